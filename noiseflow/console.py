@@ -1,0 +1,89 @@
+"""What every command shares: options, progress, and one way to speak to people and to programs. Imports no torch."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any
+
+import typer
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last on stdout.")]
+SeedOption = Annotated[int, typer.Option("--seed", help="Seed of every random choice.")]
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+
+Progress = Callable[[int, str], None]
+"""``progress(done, note)``: steps done so far, and a few words such as the current likelihood."""
+
+
+class Output:
+    """Tells people in lines and tables, or programs in one JSON object.
+
+    Args:
+        json_mode: print only the JSON object on stdout; the lines go to stderr.
+    """
+
+    def __init__(self, json_mode: bool) -> None:
+        self.json_mode = json_mode
+
+    def line(self, text: str) -> None:
+        """One line for people."""
+        print(text, file=sys.stderr if self.json_mode else sys.stdout, flush=True)
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """A table aligned for a terminal; the first column is left-aligned, the others right."""
+        cells = [list(header), *[list(row) for row in rows]]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+        for row in cells:
+            first, rest = row[0].ljust(widths[0]), [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+            self.line("  ".join([first, *rest]).rstrip())
+
+    def result(self, values: dict[str, Any]) -> None:
+        """The command's result, printed only in JSON mode; non-finite numbers become null."""
+        if self.json_mode:
+            print(json.dumps(_plain(values), allow_nan=False), flush=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if value == value and abs(value) != float("inf") else None
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)
+
+
+@contextlib.contextmanager
+def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
+    """A progress bar with ETA on a terminal, and only there."""
+    if json_mode or not sys.stderr.isatty():
+        yield lambda done, note: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    with RichProgress(*columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=total, note="")
+        yield lambda done, note: bar.update(task, completed=done, note=note)
+
+
+def choose_device(name: str) -> Any:
+    """The torch device of ``auto``, ``cpu`` or ``cuda``.
+
+    Raises:
+        ValueError: another name, or CUDA asked for where there is none.
+    """
+    import torch
+
+    if name not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"--device {name}: choose auto, cpu or cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch sees no CUDA GPU here; use --device cpu, or install a CUDA build of torch")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
