@@ -1,0 +1,124 @@
+"""Rounding and saturation around any noise model: the likelihood of an interval instead of a density at a point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions import NoiseDistribution
+
+_MOMENT_NODES = 257
+
+
+class Digitised(nn.Module):
+    """A detector that rounds to steps and clips at rails, in front of any noise model.
+
+    An observation k stands for every reading in (k − step/2, k + step/2]; the rails stand for everything beyond them too.
+
+    Args:
+        model: the noise model before digitisation.
+        step: rounding step, detector units; 0 for readings that are clipped but not rounded.
+        low, high: rails, detector units; infinite where there is none.
+
+    Raises:
+        ValueError: negative step, or rails in the wrong order.
+    """
+
+    def __init__(self, model: nn.Module, step: float = 1.0, low: float = -math.inf, high: float = math.inf) -> None:
+        super().__init__()
+        if step < 0:
+            raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
+        if not low < high:
+            raise ValueError(f"low is {low} and high is {high}; the low rail must lie below the high one")
+        self.model = model
+        self.step, self.low, self.high = float(step), float(low), float(high)
+
+    def forward(self, signal: Tensor) -> DigitisedDistribution:
+        return DigitisedDistribution(self.model(signal), self.step, self.low, self.high)
+
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Standardise the model inside; see its own method."""
+        self.model.standardise(signal, observation)
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again, besides the model inside."""
+        rails = {"low": self.low, "high": self.high}
+        return {"step": self.step} | {name: rail for name, rail in rails.items() if math.isfinite(rail)}
+
+    def extra_repr(self) -> str:
+        return f"step={self.step:g}, low={self.low:g}, high={self.high:g}"
+
+
+class DigitisedDistribution(NoiseDistribution):
+    """A rounded and clipped distribution. ``log_prob`` is a log-mass on the rails and, with a step, on every level.
+
+    With ``step = 0`` the readings between the rails keep their log-density.
+    """
+
+    def __init__(self, base: NoiseDistribution, step: float, low: float, high: float) -> None:
+        super().__init__(base.batch_shape)
+        self.base, self.step, self.low, self.high = base, step, low, high
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        result = self._log_cell(value) if self.step > 0 else self.base.log_prob(value)
+        infinity = torch.full_like(value, math.inf)
+        if math.isfinite(self.low):
+            edge = torch.full_like(value, self.low + self.step / 2)
+            result = torch.where(value <= self.low, self.base.log_interval_prob(-infinity, edge), result)
+        if math.isfinite(self.high):
+            edge = torch.full_like(value, self.high - self.step / 2)
+            result = torch.where(value >= self.high, self.base.log_interval_prob(edge, infinity), result)
+        return result
+
+    def _log_cell(self, value: Tensor) -> Tensor:
+        return self.base.log_interval_prob(value - self.step / 2, value + self.step / 2)
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.base.log_interval_prob(self._edge(low), self._edge(high))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        edge = self._edge(value)
+        finite = torch.isfinite(edge)
+        inside = self.base.cdf(torch.where(finite, edge, torch.zeros_like(edge)))
+        return torch.where(finite, inside, (edge > 0).to(inside.dtype))
+
+    def _edge(self, value: Tensor) -> Tensor:
+        """The undigitised reading below which everything is digitised to at most `value`."""
+        edge = self._level(value, torch.floor) + self.step / 2 if self.step > 0 else value
+        edge = torch.where(value < self.low, torch.full_like(edge, -math.inf), edge)
+        return torch.where(value >= self.high, torch.full_like(edge, math.inf), edge)
+
+    def _level(self, value: Tensor, rounding: Any) -> Tensor:
+        origin = self.low if math.isfinite(self.low) else 0.0
+        steps = (value - origin) / self.step
+        if rounding is torch.floor:  # a level itself must not fall below itself by rounding error
+            steps = steps + 1e-4
+        return rounding(steps) * self.step + origin
+
+    def digitise(self, value: Tensor) -> Tensor:
+        """Round and clip undigitised readings."""
+        rounded = self._level(value, torch.round) if self.step > 0 else value
+        return rounded.clamp(self.low, self.high)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.digitise(self.base.icdf(value))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:  # type: ignore[override]
+        return self.digitise(self.base.sample(sample_shape, generator))
+
+    @property
+    def mean(self) -> Tensor:
+        return self._moment(torch.zeros(()), 1)
+
+    @property
+    def variance(self) -> Tensor:
+        return self._moment(self.mean, 2)
+
+    def _moment(self, about: Tensor, power: int) -> Tensor:
+        nodes = (torch.arange(_MOMENT_NODES, dtype=torch.float64) + 0.5) / _MOMENT_NODES
+        values = [self.icdf(torch.full(self.batch_shape, float(node))) for node in nodes]
+        return torch.stack([(value - about) ** power for value in values]).mean(0)

@@ -1,0 +1,235 @@
+"""Conditional normalizing flows in one dimension: p(observation | signal) as a stack of monotone maps to a standard normal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions import LatentDistribution, normal_quadrature
+from noiseflow.standardisation import Standardisation, interpolate_cubic
+from noiseflow.transforms import Affine, Radial, Spline, StudentTail, Transform
+
+_MEAN_NODES = 65
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One map of a flow: how many raw parameters it takes, where they start, and how they become a transform.
+
+    Args:
+        initial: starting values of the raw parameters.
+        build: raw parameters (..., P) to a transform; any real parameters must give a valid one.
+        conditional: whether the parameters depend on the signal.
+    """
+
+    initial: tuple[float, ...]
+    build: Callable[[Tensor], Transform]
+    conditional: bool = True
+
+
+def affine_layer(*, conditional: bool = True) -> Layer:
+    """Location and scale of the standardised residual."""
+    return Layer((0.0, 0.0), lambda raw: Affine(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)), conditional)
+
+
+def scale_layer(*, conditional: bool = True) -> Layer:
+    """Scale of the standardised residual alone."""
+    return Layer((0.0,), lambda raw: Affine(torch.zeros_like(raw[..., 0]), _bounded(raw[..., 0], 5)), conditional)
+
+
+def radial_layer(centre: float = 0.0, *, conditional: bool = True) -> Layer:
+    """One radial map; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
+
+    def build(raw: Tensor) -> Transform:
+        return Radial(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 3), _bounded(raw[..., 2], 3))
+
+    return Layer((centre, 0.0, 0.0), build, conditional)
+
+
+def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = True) -> Layer:
+    """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
+
+    def build(raw: Tensor) -> Transform:
+        widths, heights, slopes = raw.split((num_bins, num_bins, num_bins + 1), dim=-1)
+        return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
+
+    return Layer((0.0,) * (3 * num_bins + 1), build, conditional)
+
+
+def tail_layer(*, conditional: bool = False) -> Layer:
+    """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
+
+    def build(raw: Tensor) -> Transform:
+        weight = 0.4 * torch.sigmoid(raw)
+        return StudentTail(weight[..., 0], weight[..., 1])
+
+    return Layer((-4.0, -4.0), build, conditional)
+
+
+def _bounded(raw: Tensor, limit: float) -> Tensor:
+    return limit * torch.tanh(raw / limit)
+
+
+def _knots(raw: Tensor, reach: float) -> Tensor:
+    least = 0.02 / raw.shape[-1]
+    steps = least + (1 - least * raw.shape[-1]) * torch.softmax(raw, -1)
+    inner = 2 * reach * torch.cumsum(steps, -1)[..., :-1] - reach
+    end = torch.full_like(raw[..., :1], reach)
+    return torch.cat([-end, inner, end], -1)
+
+
+class ConditionalFlow(nn.Module):
+    """A noise model made of layers, the first one next to the data; the last one gives the standard normal latent.
+
+    Args:
+        layers: the maps, in the order in which they turn an observation into the latent.
+        mean_preserving: shift the noise so that E[observation | signal] = signal (before any digitisation). A joint fit
+            needs it: otherwise an offset of the signal cannot be told from a mean of the noise.
+        width: hidden units of the network that turns a signal into the parameters of the conditional layers.
+    """
+
+    def __init__(self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32) -> None:
+        super().__init__()
+        self.layers = tuple(layers)
+        self.mean_preserving = mean_preserving
+        self.width = width
+        self.standardisation = Standardisation()
+        self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
+        self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
+        last = nn.Linear(width, self.num_conditional)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        hidden = nn.Linear(width, width)
+        self.conditioner = nn.Sequential(nn.Linear(2, width), nn.Tanh(), hidden, nn.Tanh(), last)
+
+    def forward(self, signal: Tensor) -> FlowDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        coordinate = self.standardisation.coordinate(signal)
+        location, log_scale = self.standardisation(coordinate)
+        if self.mean_preserving:
+            location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
+        return FlowDistribution(signal, signal + location, log_scale, self.transforms(coordinate))
+
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Measure and store the scaling of the data; both (N,), detector units."""
+        self.standardisation.set_from(signal, observation)
+
+    def transforms(self, coordinate: Tensor) -> list[Transform]:
+        """The maps at each signal coordinate."""
+        with torch.autocast(coordinate.device.type, enabled=False):
+            features = torch.stack([2 * coordinate - 1, 2 * coordinate * coordinate - 1], -1).to(self.bias.dtype)
+            conditional = self.conditioner(features)
+            built, bias_at, conditional_at = [], 0, 0
+            for layer in self.layers:
+                size = len(layer.initial)
+                raw = self.bias[bias_at : bias_at + size]
+                if layer.conditional:
+                    raw = raw + conditional[..., conditional_at : conditional_at + size]
+                    conditional_at += size
+                built.append(layer.build(raw))
+                bias_at += size
+            return built
+
+    def _mean_of_standardised(self) -> Tensor:
+        """Mean of the standardised residual on a grid of signal coordinates, by quadrature."""
+        dtype, device = self.bias.dtype, self.bias.device
+        nodes, weights = normal_quadrature(dtype, device)
+        coordinate = torch.linspace(0, 1, _MEAN_NODES, dtype=dtype, device=device)
+        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(_MEAN_NODES, -1))
+        return x @ weights
+
+    def extra_repr(self) -> str:
+        low, high = float(self.standardisation.signal_low), float(self.standardisation.signal_high)
+        return f"signals {low:g} … {high:g}, {len(self.layers)} layers, mean_preserving={self.mean_preserving}"
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again."""
+        return {"mean_preserving": self.mean_preserving, "width": self.width}
+
+
+def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
+    total = torch.zeros_like(latent)
+    for transform in reversed(transforms):
+        latent, ladj = transform.inverse(latent)
+        total = total + ladj
+    return latent, total
+
+
+class FlowDistribution(LatentDistribution):
+    """The distribution that a `ConditionalFlow` returns."""
+
+    def __init__(self, signal: Tensor, location: Tensor, log_scale: Tensor, transforms: Sequence[Transform]) -> None:
+        super().__init__(signal.shape)
+        self.signal, self.location, self.log_scale, self._transforms = signal, location, log_scale, transforms
+
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        value = (value - self.location) * torch.exp(-self.log_scale)
+        total = -self.log_scale.expand_as(value)
+        for transform in self._transforms:
+            value, ladj = transform.forward(value)
+            total = total + ladj
+        return value, total
+
+    def from_latent(self, latent: Tensor) -> Tensor:
+        return self.location + torch.exp(self.log_scale) * _inverse(self._transforms, latent)[0]
+
+    def _like(self) -> Tensor:
+        return self.location
+
+
+class RadialFlow(ConditionalFlow):
+    """The noise model of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018), with a normalised density.
+
+    A conditional affine layer, then radial layers of which the half next to the data depends on the signal.
+
+    Args:
+        num_layers: number of radial layers.
+        mean_preserving: see `ConditionalFlow`.
+        width: hidden units of the conditioning network.
+    """
+
+    def __init__(self, num_layers: int = 8, *, mean_preserving: bool = False, width: int = 32) -> None:
+        conditional = num_layers - num_layers // 2
+        centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
+        radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
+        super().__init__([affine_layer(), *radials], mean_preserving=mean_preserving, width=width)
+        self.num_layers = num_layers
+
+    def config(self) -> dict[str, Any]:
+        return super().config() | {"num_layers": self.num_layers}
+
+
+class SplineFlow(ConditionalFlow):
+    """The default noise model: conditional affine layer, conditional monotone spline, learnt tail weights.
+
+    Args:
+        num_bins: bins of the spline.
+        mean_preserving: see `ConditionalFlow`.
+        width: hidden units of the conditioning network.
+    """
+
+    def __init__(self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32) -> None:
+        layers = [affine_layer(), spline_layer(num_bins), tail_layer()]
+        super().__init__(layers, mean_preserving=mean_preserving, width=width)
+        self.num_bins = num_bins
+
+    def config(self) -> dict[str, Any]:
+        return super().config() | {"num_bins": self.num_bins}
+
+
+class SignalDependentGaussian(ConditionalFlow):
+    """Gaussian noise around the signal whose standard deviation is a smooth function of the signal.
+
+    Args:
+        width: hidden units of the network that gives the standard deviation.
+    """
+
+    def __init__(self, *, width: int = 32) -> None:
+        super().__init__([scale_layer()], mean_preserving=True, width=width)
+
+    def config(self) -> dict[str, Any]:
+        return {"width": self.width}

@@ -1,0 +1,131 @@
+"""Noise-model files: safetensors with kind, units and provenance as JSON metadata. Opening one runs no code from it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import entry_points, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+import noiseflow
+from noiseflow.io import atomic_path, check_output
+
+FORMAT_VERSION = 1
+MODEL_SUFFIXES = frozenset({".safetensors"})
+
+
+def kinds() -> dict[str, type[nn.Module]]:
+    """Every noise model that a file may name: the public ones here, and those of installed packages (entry points
+    ``noiseflow.noise_models``)."""
+    own = {name: getattr(noiseflow, name) for name in noiseflow.__all__}
+    found = {name: kind for name, kind in own.items() if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")}
+    return found | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
+
+
+def save(model: nn.Module, path: str | Path, *, units: str = "detector units", provenance: Mapping[str, Any] | None = None) -> Path:
+    """Save a noise model.
+
+    Args:
+        model: any model whose class is in `kinds`, on any device.
+        path: target, ``.safetensors``.
+        units: units of signal and observation.
+        provenance: where the model comes from: anything JSON can hold.
+
+    Raises:
+        ValueError: unknown kind of model, or a path that cannot be written.
+    """
+    from safetensors.torch import save_file
+
+    path = check_output(path, suffixes=MODEL_SUFFIXES)
+    metadata = {
+        "format": "noiseflow noise model",
+        "format_version": str(FORMAT_VERSION),
+        "library_version": version("noiseflow"),
+        "model": json.dumps(_describe(model)),
+        "units": units,
+        "provenance": json.dumps(dict(provenance or {}), default=str),
+    }
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    with atomic_path(path) as partial:
+        save_file(tensors, partial, metadata=metadata)
+    return path
+
+
+def load(path: str | Path) -> nn.Module:
+    """Load a noise model, ready to use on the CPU.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a noise-model file, damaged, of an unknown kind or from a newer version of the library.
+    """
+    metadata, tensors = _open(Path(path))
+    try:
+        description = json.loads(metadata["model"])
+        model = _build(description)
+    except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
+        raise ValueError(f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    expected = model.state_dict()
+    wrong = sorted(
+        set(expected) ^ set(tensors)
+        | {name for name in set(expected) & set(tensors) if expected[name].shape != tensors[name].shape}
+    )
+    if wrong:
+        raise ValueError(f"{path}: parameters do not fit a {description['kind']}: {', '.join(wrong[:3])}; fit and save the model again")
+    if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
+        raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
+    model.load_state_dict(tensors)
+    return model.eval()
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """Kind, units, provenance and versions of a noise-model file. Raises as `load`."""
+    metadata, _ = _open(Path(path))
+    model = json.loads(metadata.get("model", "{}"))
+    return {
+        "kind": model.get("kind"),
+        "units": metadata.get("units"),
+        "provenance": json.loads(metadata.get("provenance", "{}")),
+        "library_version": metadata.get("library_version"),
+    }
+
+
+def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; make a noise model with: noiseflow calibrate")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give the noise-model file inside it")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = dict(file.metadata() or {})
+            if metadata.get("format") != "noiseflow noise model":
+                raise ValueError(f"{path} is not a noiseflow noise model; make one with: noiseflow calibrate")
+            found = metadata.get("format_version", "")
+            if not found.isdigit() or int(found) > FORMAT_VERSION:
+                raise ValueError(f"{path} has format version {found!r}, this library reads up to {FORMAT_VERSION}; update noiseflow")
+            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a noise-model file, or is damaged ({error})") from error
+
+
+def _describe(model: nn.Module) -> dict[str, Any]:
+    kind = type(model).__name__
+    if kinds().get(kind) is not type(model):
+        raise ValueError(f"{kind} is not a known kind of noise model; register it as an entry point of 'noiseflow.noise_models'")
+    inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
+    return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
+
+
+def _build(description: Mapping[str, Any]) -> nn.Module:
+    known = kinds()
+    if description["kind"] not in known:
+        raise ValueError(f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}")
+    inner = {name: _build(child) for name, child in description.get("models", {}).items()}
+    return known[description["kind"]](**description["arguments"], **inner)

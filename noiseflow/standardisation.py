@@ -1,0 +1,116 @@
+"""The scaling stored inside a model: a smooth coordinate of the signal, and the noise's rough location and scale along it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+_NUM_KNOTS = 17
+_ROOT_SHIFT = 0.01
+
+
+class Standardisation(nn.Module):
+    """Brings signals to a coordinate in [0, 1] and residuals to unit scale, whatever the detector's units.
+
+    The coordinate grows like the square root of the signal above its lowest value, because shot noise changes fastest where the
+    signal is weak. Signals outside the range seen in the fit share the coordinate of the nearest end.
+
+    Buffers:
+        signal_low, signal_high: range of the signals of the fit, detector units.
+        location, log_scale: (17,) residual location (detector units) and log of the residual scale, at equally spaced
+            coordinates.
+    """
+
+    signal_low: Tensor
+    signal_high: Tensor
+    location: Tensor
+    log_scale: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("signal_low", torch.tensor(0.0))
+        self.register_buffer("signal_high", torch.tensor(1.0))
+        self.register_buffer("location", torch.zeros(_NUM_KNOTS))
+        self.register_buffer("log_scale", torch.full((_NUM_KNOTS,), -2.3))
+
+    def coordinate(self, signal: Tensor) -> Tensor:
+        """Coordinate in [0, 1] of each signal."""
+        fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)
+        return (torch.sqrt(fraction + _ROOT_SHIFT) - _ROOT_SHIFT**0.5) / _root_span()
+
+    def signal(self, coordinate: Tensor) -> Tensor:
+        """The signal of a coordinate; inverse of `coordinate` inside the range."""
+        fraction = (coordinate * _root_span() + _ROOT_SHIFT**0.5) ** 2 - _ROOT_SHIFT
+        return self.signal_low + fraction * (self.signal_high - self.signal_low)
+
+    def forward(self, coordinate: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual location and log-scale at each coordinate."""
+        return interpolate_linear(self.location, coordinate), interpolate_linear(self.log_scale, coordinate)
+
+    @torch.no_grad()
+    def set_from(self, signal: Tensor, observation: Tensor) -> None:
+        """Measure range, location and scale on (N,) signals and observations; robust to outliers and empty levels.
+
+        Raises:
+            ValueError: the observations equal the signals, so that there is no noise to learn.
+        """
+        signal, residual = signal.double(), observation.double() - signal.double()
+        spread = residual.std(correction=0)
+        if not spread > 0:
+            raise ValueError("observation − signal is constant: there is no noise to learn; check that the two images differ")
+        low, high = signal.min(), signal.max()
+        if high <= low:  # one signal level: give the coordinate a width of its own
+            low, high = low - spread, high + spread
+        self.signal_low.copy_(low)
+        self.signal_high.copy_(high)
+        fraction = ((signal - low) / (high - low)).clamp(0, 1)
+        coordinate = (torch.sqrt(fraction + _ROOT_SHIFT) - _ROOT_SHIFT**0.5) / _root_span()
+        location, scale = _moments_by_level((coordinate * (_NUM_KNOTS - 1)).round().long(), residual)
+        self.location.copy_(location)
+        self.log_scale.copy_(torch.log(scale.clamp(min=1e-3 * float(spread))))
+
+
+def _root_span() -> float:
+    return float((1 + _ROOT_SHIFT) ** 0.5 - _ROOT_SHIFT**0.5)
+
+
+def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
+    """Median and robust scale at each knot; knots with too few pixels take them from their neighbours."""
+    import numpy as np
+
+    known, location, scale = [], [], []
+    order = torch.argsort(level)
+    for knot, values in zip(range(_NUM_KNOTS), torch.split(residual[order], torch.bincount(level, minlength=_NUM_KNOTS).tolist()), strict=True):
+        if values.numel() >= min(least, residual.numel()):
+            values = values[:: max(1, values.numel() // 100_000)]
+            q16, q50, q84 = torch.quantile(values, torch.tensor([0.1587, 0.5, 0.8413], dtype=values.dtype))
+            spread = (q84 - q16) / 2
+            known.append(knot)
+            location.append(float(q50))
+            scale.append(float(torch.maximum(spread, values.std(correction=0) / 4)))
+    if not known:
+        known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
+    knots = np.arange(_NUM_KNOTS)
+    return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
+
+
+def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:
+    """Interpolate a (K,) table of equally spaced values linearly at coordinates in [0, 1]."""
+    position = coordinate * (table.shape[0] - 1)
+    index = position.detach().floor().clamp(0, table.shape[0] - 2).long()
+    left = table[index]
+    return left + (position - index) * (table[index + 1] - left)
+
+
+def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
+    """Interpolate a (K,) table of equally spaced values by local cubics (four points) at coordinates in [0, 1]."""
+    position = coordinate * (table.shape[0] - 1)
+    index = position.detach().floor().clamp(1, table.shape[0] - 3).long()
+    p = position - index
+    a, b, c, d = (table[index + k] for k in (-1, 0, 1, 2))
+    return (
+        a * (-p * (p - 1) * (p - 2) / 6)
+        + b * ((p + 1) * (p - 1) * (p - 2) / 2)
+        - c * ((p + 1) * p * (p - 2) / 2)
+        + d * ((p + 1) * p * (p - 1) / 6)
+    )
