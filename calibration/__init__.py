@@ -1,0 +1,5 @@
+"""Calibration of a detector's noise from exposures. Imports `noiseflow`, never `recon`."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,12 @@
+from .align import Registration as Registration
+from .align import register as register
+from .aligned import AlignedPair as AlignedPair
+from .aligned import align as align
+from .exposures import Burst as Burst
+from .exposures import ExposurePair as ExposurePair
+from .exposures import read_burst as read_burst
+from .exposures import read_pairs as read_pairs
+from .models import ModelScore as ModelScore
+from .models import collect_pixels as collect_pixels
+from .models import fit_models as fit_models
+from .models import simplest_sufficient as simplest_sufficient

@@ -1,0 +1,67 @@
+"""Pixels that cannot be trusted: hot, dead, saturated, and those no exposure covers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from calibration.exposures import Image, saturation_level
+
+Mask = NDArray[np.bool_]
+
+DEFECT_DEVIATIONS = 8.0
+"""Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
+
+
+@dataclass(frozen=True)
+class MaskCounts:
+    """How many pixels of a frame were left out, and why (a pixel counts once, for the first reason)."""
+
+    outside: int
+    saturated: int
+    hot: int
+    dead: int
+
+
+def defects(frames: Image) -> tuple[Mask, Mask]:
+    """Hot and dead pixels: those that differ from their neighbours in the same direction in every frame of one detector.
+
+    Judged in detector coordinates, before any frame is warped. A real feature of the scene spreads over neighbours through the
+    optics; a single noisy reading does not repeat.
+
+    Args:
+        frames: (frame, y, x).
+
+    Returns:
+        Two (y, x) masks.
+    """
+    hot = np.ones(frames.shape[1:], bool)
+    dead = hot.copy()
+    for frame in frames:
+        deviation = _deviation(frame)
+        hot &= deviation > DEFECT_DEVIATIONS
+        dead &= deviation < -DEFECT_DEVIATIONS
+    return hot, dead
+
+
+def saturated(frame: Image, *, margin: int = 0) -> Mask:
+    """Pixels at the upper rail, grown by `margin` pixels."""
+    at_rail = frame >= saturation_level(frame)
+    return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
+
+
+def _deviation(frame: Image) -> Image:
+    """Departure from the median of the eight neighbours, over its robust spread among pixels of like brightness."""
+    ring = np.ones((3, 3), bool)
+    ring[1, 1] = False
+    middle = ndimage.median_filter(frame, footprint=ring)
+    difference = frame - middle
+    order = np.argsort(middle, axis=None)
+    result = np.empty(frame.size)
+    for group in np.array_split(order, max(1, frame.size // 2000)):
+        values = difference.flat[group]
+        result[group] = values / max(1.4826 * np.median(np.abs(values)), np.finfo(float).tiny)
+    return result.reshape(frame.shape)

@@ -1,0 +1,175 @@
+"""Which noise model suffices: each is fitted on some blocks of pixels and judged on the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.aligned import AlignedPair, block_split
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from noiseflow.console import Progress
+
+KINDS: dict[str, str] = {
+    "gaussian": "Gaussian",
+    "poisson": "Poisson",
+    "signal-gaussian": "SignalDependentGaussian",
+    "flow": "RadialFlow",
+    "spline": "SplineFlow",
+}
+"""Names of the noise models that compete, simplest first, and their classes in noiseflow."""
+
+BLOCK = 8
+"""Side, in pixels, of the blocks kept apart."""
+
+NUM_STEPS = 500
+"""Optimisation steps of each model."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of all pairs in one row, ready to fit and to judge.
+
+    Attributes:
+        signal: (N,) counts.
+        observation: (N,) counts.
+        held_out: (N,) those that judge.
+        block: (N,) number of the block each belongs to.
+    """
+
+    signal: NDArray[np.float64]
+    observation: NDArray[np.float64]
+    held_out: NDArray[np.bool_]
+    block: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """A fitted noise model and its figures on the pixels kept apart.
+
+    Attributes:
+        name: one of `KINDS`.
+        model: the fitted model.
+        nll: mean negative log-likelihood, nats per pixel.
+        nll_error: its standard error, from the scatter between blocks.
+        excess: nll above the best model's, nats per pixel.
+        excess_error: its standard error, paired block by block.
+        jsd, bc, bd: Jensen-Shannon divergence (nats), Bhattacharyya coefficient and distance of the residuals' histogram from
+            the model's own bin masses.
+        jsd_floor, bc_floor, bd_floor: what the same number of the model's own samples would give.
+    """
+
+    name: str
+    model: nn.Module
+    nll: float
+    nll_error: float
+    excess: float
+    excess_error: float
+    jsd: float
+    jsd_floor: float
+    bc: float
+    bc_floor: float
+    bd: float
+    bd_floor: float
+
+
+def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: float = 0.5) -> Pixels:
+    """Gather the trusted pixels of all pairs, with whole blocks kept apart for judging.
+
+    Blocks lie at the same places in every pair, so that a pixel's scene never sits on both sides.
+
+    Args:
+        pairs: aligned pairs.
+        seed: of the choice of blocks.
+        fraction: of the blocks kept apart.
+    """
+    parts = []
+    for number, pair in enumerate(pairs):
+        apart = block_split(pair.mask.shape, np.random.default_rng(seed), block=BLOCK, fraction=fraction)
+        rows, columns = np.indices(pair.mask.shape) // BLOCK
+        block = rows * (columns.max() + 1) + columns + number * (rows.max() + 1) * (columns.max() + 1)
+        parts.append([image[pair.mask] for image in (pair.signal, pair.observation, apart, block)])
+    return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def fit_models(
+    pixels: Pixels, *, kinds: Sequence[str] = tuple(KINDS), seed: int = 0, device: Any = "cpu", progress: Progress | None = None
+) -> list[ModelScore]:
+    """Fit noise models and judge them on the pixels kept apart.
+
+    Args:
+        pixels: from `collect_pixels`.
+        kinds: names in `KINDS`.
+        seed: of every random choice.
+        device: torch device to fit on.
+        progress: called with the steps done of ``NUM_STEPS * len(kinds)``, and a note.
+
+    Returns:
+        One score per kind, simplest first; models on the CPU.
+
+    Raises:
+        ValueError: an unknown kind, or a model that cannot be fitted.
+    """
+    models, losses = {}, {}
+    for index, name in enumerate(sorted(kinds, key=_rank)):
+        told = None if progress is None else _shifted(progress, index * NUM_STEPS, name)
+        models[name] = _fitted(name, pixels, seed, device, told)
+        losses[name] = _losses(models[name], pixels)
+    best = min(losses, key=lambda name: float(losses[name].mean()))
+    judged = pixels.block[pixels.held_out]
+    return [_score(name, models[name], losses[name], losses[best], judged, pixels) for name in models]
+
+
+def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
+    """The simplest model whose held-out likelihood lies within one standard error of the best one's."""
+    return next(score for score in sorted(scores, key=lambda s: _rank(s.name)) if score.excess <= score.excess_error)
+
+
+def _rank(name: str) -> int:
+    if name not in KINDS:
+        raise ValueError(f"unknown kind of noise model '{name}'; choose auto, {', '.join(KINDS)}")
+    return list(KINDS).index(name)
+
+
+def _shifted(progress: Progress, start: int, name: str) -> Progress:
+    return lambda done, note: progress(start + done, f"{name}: {note}")
+
+
+def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progress | None) -> nn.Module:
+    import torch
+
+    import noiseflow
+
+    torch.manual_seed(seed)
+    options = {"mean_preserving": True} if name in ("flow", "spline") else {}
+    model: nn.Module = getattr(noiseflow, KINDS[name])(**options).to(device)
+    signal, observation = (torch.from_numpy(x[~pixels.held_out]).float().to(device) for x in (pixels.signal, pixels.observation))
+    stopping = torch.from_numpy(pixels.block[~pixels.held_out] % 10 == 0).to(device)
+    generator = torch.Generator().manual_seed(seed)
+    noiseflow.fit(
+        model, signal, observation, held_out=stopping, num_steps=NUM_STEPS, generator=generator, progress=progress
+    )
+    return model.cpu().eval()
+
+
+def _losses(model: nn.Module, pixels: Pixels) -> NDArray[np.float64]:
+    """Negative log-likelihood of each pixel kept apart, nats."""
+    import torch
+
+    signal, observation = (torch.from_numpy(x[pixels.held_out]).float() for x in (pixels.signal, pixels.observation))
+    parts = zip(signal.split(65536), observation.split(65536), strict=True)
+    with torch.no_grad():
+        return np.asarray(torch.cat([-model(s).log_prob(o) for s, o in parts]).double().numpy())
+
+
+def _mean_and_error(values: NDArray[np.float64], block: NDArray[np.int64]) -> tuple[float, float]:
+    """Mean, and its standard error from the scatter of whole blocks (pixels of one block may err alike)."""
+    _, index = np.unique(block, return_inverse=True)
+    departure = np.bincount(index, values - values.mean())
+    return float(values.mean()), float(np.sqrt(np.sum(departure**2)) / len(values))
