@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import sys
 from importlib.metadata import entry_points, version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare")
 
@@ -27,8 +28,25 @@ def build_app() -> typer.Typer:
     app.callback()(_options)
     found = {point.name: point for point in entry_points(group="noiseflow.commands")}
     for name in sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
-        app.command(name)(found[name].load())
+        app.command(name, cls=_ListCommand)(found[name].load())
     return app
+
+
+class _ListCommand(TyperCommand):
+    """A command whose list options take several values: ``--short a b c`` for ``--short a --short b --short c``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        lists = {name for option in self.params if getattr(option, "multiple", False) for name in option.opts}
+        spread: list[str] = []
+        current = None
+        for argument in args:
+            if argument.startswith("-") and argument != "-":
+                current = argument if argument in lists else None
+            elif current is not None and spread[-1] != current:
+                spread.append(current)
+            spread.append(argument)
+        rest: list[str] = super().parse_args(ctx, spread)
+        return rest
 
 
 def _show_version(asked: bool) -> None:
