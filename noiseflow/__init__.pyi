@@ -2,8 +2,6 @@ from .baselines import Gaussian as Gaussian
 from .baselines import Poisson as Poisson
 from .digitised import Digitised as Digitised
 from .fit import FitResult as FitResult
-from .fit import KnownSignal as KnownSignal
-from .fit import StaticScene as StaticScene
 from .fit import fit as fit
 from .flow import RadialFlow as RadialFlow
 from .flow import SignalDependentGaussian as SignalDependentGaussian
@@ -12,3 +10,5 @@ from .model_files import load as load
 from .model_files import save as save
 from .protocols import NoiseModel as NoiseModel
 from .protocols import SignalModel as SignalModel
+from .signal_models import KnownSignal as KnownSignal
+from .signal_models import StaticScene as StaticScene
