@@ -1,0 +1,8 @@
+"""Clean volumes from noisy single-axis tilt series: projector, fields, joint fit, classical rivals, metrics, phantoms.
+
+Names load on first use, so importing the package costs nothing.
+"""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

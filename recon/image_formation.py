@@ -1,0 +1,84 @@
+"""From line integrals to the signal that the detector would read without noise."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class Transmission(nn.Module):
+    """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 per tilt or for all.
+
+    Args:
+        intensity: incident intensity, detector units; a number, or one for each tilt.
+        offset: detector units; kept fixed.
+        estimate: whether the intensity is learnt.
+
+    Raises:
+        ValueError: an intensity that is not positive.
+    """
+
+    offset: Tensor
+
+    def __init__(self, intensity: float | Tensor = 1.0, *, offset: float = 0.0, estimate: bool = True) -> None:
+        super().__init__()
+        start = torch.as_tensor(intensity, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
+        if not bool((start > 0).all()):
+            raise ValueError("the incident intensity must be positive; is the contrast inverted or the offset too high?")
+        self.log_intensity = nn.Parameter(start.log(), requires_grad=estimate)
+        self.register_buffer("offset", torch.tensor(float(offset)))
+
+    def forward(self, line_integrals: Tensor) -> Tensor:
+        """Line integrals (tilt, u, y) to signals of the same shape."""
+        return torch.exp(self.log_intensity - line_integrals) + self.offset
+
+    def invert(self, signal: Tensor) -> Tensor:
+        """Line integrals of signals; readings at or below the offset count as the smallest that a 1000th of I0 gives."""
+        share = (signal - self.offset) / self.log_intensity.detach().exp()
+        return -torch.log(share.clamp_min(1e-3))
+
+    @property
+    def intensity(self) -> Tensor:
+        """Incident intensity, (1,) or (tilts,)."""
+        return self.log_intensity.detach().exp().reshape(-1)
+
+
+class Linear(nn.Module):
+    """HAADF or EDX: signal = gain·line integral + offset.
+
+    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is learnt
+    for each tilt or for all.
+
+    Args:
+        gain: detector units per unit of line integral.
+        offset: detector units; a number, or one for each tilt.
+        estimate: whether the offset is learnt.
+
+    Raises:
+        ValueError: a gain of zero, or one that is not finite.
+    """
+
+    gain: Tensor
+
+    def __init__(self, gain: float = 1.0, *, offset: float | Tensor = 0.0, estimate: bool = True) -> None:
+        super().__init__()
+        if not math.isfinite(gain) or gain == 0:
+            raise ValueError(f"gain {gain} must be finite and not zero")
+        self.register_buffer("gain", torch.tensor(float(gain)))
+        start = torch.as_tensor(offset, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
+        self.scaled_offset = nn.Parameter(start / gain, requires_grad=estimate)
+
+    def forward(self, line_integrals: Tensor) -> Tensor:
+        """Line integrals (tilt, u, y) to signals of the same shape."""
+        return self.gain * (line_integrals + self.scaled_offset)
+
+    def invert(self, signal: Tensor) -> Tensor:
+        """Line integrals of signals."""
+        return signal / self.gain - self.scaled_offset.detach()
+
+    @property
+    def offset(self) -> Tensor:
+        """Detector units, (1,) or (tilts,)."""
+        return (self.gain * self.scaled_offset.detach()).reshape(-1)

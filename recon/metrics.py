@@ -1,0 +1,114 @@
+"""How far a volume or projection is from its reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Scaling = Literal["raw", "affine", "min-max"]
+SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one array against its reference, both scaled by the reference's range.
+
+    Attributes:
+        mse: mean squared error, in squared ranges of the reference.
+        psnr: peak signal-to-noise ratio, dB.
+        dssim: (1 − SSIM) / 2, the mean over slices along the first axis.
+    """
+
+    mse: float
+    psnr: float
+    dssim: float
+
+
+def compare(result: Array, reference: Array, *, scaling: Scaling = "raw") -> Errors:
+    """Compare an array with its reference.
+
+    Args:
+        result: (z, y, x) or (y, x).
+        reference: the truth, same shape.
+        scaling: ``raw`` takes the numbers as they are; ``affine`` first fits gain and offset of `result` by least squares;
+            ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
+
+    Raises:
+        ValueError: shapes differ, pixels are not finite, or the reference is flat.
+    """
+    result, reference = _checked(result, reference)
+    matched = match(result, reference, scaling=scaling)
+    span = float(reference.max() - reference.min())
+    mse = float(np.mean((matched - reference) ** 2)) / span**2
+    psnr = math.inf if mse == 0 else -10 * math.log10(mse)
+    return Errors(mse, psnr, _dssim(matched, reference, span))
+
+
+def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
+    """`result` brought to the scale of `reference`, as `compare` does it."""
+    if scaling == "raw":
+        return result
+    if scaling == "min-max":
+        low, high = float(result.min()), float(result.max())
+        gain = (float(reference.max()) - float(reference.min())) / (high - low) if high > low else 0.0
+        return (result - low) * gain + float(reference.min())
+    if scaling == "affine":
+        centred = result - result.mean()
+        power = float(np.mean(centred**2))
+        gain = float(np.mean(centred * (reference - reference.mean()))) / power if power > 0 else 0.0
+        return centred * gain + reference.mean()
+    raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
+
+
+def fourier_shell_correlation(first: Array, second: Array) -> tuple[Array, Array]:
+    """Correlation of two volumes or images by shells of spatial frequency (doi:10.1016/0304-3991(86)90198-4).
+
+    Args:
+        first, second: arrays of the same shape.
+
+    Returns:
+        Frequencies in cycles per voxel up to 0.5, and the correlation at each.
+
+    Raises:
+        ValueError: shapes differ, or pixels are not finite.
+    """
+    first, second = _checked(first, second, flat=True)
+    f, g = np.fft.fftn(first), np.fft.fftn(second)
+    frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*(np.fft.fftfreq(n) for n in first.shape), indexing="ij")))
+    shells = min(first.shape) // 2
+    shell = np.rint(frequency * 2 * shells).astype(int).ravel()
+    cross, power_f, power_g = (
+        np.bincount(shell, weights=values.ravel(), minlength=shells + 1)[: shells + 1]
+        for values in ((f * g.conj()).real, np.abs(f) ** 2, np.abs(g) ** 2)
+    )
+    norm = np.sqrt(power_f * power_g)
+    return np.arange(shells + 1) / (2 * shells), np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
+
+
+def _dssim(result: Array, reference: Array, span: float) -> float:
+    from skimage.metrics import structural_similarity
+
+    if reference.ndim == 2:
+        result, reference = result[None], reference[None]
+    window = min(7, (min(reference.shape[1:]) - 1) // 2 * 2 + 1)
+    values = [
+        structural_similarity(a, b, data_range=span, win_size=window) for a, b in zip(result, reference, strict=True)
+    ]
+    return (1 - float(np.mean(values))) / 2
+
+
+def _checked(result: Array, reference: Array, *, flat: bool = False) -> tuple[Array, Array]:
+    from noiseflow.io import require_contrast, require_finite
+
+    if result.shape != reference.shape:
+        raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
+    require_finite(result, "the result")
+    require_finite(reference, "the reference")
+    if not flat:
+        require_contrast(reference, "the reference")
+    return result.astype(np.float64), reference.astype(np.float64)

@@ -1,0 +1,45 @@
+"""Simultaneous iterative reconstruction technique (doi:10.1016/0022-5193(72)90180-4), in its weighted modern form."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from recon.projector import SliceProjector
+
+
+def sirt(
+    line_integrals: Tensor,
+    projector: SliceProjector,
+    *,
+    num_iterations: int = 100,
+    start: Tensor | None = None,
+    minimum: float | None = 0.0,
+) -> Tensor:
+    """Reconstruct by x ← x + C Aᵀ R (y − A x), with R and C the inverse row and column sums of A.
+
+    Args:
+        line_integrals: (tilt, y, u) measured line integrals.
+        projector: the operator A.
+        num_iterations: iterations; noise grows with them.
+        start: (z, y, x) volume to go on from; zero if None. Thirty iterations are ten and twenty.
+        minimum: lower bound applied after every iteration, or None.
+
+    Returns:
+        (z, y, x) attenuation per voxel.
+    """
+    A = projector  # noqa: N806: reads as the paper does
+    ones = torch.ones((A.depth, 1, A.width), dtype=line_integrals.dtype, device=line_integrals.device)
+    R = _inverse(A(ones))
+    C = _inverse(A.T(torch.ones_like(R)))
+    y = line_integrals
+    x = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device) if start is None else start
+    for _ in range(num_iterations):
+        x = x + C * A.T(R * (y - A(x)))
+        if minimum is not None:
+            x = x.clamp_min(minimum)
+    return x
+
+
+def _inverse(sums: Tensor) -> Tensor:
+    return torch.where(sums > 0, 1 / sums, torch.zeros_like(sums))

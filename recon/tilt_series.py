@@ -1,0 +1,181 @@
+"""Tilt series and volumes: values checked once, when they are made or read."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow import io
+
+Mode = Literal["transmission", "linear"]
+ANGLE_SUFFIXES = (".rawtlt", ".tlt")
+
+
+@dataclass(frozen=True)
+class TiltSeries:
+    """Images of one object at several tilts, in raw detector units.
+
+    Attributes:
+        images: (tilt, y, u), any real number type; the tilt axis runs along y through the middle of u.
+        tilt_angles: (tilt,) degrees.
+        pixel_size: Å, or None where unknown.
+        mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
+
+    Raises:
+        ValueError: not a stack, angles that do not match it, pixels or angles that are not finite, or a flat stack.
+    """
+
+    images: NDArray[Any]
+    tilt_angles: NDArray[np.float64]
+    pixel_size: float | None = None
+    mode: Mode = "transmission"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tilt_angles", np.asarray(self.tilt_angles, dtype=np.float64).reshape(-1))
+        if self.mode not in ("transmission", "linear"):
+            raise ValueError(f"mode '{self.mode}': choose transmission (bright field) or linear (HAADF, EDX)")
+        if self.images.ndim != 3:
+            raise ValueError(f"a tilt series is a stack (tilt, y, x); this array has shape {self.images.shape}")
+        if len(self.images) != len(self.tilt_angles):
+            raise ValueError(
+                f"the stack has {len(self.images)} images and there are {len(self.tilt_angles)} tilt angles; give the angle file of this stack"
+            )
+        if len(self.images) < 2:
+            raise ValueError("a tilt series needs at least two tilts")
+        io.require_finite(self.images, "the tilt series")
+        io.require_finite(self.tilt_angles, "the list of tilt angles")
+        io.require_contrast(self.images, "the tilt series")
+        _check_angles(self.tilt_angles)
+
+    @property
+    def num_tilts(self) -> int:
+        """How many images."""
+        return len(self.images)
+
+
+@dataclass(frozen=True)
+class VolumeGrid:
+    """The lattice to reconstruct on, centred on the tilt axis.
+
+    Attributes:
+        depth, height, width: voxels along z (the beam at zero tilt), y (the tilt axis) and x.
+        voxel_size: Å, or None where unknown.
+    """
+
+    depth: int
+    height: int
+    width: int
+    voxel_size: float | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1:
+            raise ValueError(f"a volume of {self.shape} voxels is empty; give a positive thickness")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(depth, height, width)."""
+        return self.depth, self.height, self.width
+
+    @classmethod
+    def of(cls, tilt_series: TiltSeries, thickness: int | None = None) -> VolumeGrid:
+        """The grid with one voxel per pixel: as high and wide as the images, `thickness` voxels deep (the width if None)."""
+        _, height, width = tilt_series.images.shape
+        return cls(width if thickness is None else thickness, height, width, tilt_series.pixel_size)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A reconstruction.
+
+    Attributes:
+        attenuation: (z, y, x), per voxel.
+        voxel_size: Å, or None where unknown.
+    """
+
+    attenuation: NDArray[np.float32]
+    voxel_size: float | None = None
+
+    def write(self, path: str | Path) -> None:
+        """Write to an MRC, TIFF or ``.npy`` file with the voxel size. Raises as `noiseflow.io.write`."""
+        size = self.voxel_size
+        io.write(path, self.attenuation, voxel_size=None if size is None else (size, size, size))
+
+
+def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode: Mode = "transmission") -> TiltSeries:
+    """Read a stack and its tilt angles.
+
+    Args:
+        path: the stack: MRC, TIFF or ``.npy``.
+        angles: text file with one angle in degrees per line; by default the ``.rawtlt`` or ``.tlt`` file beside the stack.
+        mode: how the images were formed.
+
+    Raises:
+        FileNotFoundError: no such file, or no angle file beside the stack.
+        ValueError: a file cannot be read, or `TiltSeries` refuses what it holds.
+    """
+    image_file = io.read(path)
+    if image_file.data.ndim != 3:
+        raise ValueError(f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed")
+    tilt_angles = read_angles(_angle_file(Path(path)) if angles is None else angles)
+    io.require_finite(image_file.data, path)
+    io.require_contrast(image_file.data, path)
+    pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
+    return TiltSeries(image_file.data, tilt_angles, pixel_size, mode)
+
+
+def read_angles(path: str | Path) -> NDArray[np.float64]:
+    """Read tilt angles, degrees, one per line; blank lines are skipped.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a line is not a number, or there is none.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"angle file {path} does not exist; check the path")
+    values = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        if line.strip():
+            try:
+                values.append(float(line))
+            except ValueError:
+                raise ValueError(f"{path} line {number}: '{line.strip()[:40]}' is not an angle in degrees") from None
+    if not values:
+        raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")
+    return np.array(values)
+
+
+def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
+    """Write the stack, and its angles to a ``.rawtlt`` file beside it; returns the angle file's path."""
+    path = Path(path)
+    size = tilt_series.pixel_size
+    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
+    angle_path = path.with_suffix(".rawtlt")
+    with io.atomic_path(angle_path) as partial:
+        partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_series.tilt_angles), encoding="utf-8")
+    return angle_path
+
+
+def _angle_file(stack: Path) -> Path:
+    for suffix in ANGLE_SUFFIXES:
+        if stack.with_suffix(suffix).is_file():
+            return stack.with_suffix(suffix)
+    names = " or ".join(stack.with_suffix(suffix).name for suffix in ANGLE_SUFFIXES)
+    raise FileNotFoundError(f"no tilt angles: there is no {names} beside {stack}; give the file with --angles")
+
+
+def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
+    values, counts = np.unique(np.round(angles, 6), return_counts=True)
+    if len(values) < 2:
+        raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")
+    if counts.max() > 1:
+        repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
+        warnings.warn(f"tilt angles appear more than once ({repeated}); each image is used as its own view", stacklevel=4)
+    if np.abs(angles).max() < 1.6:
+        warnings.warn(f"all tilt angles are within ±{np.abs(angles).max():.2f}: are they in radians? Degrees are expected", stacklevel=4)

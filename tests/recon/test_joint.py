@@ -1,0 +1,128 @@
+"""The joint fit: its parts, and that it beats least squares at its best weight."""
+
+import numpy as np
+import pytest
+import torch
+
+import noiseflow
+from recon.fields import VoxelField
+from recon.image_formation import Linear, Transmission
+from recon.joint import (
+    JointReconstructor,
+    TomographySignal,
+    automatic_noise_model,
+    block_mask,
+    estimate_response,
+    find_rails,
+)
+from recon.metrics import compare
+from recon.phantoms import shells
+from recon.projector import SliceProjector
+from recon.simulation import add_noise, clean_tilt_series, clipped_noise
+from recon.tilt_series import TiltSeries, VolumeGrid
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    density = shells(32, generator=np.random.default_rng(1), count=10)
+    clean, unit = clean_tilt_series(density, np.arange(-60, 61, 3.0))
+    return density * unit, clean, add_noise(clean, clipped_noise(), seed=2)
+
+
+def small_signal_model(weight=1.0):
+    projector = SliceProjector(tilt_angles=[-40.0, 0.0, 40.0], depth=5, width=6)
+    return TomographySignal(VoxelField((5, 4, 6), scale=0.1), projector, Transmission(), weight=weight)
+
+
+def test_signal_model_keeps_its_contract():
+    model = small_signal_model()
+    pixels = torch.tensor([0, 17, 5, 71])
+    assert isinstance(model, noiseflow.SignalModel)
+    torch.testing.assert_close(model(pixels), model.signal()[pixels])
+    with torch.no_grad():
+        torch.testing.assert_close(model(pixels), model.signal()[pixels])
+    assert model.num_pixels == model.signal().numel() == 72
+
+
+def test_signal_without_gradients_follows_every_step():
+    model = small_signal_model()
+    optimiser = torch.optim.Adam(model.parameter_groups(), fused=True)
+    everything = torch.arange(72)
+    for _ in range(3):
+        (model.signal().sum() + model.penalty()).backward()
+        optimiser.step()
+        with torch.no_grad():
+            torch.testing.assert_close(model(everything), model.signal())
+            model.field.values.add_(0.1)
+            torch.testing.assert_close(model(everything), model.signal())
+
+
+def test_penalty_does_not_depend_on_the_unit_of_attenuation():
+    small, large = small_signal_model(), small_signal_model()
+    with torch.no_grad():
+        large.field.scale.mul_(7.0)
+        small.field.values.add_(torch.rand(5, 6, 4, generator=torch.Generator().manual_seed(0)))
+        large.field.values.copy_(small.field.values)
+    torch.testing.assert_close(small.penalty(), large.penalty())
+    torch.testing.assert_close(small_signal_model(weight=0.0).penalty(), torch.tensor(0.0))
+
+
+def test_rails_are_found_only_where_readings_pile_up():
+    generator = np.random.default_rng(0)
+    unclipped = generator.normal(0.5, 0.3, 20000).astype(np.float32)
+    assert find_rails(unclipped) == (-np.inf, np.inf)
+    assert find_rails(unclipped.clip(0, 1)) == (0.0, 1.0)
+    assert find_rails(unclipped.clip(-9, 1)) == (-np.inf, 1.0)
+    assert find_rails(np.round(unclipped * 50)) == (-np.inf, np.inf)
+    assert find_rails(np.round(unclipped.clip(0, 1) * 255).astype(np.uint8)) == (0.0, 255.0)
+
+
+def test_automatic_noise_model_fits_the_detector():
+    images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
+    assert isinstance(automatic_noise_model(images), noiseflow.RadialFlow)
+    assert automatic_noise_model(images.clip(0, 1)).high == 1.0
+    assert automatic_noise_model((images * 100).astype(np.int16)).step == 1.0
+
+
+def test_held_out_pixels_come_in_blocks():
+    mask = block_mask((5, 42, 38), share=0.2, generator=torch.Generator().manual_seed(0))
+    assert mask.shape == (5, 42, 38)
+    assert float(mask.float().mean()) == pytest.approx(0.2, abs=0.05)
+    blocks = mask[:, :40, :36].reshape(5, 10, 4, 9, 4).float().mean((2, 4))
+    assert set(blocks.unique().tolist()) == {0.0, 1.0}
+
+
+def test_first_guess_of_the_response(scene):
+    _, clean, _ = scene
+    response = estimate_response(clean)
+    assert isinstance(response, Transmission)
+    assert float(response.intensity) == pytest.approx(1.0, abs=0.02)
+    linear = estimate_response(TiltSeries(5 - 3 * np.log(clean.images), clean.tilt_angles, mode="linear"))
+    assert isinstance(linear, Linear)
+    assert float(linear.offset) == pytest.approx(5.0, abs=0.1)
+
+
+def test_joint_fit_beats_least_squares_at_its_best_weight(scene):
+    truth, clean, noisy = scene
+    least_squares = [
+        JointReconstructor(weight=weight, noise_model=lambda images: noiseflow.Gaussian(), num_steps=100)(noisy)
+        for weight in (0.05, 0.1, 0.2, 0.4)
+    ]
+    best = max(compare(result.volume.attenuation, truth).psnr for result in least_squares)
+    best_projections = max(compare(result.projections, clean.images).psnr for result in least_squares)
+    joint = JointReconstructor(weight=0.3, num_steps=100)(noisy)
+    assert compare(joint.volume.attenuation, truth).psnr > best + 0.1
+    assert compare(joint.projections, clean.images).psnr > best_projections + 1
+
+
+def test_grid_of_another_height_is_refused(scene):
+    with pytest.raises(ValueError, match="voxels high"):
+        JointReconstructor()(scene[2], VolumeGrid(32, 31, 32))

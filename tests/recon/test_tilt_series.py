@@ -1,0 +1,84 @@
+"""Tilt series in and out, and every refusal."""
+
+import numpy as np
+import pytest
+
+from noiseflow import io
+from recon.tilt_series import TiltSeries, Volume, VolumeGrid, read_angles, read_tilt_series, write_tilt_series
+
+ANGLES = np.array([-40.0, 0.0, 40.0])
+
+
+def images():
+    return np.random.default_rng(0).random((3, 6, 8)).astype(np.float32)
+
+
+def test_round_trip_keeps_pixels_angles_and_pixel_size(tmp_path):
+    series = TiltSeries(images(), ANGLES, 4.5, "linear")
+    write_tilt_series(tmp_path / "tilts.mrc", series)
+    back = read_tilt_series(tmp_path / "tilts.mrc", mode="linear")
+    np.testing.assert_array_equal(back.images, series.images)
+    np.testing.assert_allclose(back.tilt_angles, ANGLES)
+    assert back.pixel_size == pytest.approx(4.5)
+
+
+def test_volume_carries_its_voxel_size(tmp_path):
+    Volume(images(), 4.5).write(tmp_path / "volume.mrc")
+    assert io.read(tmp_path / "volume.mrc").voxel_size == pytest.approx((4.5, 4.5, 4.5))
+
+
+def test_grid_of_a_series():
+    assert VolumeGrid.of(TiltSeries(images(), ANGLES, 2.0)).shape == (8, 6, 8)
+    assert VolumeGrid.of(TiltSeries(images(), ANGLES), thickness=5).shape == (5, 6, 8)
+    with pytest.raises(ValueError, match="thickness"):
+        VolumeGrid.of(TiltSeries(images(), ANGLES), thickness=0)
+
+
+@pytest.mark.parametrize(
+    ("stack", "angles", "words"),
+    [
+        (images(), ANGLES[:2], "3 images and there are 2"),
+        (images()[0], ANGLES[:1], "stack"),
+        (images()[:1], ANGLES[:1], "at least two"),
+        (np.where(np.arange(8) == 3, np.nan, images()), ANGLES, "NaN"),
+        (np.ones((3, 6, 8)), ANGLES, "flat"),
+        (images(), np.array([0.0, np.nan, 1.0]), "NaN"),
+        (images(), np.zeros(3), "different angles"),
+    ],
+)
+def test_wrong_series_is_refused(stack, angles, words):
+    with pytest.raises(ValueError, match=words):
+        TiltSeries(stack, angles)
+
+
+def test_wrong_mode_is_refused():
+    with pytest.raises(ValueError, match="linear"):
+        TiltSeries(images(), ANGLES, mode="haadf")
+
+
+def test_radians_and_repeated_angles_are_pointed_out():
+    with pytest.warns(UserWarning, match="radians"):
+        TiltSeries(images(), np.deg2rad(ANGLES))
+    with pytest.warns(UserWarning, match="more than once"):
+        TiltSeries(images(), np.array([-40.0, 0.0, 0.0]))
+
+
+def test_missing_and_broken_angle_files(tmp_path):
+    io.write(tmp_path / "tilts.mrc", images())
+    with pytest.raises(FileNotFoundError, match="--angles"):
+        read_tilt_series(tmp_path / "tilts.mrc")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        read_tilt_series(tmp_path / "tilts.mrc", angles=tmp_path / "none.tlt")
+    broken = tmp_path / "broken.tlt"
+    broken.write_text("1.0\nabc\n")
+    with pytest.raises(ValueError, match="line 2: 'abc'"):
+        read_angles(broken)
+    broken.write_text("\n")
+    with pytest.raises(ValueError, match="no angles"):
+        read_angles(broken)
+
+
+def test_angles_are_found_beside_the_stack(tmp_path):
+    io.write(tmp_path / "tilts.mrc", images())
+    (tmp_path / "tilts.tlt").write_text("-40\n0\n\n40\n")
+    np.testing.assert_allclose(read_tilt_series(tmp_path / "tilts.mrc").tilt_angles, ANGLES)
