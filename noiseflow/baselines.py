@@ -36,7 +36,7 @@ class Gaussian(nn.Module):
         return {}
 
     def extra_repr(self) -> str:
-        return f"scale={math.exp(float(self.log_scale)):.4g}"
+        return f"scale={math.exp(self.log_scale.item()):.4g}"
 
 
 class GaussianDistribution(LatentDistribution):
@@ -98,7 +98,7 @@ class Poisson(nn.Module):
         return {}
 
     def extra_repr(self) -> str:
-        return f"gain={math.exp(float(self.log_gain)):.4g}, offset={float(self.offset):.4g}"
+        return f"gain={math.exp(self.log_gain.item()):.4g}, offset={self.offset.item():.4g}"
 
 
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,7 +137,12 @@ class PoissonDistribution(NoiseDistribution):
 
     def cdf(self, value: Tensor) -> Tensor:
         # the small shift lets a value computed as gain·k + offset count as having reached k
-        count = torch.floor(self._count(value) + 1e-3)
+        return self._mass_up_to(torch.floor(self._count(value) + 1e-3))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self._mass_up_to(torch.ceil(self._count(value) - 1e-3) - 1)
+
+    def _mass_up_to(self, count: Tensor) -> Tensor:
         mass = torch.special.gammaincc((count + 1).clamp(min=1), self.rate.expand_as(count))
         return torch.where(count >= 0, mass, torch.zeros_like(mass))
 

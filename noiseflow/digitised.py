@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -81,7 +81,14 @@ class DigitisedDistribution(NoiseDistribution):
         return self.base.log_interval_prob(self._edge(low), self._edge(high))
 
     def cdf(self, value: Tensor) -> Tensor:
-        edge = self._edge(value)
+        return self._base_cdf(self._edge(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        edge = self._level(value, torch.ceil) - self.step / 2 if self.step > 0 else value
+        edge = torch.where(value <= self.low, torch.full_like(edge, -math.inf), edge)
+        return self._base_cdf(torch.where(value > self.high, torch.full_like(edge, math.inf), edge))
+
+    def _base_cdf(self, edge: Tensor) -> Tensor:
         finite = torch.isfinite(edge)
         inside = self.base.cdf(torch.where(finite, edge, torch.zeros_like(edge)))
         return torch.where(finite, inside, (edge > 0).to(inside.dtype))
@@ -92,12 +99,13 @@ class DigitisedDistribution(NoiseDistribution):
         edge = torch.where(value < self.low, torch.full_like(edge, -math.inf), edge)
         return torch.where(value >= self.high, torch.full_like(edge, math.inf), edge)
 
-    def _level(self, value: Tensor, rounding: Any) -> Tensor:
+    def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
         origin = self.low if math.isfinite(self.low) else 0.0
         steps = (value - origin) / self.step
-        if rounding is torch.floor:  # a level itself must not fall below itself by rounding error
-            steps = steps + 1e-4
-        return rounding(steps) * self.step + origin
+        nearest = torch.round(steps)
+        on_level = (steps - nearest).abs() < 1e-3  # a level itself must not leave itself by rounding error
+        level: Tensor = torch.where(on_level, nearest, rounding(steps))
+        return level * self.step + origin
 
     def digitise(self, value: Tensor) -> Tensor:
         """Round and clip undigitised readings."""

@@ -36,6 +36,10 @@ class NoiseDistribution(Distribution):
     def cdf(self, value: Tensor) -> Tensor:
         """P(observation ≤ value)."""
 
+    def cdf_below(self, value: Tensor) -> Tensor:
+        """P(observation < value); differs from `cdf` only where single readings have mass."""
+        return self.cdf(value)
+
     @abstractmethod
     def icdf(self, value: Tensor) -> Tensor:
         """The quantile: smallest observation whose CDF reaches `value`."""

@@ -192,8 +192,7 @@ def probability_integral_transform(
     values = []
     for s, o in zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True):
         distribution = noise_model(s)
-        below = distribution.cdf(torch.nextafter(o, torch.full_like(o, -math.inf)) - 1e-3 * getattr(distribution, "step", 0.0))
-        values.append(torch.stack([below, distribution.cdf(o)]).double().cpu().numpy())
+        values.append(torch.stack([distribution.cdf_below(o), distribution.cdf(o)]).double().cpu().numpy())
     below, at = np.concatenate(values, axis=1)
     return np.asarray(below + random.random(below.shape) * np.maximum(at - below, 0))
 
@@ -203,3 +202,22 @@ def kolmogorov_smirnov(u: NDArray[np.float64]) -> float:
     ordered = np.sort(u)
     steps = np.arange(u.size + 1) / u.size
     return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
+
+
+TABLE_HEADER = ("model", "NLL (nats/px)", "± s.e.", "JSD ×100", "floor", "JSD/signal bin", "floor", "1−BC ×100", "floor", "BD ×100", "floor", "KS")
+
+
+def table_row(name: str, evaluation: Evaluation) -> list[str]:
+    """The cells of `TABLE_HEADER` for one model."""
+    overall = evaluation.overall
+    percent = (
+        overall.jsd,
+        overall.jsd_floor,
+        evaluation.mean_jsd,
+        evaluation.mean_jsd_floor,
+        1 - overall.bc,
+        1 - overall.bc_floor,
+        overall.bd,
+        overall.bd_floor,
+    )
+    return [name, f"{evaluation.nll:.4f}", f"{evaluation.nll_error:.4f}", *(f"{100 * p:.3f}" for p in percent), f"{evaluation.ks:.4f}"]
