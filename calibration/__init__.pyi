@@ -1,7 +1,7 @@
 from .align import Registration as Registration
 from .align import register as register
 from .aligned import AlignedPair as AlignedPair
-from .aligned import align as align
+from .aligned import align_pair as align_pair
 from .exposures import Burst as Burst
 from .exposures import ExposurePair as ExposurePair
 from .exposures import read_burst as read_burst

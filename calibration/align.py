@@ -32,8 +32,8 @@ MINIMUM_OVERLAP = 0.25
 """Fraction of the short frame that the long one must cover."""
 
 CLEAR_PEAK = 8.0
-"""Standard deviations by which the correlation of registered frames must stand out at zero shift. Unrelated frames reach 5.5
-once the search over shifts, rotations and motions has picked their best."""
+"""Standard deviations by which the correlation of registered frames must stand out at zero shift. Unrelated frames
+reach 5.5 once the search over shifts, rotations and motions has picked their best."""
 
 LARGEST_ERROR = 0.5
 """Standard error, in pixels, above which a transform is too uncertain to use."""
@@ -71,7 +71,9 @@ class Registration:
     @property
     def rotation(self) -> float:
         """Degrees, positive from x towards y."""
-        return float(np.degrees(np.arctan2(self.matrix[1, 0] - self.matrix[0, 1], self.matrix[0, 0] + self.matrix[1, 1])))
+        return float(
+            np.degrees(np.arctan2(self.matrix[1, 0] - self.matrix[0, 1], self.matrix[0, 0] + self.matrix[1, 1]))
+        )
 
     @property
     def scale(self) -> float:
@@ -87,8 +89,8 @@ class Registration:
     def warp(self, long: Image) -> tuple[Image, NDArray[np.bool_]]:
         """The long frame on the short one's pixels, and which of them it covers (a pixel off its border).
 
-        A shift below a hundredth of a pixel is not worth the smoothing of an interpolation: the frame is then returned as it is.
-        """
+        A shift below a hundredth of a pixel is not worth the smoothing of an interpolation: the frame is then
+            returned as it is."""
         import cv2
 
         size = long.shape[::-1]
@@ -97,23 +99,26 @@ class Registration:
             return long, np.ones(long.shape, bool)
         flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
         warped = cv2.warpAffine(long, self.matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
-        return warped, covered(self.matrix, long.shape)
+        return np.asarray(warped, float), covered(self.matrix, long.shape)
 
 
 def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:
     """Which pixels of the short frame fall inside the long one, `border` pixels off its edge."""
     row, column = np.indices(shape)
     x, y = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([column, row])) + matrix[:, 2][:, None, None]
-    return (x >= border) & (x <= shape[1] - 1 - border) & (y >= border) & (y <= shape[0] - 1 - border)
+    inside: NDArray[np.bool_] = (
+        (x >= border) & (x <= shape[1] - 1 - border) & (y >= border) & (y <= shape[0] - 1 - border)
+    )
+    return inside
 
 
 def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short", "the long exposure")) -> Registration:
     """Find the transform from the short frame to the long one.
 
     SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
-    has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to sub-pixel
-    accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion prefers. A guess counts
-    only if the registered frames then correlate clearly, and best at zero shift.
+    has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
+    sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
+    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift.
 
     Args:
         short: (y, x) detector units.
@@ -136,7 +141,8 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
             if found is not None:
                 return found
     reason = (
-        f"they overlap by {overlap:.0%} only" if overlap < MINIMUM_OVERLAP
+        f"they overlap by {overlap:.0%} only"
+        if overlap < MINIMUM_OVERLAP
         else f"SIFT found {most_matches} consistent matches and their correlation has no clear peak"
     )
     raise ValueError(
@@ -178,7 +184,9 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not found:
         return None
     mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
-    motion = max(found, key=lambda name: _information(short, long, found[name], mask) - MOTIONS[name] * np.log(mask.sum()))
+    motion = max(
+        found, key=lambda name: _information(short, long, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
+    )
     matrix = found[motion]
     checks = [correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0)]
     clear = [abs(peak) for peak, distance in checks if abs(peak) >= CLEAR_PEAK and distance <= SEARCH_MARGIN]
@@ -188,7 +196,9 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
-    return Registration(matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, max(clear), sign < 0)
+    return Registration(
+        matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, max(clear), sign < 0
+    )
 
 
 def _restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
@@ -204,7 +214,9 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
     """Refine a transform by the enhanced correlation coefficient, coarse then fine; None where it diverges."""
     import cv2
 
-    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[motion]
+    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
+        motion
+    ]
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     matrix = start.astype(np.float32)
     for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
@@ -217,7 +229,8 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
 
 
 def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool_]) -> float:
-    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one, nats."""
+    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one,
+    nats."""
     coefficient = np.corrcoef(short[mask], _interpolated(long, matrix)[mask])[0, 1]
     return float(-mask.sum() * np.log1p(-(coefficient**2)))
 

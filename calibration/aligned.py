@@ -26,6 +26,7 @@ class AlignedPair:
 
     Attributes:
         short: (y, x) counts.
+        long: (y, x) as recorded.
         signal: (y, x) the long exposure warped and scaled onto it, counts.
         mask: (y, x) pixels to trust.
         registration: how the long exposure was warped.
@@ -37,6 +38,7 @@ class AlignedPair:
     """
 
     short: Image
+    long: Image
     signal: Image
     mask: Mask
     registration: Registration
@@ -62,12 +64,12 @@ def share_of(part: VarianceLine, total: VarianceLine, signal: Image) -> Image:
     return np.clip(part(signal) / np.maximum(total(signal), np.finfo(float).tiny), 0.0, 0.9)
 
 
-def align(pair: ExposurePair) -> AlignedPair:
+def align_pair(pair: ExposurePair) -> AlignedPair:
     """Register a pair, warp the long exposure onto the short one, and bring both to one scale.
 
     Raises:
-        ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier one, or
-            it is a copy of the short one.
+        ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier
+            one, or it is a copy of the short one.
     """
     registration = register(pair.short, pair.long, names=(pair.short_name, pair.long_name))
     long, covered = registration.warp(pair.long)
@@ -86,7 +88,9 @@ def align(pair: ExposurePair) -> AlignedPair:
     _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead
     counts = MaskCounts(*(int(m.sum()) for m in (~covered, (railed & trusted) | lost, hot, dead)))
-    return AlignedPair(pair.short, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio)
+    return AlignedPair(
+        pair.short, pair.long, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio
+    )
 
 
 def block_split(
@@ -126,8 +130,8 @@ def _near_rail(short: Image, signal: Image, mask: Mask) -> Mask:
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
     if mask.sum() < MINIMUM_PIXELS:
         raise ValueError(
-            f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the rest are saturated, defective or not in "
-            f"{pair.long_name}: give exposures that overlap more, or that are not saturated"
+            f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the rest are saturated, defective "
+            f"or not in {pair.long_name}: give exposures that overlap more, or that are not saturated"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ class ExposurePair:
         _require_same_size(self.short, self.short_name, self.long, self.long_name)
         if np.array_equal(self.short, self.long):
             raise ValueError(
-                f"{self.short_name} and {self.long_name} hold identical pixels; give two separate exposures of one scene"
+                f"{self.short_name} and {self.long_name} hold identical pixels; "
+                "give two separate exposures of one scene"
             )
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
@@ -78,7 +80,7 @@ class Burst:
                 "exposure with it, or a burst of at least two equal exposures"
             )
         checked = [checked_frame(frame, f"{self.name}, frame {i}") for i, frame in enumerate(frames)]
-        for i, (first, second) in enumerate(zip(checked, checked[1:], strict=False)):
+        for i, (first, second) in enumerate(pairwise(checked)):
             if np.array_equal(first, second):
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} hold identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
@@ -100,9 +102,13 @@ def checked_frame(data: NDArray[Any], name: str) -> Image:
     if data.ndim == 3 and min(data.shape[0], data.shape[-1]) <= 4:
         raise ValueError(f"{name} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim != 2:
-        raise ValueError(f"{name} has shape {data.shape}; one 2D frame is needed here (a stack alone is read as a burst)")
+        raise ValueError(
+            f"{name} has shape {data.shape}; one 2D frame is needed here (a stack alone is read as a burst)"
+        )
     if min(data.shape) < MINIMUM_SIDE:
-        raise ValueError(f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {MINIMUM_SIDE} per side are needed")
+        raise ValueError(
+            f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {MINIMUM_SIDE} per side are needed"
+        )
     require_finite(data, name)
     rail = saturation_level(data)
     saturated = float(np.mean(data >= rail))
@@ -155,7 +161,8 @@ def read_pairs(
     """
     if len(long) not in (1, len(short)) or not short:
         raise ValueError(
-            f"{len(short)} short and {len(long)} long exposures were given; give one long exposure per short one, or one for all"
+            f"{len(short)} short and {len(long)} long exposures were given; "
+            "give one long exposure per short one, or one for all"
         )
     longs = list(long) * (len(short) if len(long) == 1 else 1)
     for one, other in zip(short, longs, strict=True):

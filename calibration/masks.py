@@ -27,10 +27,11 @@ class MaskCounts:
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
-    """Hot and dead pixels: those that differ from their neighbours in the same direction in every frame of one detector.
+    """Hot and dead pixels: those that differ from their neighbours in the same direction in every frame of one
+    detector.
 
-    Judged in detector coordinates, before any frame is warped. A real feature of the scene spreads over neighbours through the
-    optics; a single noisy reading does not repeat.
+    Judged in detector coordinates, before any frame is warped. A real feature of the scene spreads over neighbours
+    through the optics; a single noisy reading does not repeat.
 
     Args:
         frames: (frame, y, x).

@@ -48,7 +48,8 @@ def feature_guesses(short: Image, long: Image) -> Iterator[Guess]:
 
 
 def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0) -> list[Guess]:
-    """Guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without features.
+    """Guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without
+    features.
 
     Args:
         short: (y, x).
@@ -75,7 +76,7 @@ def band_pass(image: Image, blur: float) -> Image:
     """Remove noise finer than `blur` pixels and shading coarser than eight times that; mean 0, standard deviation 1."""
     band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, 8 * blur)
     band = np.clip(band, *np.percentile(band, (0.05, 99.95)))
-    return (band - band.mean()) / max(band.std(), np.finfo(float).tiny)
+    return np.asarray((band - band.mean()) / max(band.std(), np.finfo(float).tiny))
 
 
 def correlation_surface(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
@@ -154,14 +155,18 @@ def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
 
 
 def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image]:
-    """Height of the correlation's highest peak of either sign when `second` is turned back by `angle`, and its matrix."""
+    """Height of the correlation's highest peak of either sign when `second` is turned back by `angle`, and its
+    matrix."""
     import cv2
 
     turn = about_centre(angle, first.shape)
     turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    surface = np.abs(correlation_surface(first, turned))
+    surface = np.abs(correlation_surface(first, np.asarray(turned, float)))
     row, column = np.unravel_index(np.argmax(surface), surface.shape)
-    shift = [float(index if index < size / 2 else index - size) for index, size in zip((column, row), surface.shape[::-1], strict=True)]
+    shift = [
+        float(index if index < size / 2 else index - size)
+        for index, size in zip((column, row), surface.shape[::-1], strict=True)
+    ]
     matrix = turn.copy()
     matrix[:, 2] += turn[:, :2] @ np.array(shift)
     return float(surface[row, column]), matrix

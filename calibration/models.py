@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from calibration.aligned import AlignedPair, block_split
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
     from noiseflow.console import Progress
+    from noiseflow.metrics import Evaluation
 
 KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
@@ -60,9 +61,7 @@ class ModelScore:
         nll_error: its standard error, from the scatter between blocks.
         excess: nll above the best model's, nats per pixel.
         excess_error: its standard error, paired block by block.
-        jsd, bc, bd: Jensen-Shannon divergence (nats), Bhattacharyya coefficient and distance of the residuals' histogram from
-            the model's own bin masses.
-        jsd_floor, bc_floor, bd_floor: what the same number of the model's own samples would give.
+        evaluation: divergences of the residuals' histogram from the model's own bin masses, each with its floor; PIT.
     """
 
     name: str
@@ -71,12 +70,7 @@ class ModelScore:
     nll_error: float
     excess: float
     excess_error: float
-    jsd: float
-    jsd_floor: float
-    bc: float
-    bc_floor: float
-    bd: float
-    bd_floor: float
+    evaluation: Evaluation
 
 
 def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: float = 0.5) -> Pixels:
@@ -99,7 +93,12 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
 
 
 def fit_models(
-    pixels: Pixels, *, kinds: Sequence[str] = tuple(KINDS), seed: int = 0, device: Any = "cpu", progress: Progress | None = None
+    pixels: Pixels,
+    *,
+    kinds: Sequence[str] = tuple(KINDS),
+    seed: int = 0,
+    device: Any = "cpu",
+    progress: Progress | None = None,
 ) -> list[ModelScore]:
     """Fit noise models and judge them on the pixels kept apart.
 
@@ -122,13 +121,18 @@ def fit_models(
         models[name] = _fitted(name, pixels, seed, device, told)
         losses[name] = _losses(models[name], pixels)
     best = min(losses, key=lambda name: float(losses[name].mean()))
-    judged = pixels.block[pixels.held_out]
-    return [_score(name, models[name], losses[name], losses[best], judged, pixels) for name in models]
+    return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in models]
 
 
 def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
     """The simplest model whose held-out likelihood lies within one standard error of the best one's."""
     return next(score for score in sorted(scores, key=lambda s: _rank(s.name)) if score.excess <= score.excess_error)
+
+
+def require_kind(name: str) -> None:
+    """Refuse, before long work, a kind of model that does not exist."""
+    if name != "auto":
+        _rank(name)
 
 
 def _rank(name: str) -> int:
@@ -149,7 +153,7 @@ def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progres
     torch.manual_seed(seed)
     options = {"mean_preserving": True} if name in ("flow", "spline") else {}
     model: nn.Module = getattr(noiseflow, KINDS[name])(**options).to(device)
-    signal, observation = (torch.from_numpy(x[~pixels.held_out]).float().to(device) for x in (pixels.signal, pixels.observation))
+    signal, observation = (values.to(device) for values in _tensors(pixels, ~pixels.held_out))
     stopping = torch.from_numpy(pixels.block[~pixels.held_out] % 10 == 0).to(device)
     generator = torch.Generator().manual_seed(seed)
     noiseflow.fit(
@@ -158,18 +162,41 @@ def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progres
     return model.cpu().eval()
 
 
+def _score(
+    name: str,
+    model: nn.Module,
+    losses: NDArray[np.float64],
+    best: NDArray[np.float64],
+    pixels: Pixels,
+    seed: int,
+) -> ModelScore:
+    from noiseflow.metrics import evaluate
+
+    block = pixels.block[pixels.held_out]
+    excess = (0.0, 0.0) if losses is best else _mean_and_error(losses - best, block)
+    evaluation = evaluate(model, *_tensors(pixels, pixels.held_out), seed=seed)
+    return ModelScore(name, model, *_mean_and_error(losses, block), *excess, evaluation)
+
+
 def _losses(model: nn.Module, pixels: Pixels) -> NDArray[np.float64]:
     """Negative log-likelihood of each pixel kept apart, nats."""
+    from noiseflow.metrics import pixel_log_prob
+
+    return -np.asarray(pixel_log_prob(model, *_tensors(pixels, pixels.held_out)).numpy())
+
+
+def _tensors(pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
     import torch
 
-    signal, observation = (torch.from_numpy(x[pixels.held_out]).float() for x in (pixels.signal, pixels.observation))
-    parts = zip(signal.split(65536), observation.split(65536), strict=True)
-    with torch.no_grad():
-        return np.asarray(torch.cat([-model(s).log_prob(o) for s, o in parts]).double().numpy())
+    signal, observation = (torch.from_numpy(values[chosen]).float() for values in (pixels.signal, pixels.observation))
+    return signal, observation
 
 
 def _mean_and_error(values: NDArray[np.float64], block: NDArray[np.int64]) -> tuple[float, float]:
     """Mean, and its standard error from the scatter of whole blocks (pixels of one block may err alike)."""
+    mean = float(values.mean())
+    if not np.isfinite(mean):  # a reading that the model holds impossible
+        return mean, float("nan")
     _, index = np.unique(block, return_inverse=True)
-    departure = np.bincount(index, values - values.mean())
-    return float(values.mean()), float(np.sqrt(np.sum(departure**2)) / len(values))
+    departure = np.bincount(index, values - mean)
+    return mean, float(np.sqrt(np.sum(departure**2)) / len(values))

@@ -1,4 +1,4 @@
-"""One scale for two exposures: slope, intercept and the long exposure's own noise, without its bias (errors in variables)."""
+"""One scale for two exposures that are both noisy: slope, intercept and the long one's own noise."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Scaling:
     """signal = slope·long + intercept, in the short exposure's units.
 
     Attributes:
-        slope: counts of the short exposure per unit of the long one; its inverse estimates the exposure ratio where both
-            come from one detector setting.
+        slope: counts of the short exposure per unit of the long one; its inverse estimates the exposure ratio where
+            both come from one detector setting.
         intercept: counts.
         slope_error: standard error of the slope.
         intercept_error: standard error of the intercept.
@@ -34,7 +34,8 @@ class Scaling:
 
 @dataclass(frozen=True)
 class VarianceLine:
-    """A variance that grows linearly with the signal, as shot noise with read noise does: floor + rate·signal, counts²."""
+    """A variance that grows linearly with the signal, as shot noise with read noise does: floor + rate·signal,
+    counts²."""
 
     floor: float
     rate: float
@@ -47,9 +48,10 @@ class VarianceLine:
 def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 4) -> Scaling:
     """Scale and offset between registered exposures by instrumental variables, robust against outliers.
 
-    Least squares of the short on the long exposure would be too flat, because the long one is noisy itself. The neighbours
-    of each pixel in the short frame know its signal but neither pixel's noise, so they serve as the instrument
-    (doi:10.1257/jep.15.4.69). Levels are weighted by their inverse variance, residuals above six of its roots left out.
+    Least squares of the short on the long exposure would be too flat, because the long one is noisy itself. The
+    neighbours of each pixel in the short frame know its signal but neither pixel's noise, so they serve as the
+    instrument (doi:10.1257/jep.15.4.69). Levels are weighted by their inverse variance, residuals above six of its
+    roots left out.
 
     Args:
         short: (y, x) counts.
@@ -82,11 +84,13 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
     return Scaling(float(slope), float(intercept), float(error), float(np.hypot(level, error * centre)))
 
 
-def own_variance(short: Image, long: Image, mask: Mask, scaling: Scaling, warp: Callable[[Image], Image]) -> VarianceLine:
+def own_variance(
+    short: Image, long: Image, mask: Mask, scaling: Scaling, warp: Callable[[Image], Image]
+) -> VarianceLine:
     """The noise variance of the signal estimate itself, as a line in the signal, counts².
 
-    The finest band of the long frame, before any interpolation, holds its noise and what detail the scene has there. That
-    detail is common to both exposures, so their covariance in this band takes it out.
+    The finest band of the long frame, before any interpolation, holds its noise and what detail the scene has there.
+    That detail is common to both exposures, so their covariance in this band takes it out.
 
     Args:
         short: (y, x) counts.
@@ -111,7 +115,8 @@ def finest_band(image: Image) -> Image:
 
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
-    """Least-squares line through squared residuals, weighted by their expected spread (that of a variance is the variance)."""
+    """Least-squares line through squared residuals, weighted by their expected spread (that of a variance is the
+    variance)."""
     centre = signal.mean()
     design = np.stack([np.ones_like(signal), signal - centre])
     weight = np.ones_like(signal)
@@ -123,16 +128,20 @@ def fit_line(signal: Image, squares: Image) -> VarianceLine:
 
 
 def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
-    """Gaussian mean of each pixel's neighbours in the mask, leaving out those within `inner` rows and columns of itself."""
+    """Gaussian mean of each pixel's neighbours in the mask, leaving out those within `inner` rows and columns of
+    itself."""
     weight = _ring_sum(mask.astype(float), inner, blur)
     total = _ring_sum(np.where(mask, image, 0.0), inner, blur)
-    return np.divide(total, weight, out=image.astype(float), where=weight > 1e-6)
+    result: Image = np.divide(total, weight, out=image.astype(float), where=weight > 1e-6)
+    return result
 
 
 def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     radius = int(np.ceil(3 * blur))
     profile = np.exp(-0.5 * (np.arange(-radius, radius + 1) / blur) ** 2)
-    whole = ndimage.convolve1d(ndimage.convolve1d(image, profile, axis=0, mode="constant"), profile, axis=1, mode="constant")
+    whole = ndimage.convolve1d(
+        ndimage.convolve1d(image, profile, axis=0, mode="constant"), profile, axis=1, mode="constant"
+    )
     middle = profile[radius - inner : radius + inner + 1]
     return np.asarray(whole - ndimage.convolve(image, np.outer(middle, middle), mode="constant"))
 
@@ -143,4 +152,4 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> I
     groups = np.array_split(order, max(1, min(num_levels, len(order) // 50)))
     centres = np.array([level[group].mean() for group in groups])
     spreads = np.array([np.subtract(*np.percentile(residual[group], (84.13, 15.87))) / 2 for group in groups])
-    return np.maximum(np.interp(level, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny))
+    return np.asarray(np.maximum(np.interp(level, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))

@@ -28,7 +28,8 @@ def textured_scene(generator: np.random.Generator, size: int) -> Scene:
     """A smooth random field with detail from 2 to 20 pixels, between 0 and 1, defined at every real position."""
     pad = size // 3
     field = sum(
-        ndimage.gaussian_filter(generator.standard_normal((size + 2 * pad,) * 2), blur) * blur for blur in (2.0, 6.0, 20.0)
+        ndimage.gaussian_filter(generator.standard_normal((size + 2 * pad,) * 2), blur) * blur
+        for blur in (2.0, 6.0, 20.0)
     )
     field = (field - field.min()) / np.ptp(field)
     coefficients = ndimage.spline_filter(field, 5)

@@ -1,0 +1,128 @@
+"""`noiseflow calibrate` end to end, and one clear line for each bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import noiseflow
+from calibration.models import KINDS
+from noiseflow.cli import main
+from noiseflow.io import write
+
+RANDOM = np.random.default_rng(1)
+
+
+@pytest.fixture
+def folder(tmp_path, exposures):
+    """Good and broken exposures in files, with an empty folder beside them for the output."""
+    (tmp_path / "out").mkdir()
+    files = {
+        "short": exposures.short,
+        "long": exposures.long,
+        "narrow": exposures.long[:, :-1],
+        "flat": np.full_like(exposures.short, 7),
+        "nan": np.where(np.indices(exposures.short.shape).sum(0) == 5, np.nan, exposures.short),
+        "noise": RANDOM.poisson(50, exposures.short.shape),
+        "saturated": np.where(RANDOM.random(exposures.short.shape) < 0.8, 4095, exposures.short),
+        "stack3": np.stack([exposures.short] * 5),
+    }
+    for name, data in files.items():
+        write(tmp_path / f"{name}.tif", data.astype(np.float32))
+    write(tmp_path / "rgb.tif", np.stack([exposures.short.clip(0, 255)] * 3, -1).astype(np.uint8))
+    whole = (tmp_path / "short.tif").read_bytes()
+    (tmp_path / "truncated.tif").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty.tif").write_bytes(b"")
+    return tmp_path
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(["calibrate", *arguments])
+    return int(stopped.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("short", "long", "message"),
+    [
+        ("missing", "long", "does not exist"),
+        ("empty", "long", "empty"),
+        ("truncated", "long", "damaged or truncated"),
+        ("short", "narrow", "one size"),
+        ("nan", "long", "NaN"),
+        ("flat", "long", "flat"),
+        ("saturated", "long", "saturated"),
+        ("rgb", "long", "colour"),
+        ("stack3", "long", "one 2D frame"),
+        ("short", "short", "short and as long"),
+        ("long", "short", "swap"),
+        ("noise", "long", "cannot be registered"),
+    ],
+)
+def test_bad_exposures_give_one_line_and_no_file(folder, capsys, short, long, message):
+    code = run(
+        "--short", f"{folder}/{short}.tif", "--long", f"{folder}/{long}.tif", "-o", f"{folder}/out/m.safetensors"
+    )
+    error = capsys.readouterr().err.strip()
+    assert code == 1
+    assert message in error
+    assert "\n" not in error
+    assert list((folder / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (("--exposure-ratio", "0.5"), "above 1"),
+        (("--kind", "gauss"), "unknown kind"),
+        (("--device", "tpu"), "choose auto"),
+    ],
+)
+def test_bad_options_are_refused_before_any_work(folder, capsys, extra, message):
+    files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/out/m.safetensors")
+    assert run(*files, *extra) == 1
+    assert message in capsys.readouterr().err
+    assert list((folder / "out").iterdir()) == []
+
+
+def test_pair_in_model_and_report_out(folder, capsys):
+    model, report = folder / "out" / "m.safetensors", folder / "out" / "report"
+    files = (
+        "--short",
+        f"{folder}/short.tif",
+        "--long",
+        f"{folder}/long.tif",
+        "-o",
+        str(model),
+        "--report",
+        str(report),
+    )
+    assert run(*files, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert set(result["models"]) == set(KINDS)
+    assert {"nll", "jsd", "jsd_floor", "bc", "bd"} <= set(result["models"]["flow"])
+    assert {"rms_px", "inliers", "matrix"} <= set(result["registration"][0])
+    assert result["models"][result["kind"]]["excess"] <= result["models"][result["kind"]]["excess_error"]
+    assert result["models"]["gaussian"]["excess"] > 4 * result["models"]["gaussian"]["excess_error"]
+    assert type(noiseflow.load(model)).__name__ == KINDS[result["kind"]]
+    page = (report / "report.html").read_text()
+    assert page.count("data:image/png") >= 2
+    assert "suffices" in page
+
+
+def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
+    monkeypatch.setattr("calibration.models.NUM_STEPS", 40)
+    model = folder / "out" / "m.safetensors"
+    files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", str(model))
+    assert run(*files, "--kind", "signal-gaussian") == 0
+    assert type(noiseflow.load(model)).__name__ == "SignalDependentGaussian"
+    assert "held-out NLL" in capsys.readouterr().out
+
+
+def test_help_needs_no_torch():
+    code = "import sys, calibration.cli; sys.exit(any(m in sys.modules for m in ('torch', 'cv2', 'scipy', 'emcee')))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], env=os.environ).returncode == 0
