@@ -65,10 +65,14 @@ class Report:
             f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
         )
 
-    def append(self, other: Report) -> None:
-        """Add all parts of another report under its title."""
-        self.heading(other.title)
-        self._parts += other._parts
+    def include(self, path: str | Path) -> None:
+        """Add the content of a page that another report saved."""
+        page = Path(path).read_text(encoding="utf-8")
+        title = page.partition("<title>")[2].partition("</title>")[0]
+        content = page.partition("<main>")[2].rpartition("</main>")[0]
+        if not content:
+            raise ValueError(f"{path} is not a noiseflow report; it has no content to include")
+        self._parts.append(f"<h1>{title}</h1>{content}")
 
     def save(self, path: str | Path) -> Path:
         """Write the page; returns its path."""
@@ -76,7 +80,7 @@ class Report:
         page = (
             f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(self.title)}</title>'
             f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{_STYLE}</style></head>'
-            f"<body><h1>{html.escape(self.title)}</h1>{''.join(self._parts)}</body></html>\n"
+            f"<body><h1>{html.escape(self.title)}</h1><main>{''.join(self._parts)}</main></body></html>\n"
         )
         with atomic_path(path) as partial:
             partial.write_text(page, encoding="utf-8")

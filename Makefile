@@ -1,0 +1,34 @@
+# `make demo` and `make test` set up everything they need in .venv; nothing but Python ≥ 3.11 and make is required.
+PYTHON ?= python3
+BIN := .venv/bin
+export OMP_NUM_THREADS ?= 2
+
+.PHONY: demo test test-slow check docs clean
+
+demo: .venv/demo-ready
+	$(BIN)/noiseflow demo --out noiseflow-demo
+
+test: export OMP_NUM_THREADS := 1
+test: .venv/test-ready
+	$(BIN)/python -m pytest -n 2
+
+test-slow: .venv/test-ready
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+check: .venv/test-ready
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/demo-ready: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	touch $@
+
+.venv/test-ready: pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	touch $@ .venv/demo-ready
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache noiseflow-demo
