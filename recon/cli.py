@@ -45,16 +45,24 @@ def simulate(
     write_tilt_series(folder / "clean.mrc", clean)
     Volume(volume * np.float32(unit)).write(folder / "truth.mrc")
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {mode}, noise: {noise}) in {folder}")
-    output.result({"folder": folder, "tilts": folder / "tilts.mrc", "truth": folder / "truth.mrc", "num_tilts": len(angles)})
+    output.result(
+        {"folder": folder, "tilts": folder / "tilts.mrc", "truth": folder / "truth.mrc", "num_tilts": len(angles)}
+    )
 
 
 def reconstruct(
-    tilts: Annotated[Path, typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif or .npy; tilt axis along y.")],
+    tilts: Annotated[
+        Path, typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif or .npy; tilt axis along y.")
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Volume to write: .mrc, .rec, .tif or .npy.")],
-    angles: Annotated[Path | None, typer.Option(help="Angle file; by default the .rawtlt or .tlt beside the stack.")] = None,
+    angles: Annotated[
+        Path | None, typer.Option(help="Angle file; by default the .rawtlt or .tlt beside the stack.")
+    ] = None,
     method: Annotated[str, typer.Option(help="auto, joint, l2, tv, sirt or wbp.")] = "auto",
     mode: Annotated[str, typer.Option(help="transmission (bright field) or linear (HAADF, EDX).")] = "transmission",
-    thickness: Annotated[int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")] = None,
+    thickness: Annotated[
+        int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
+    ] = None,
     weight: Annotated[float | None, typer.Option(help="Weight of the total variation.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit, or iterations.")] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
@@ -115,7 +123,7 @@ def compare(
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
     json: JsonOption = False,
 ) -> None:
-    """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine-matched, min-max) and Fourier shell correlation."""
+    """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     import numpy as np
 
     from noiseflow import io
@@ -175,7 +183,9 @@ def _figures(tilt_series: TiltSeries, outcome: Outcome, seconds: float) -> dict[
         "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
         "residual rms": f"{float(np.sqrt(np.mean(residual**2))):.4g}",
     }
-    rows |= {name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()}
+    rows |= {
+        name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
+    }
     if outcome.fit_result is not None:
         rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
     return rows | {"seconds": f"{seconds:.1f}"}

@@ -1,4 +1,4 @@
-"""What holds the volume: one interface, ``field()`` -> attenuation of the whole lattice in the projector's native layout."""
+"""What holds the volume: ``field()`` gives the attenuation of the whole lattice in the projector's native layout."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ class Field(nn.Module):
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__()
         if len(shape) != 3 or min(shape) < 1:
-            raise ValueError(f"shape {tuple(shape)}: three sizes (depth, height, width) of at least one voxel are needed")
+            raise ValueError(
+                f"shape {tuple(shape)}: three sizes (depth, height, width) of at least one voxel are needed"
+            )
         if not 0 < scale < math.inf:
             raise ValueError(f"scale {scale} must be positive and finite")
         self.depth, self.height, self.width = shape
@@ -37,7 +39,7 @@ class Field(nn.Module):
 
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""
-        values = functional.softplus(self.raw()) * self.scale
+        values: Tensor = functional.softplus(self.raw()) * self.scale
         return values.reshape(self.depth * self.width, self.height)
 
     def volume(self) -> Tensor:
@@ -95,7 +97,7 @@ def upsample(grid: Tensor, shape: Sequence[int]) -> Tensor:
     """
     first, second, third = (_upsampling_matrix(*sizes, like=grid) for sizes in zip(grid.shape, shape, strict=True))
     grid = torch.matmul(second, grid @ third.T)
-    return (first @ grid.flatten(1)).unflatten(1, grid.shape[1:])
+    return torch.matmul(first, grid.flatten(1)).view(tuple(shape))
 
 
 def _upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:

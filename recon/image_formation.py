@@ -26,7 +26,9 @@ class Transmission(nn.Module):
         super().__init__()
         start = torch.as_tensor(intensity, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
         if not bool((start > 0).all()):
-            raise ValueError("the incident intensity must be positive; is the contrast inverted or the offset too high?")
+            raise ValueError(
+                "the incident intensity must be positive; is the contrast inverted or the offset too high?"
+            )
         self.log_intensity = nn.Parameter(start.log(), requires_grad=estimate)
         self.register_buffer("offset", torch.tensor(float(offset)))
 
@@ -35,7 +37,7 @@ class Transmission(nn.Module):
         return torch.exp(self.log_intensity - line_integrals) + self.offset
 
     def invert(self, signal: Tensor) -> Tensor:
-        """Line integrals of signals; readings at or below the offset count as the smallest that a 1000th of I0 gives."""
+        """Line integrals of signals; readings below a thousandth of the incident intensity count as that much."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
         return -torch.log(share.clamp_min(1e-3))
 
@@ -48,7 +50,8 @@ class Transmission(nn.Module):
 class Linear(nn.Module):
     """HAADF or EDX: signal = gain·line integral + offset.
 
-    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is learnt
+    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin
+        support) is learnt
     for each tilt or for all.
 
     Args:

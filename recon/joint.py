@@ -30,7 +30,8 @@ class TomographySignal(nn.Module):
         field: the volume.
         projector: line integrals along all rays.
         image_formation: line integrals to signals, such as `Transmission` or `Linear`.
-        weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one voxel face.
+        weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
+            voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
         learning_rate: of the field; the detector's response learns at a twentieth of it.
     """
@@ -65,10 +66,10 @@ class TomographySignal(nn.Module):
         return signal.reshape(-1)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """The signal of some pixels; without gradients, all pixels are projected once for each state of the parameters."""
+        """The signal of some pixels; without gradients, all are projected once for each state of the parameters."""
         if torch.is_grad_enabled():
             return self.signal()[pixels]
-        # a fused optimiser does not count its steps in the tensors' versions, but no step comes without a call of signal()
+        # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
         version = tuple(parameter._version for parameter in self.parameters())
         if self._seen is None or self._seen[0] != version:
             signal = self.signal()
@@ -87,7 +88,9 @@ class TomographySignal(nn.Module):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam."""
         response = [parameter for parameter in self.image_formation.parameters() if parameter.requires_grad]
-        groups: list[dict[str, Any]] = [{"params": list(self.field.parameters()), "lr": self.learning_rate, "eps": 1e-15}]
+        groups: list[dict[str, Any]] = [
+            {"params": list(self.field.parameters()), "lr": self.learning_rate, "eps": 1e-15}
+        ]
         return groups + ([{"params": response, "lr": self.learning_rate / 20}] if response else [])
 
 
@@ -116,8 +119,8 @@ class JointReconstructor:
 
     Attributes:
         weight: of the total variation; see `TomographySignal`.
-        noise_model: makes the noise model for given images; a mean-preserving flow behind the detector's rounding and rails by
-            default. One without trainable parameters is used as it is.
+        noise_model: makes the noise model for given images; a mean-preserving flow behind the detector's rounding and
+            rails by default. One without trainable parameters is used as it is.
         make_field: makes the field from shape and scale.
         num_steps: steps of the joint fit.
         warm_up: steps of least squares before it.
@@ -126,7 +129,7 @@ class JointReconstructor:
         device: where to compute.
     """
 
-    weight: float = 1.0
+    weight: float = 0.25
     noise_model: Callable[[NDArrayAny], nn.Module] = field(default_factory=lambda: automatic_noise_model)
     make_field: Callable[..., Field] = MultiresolutionField
     num_steps: int = 150
@@ -148,7 +151,9 @@ class JointReconstructor:
         observation = _observation(tilt_series, self.device)
         generator = torch.Generator().manual_seed(self.seed)
         held_out = block_mask(observation.shape, generator=generator).to(observation.device)
-        noise_model = self.noise_model(tilt_series.images).to(self.device)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            noise_model = self.noise_model(tilt_series.images).to(self.device)
         options: dict[str, Any] = {"held_out": held_out, "generator": generator}
         if self.warm_up and not isinstance(noise_model, Gaussian):
             fit(Gaussian().to(self.device), signal_model, observation, num_steps=self.warm_up, **options)
@@ -157,11 +162,17 @@ class JointReconstructor:
 
     def prepare(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The signal model before any fit: an almost empty field on the scale of the data."""
-        tilts, height, width = tilt_series.images.shape
+        _, height, width = tilt_series.images.shape
         if grid.height != height:
-            raise ValueError(f"the volume is {grid.height} voxels high and the images {height} pixels; they must be equal")
+            raise ValueError(
+                f"the volume is {grid.height} voxels high and the images {height} pixels; they must be equal"
+            )
         projector = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles, depth=grid.depth, width=grid.width, detector_width=width, device=self.device
+            tilt_angles=tilt_series.tilt_angles,
+            depth=grid.depth,
+            width=grid.width,
+            detector_width=width,
+            device=self.device,
         )
         response = estimate_response(tilt_series, estimate=self.estimate_response).to(self.device)
         scale = _attenuation_scale(tilt_series, response, projector)
@@ -195,7 +206,7 @@ def find_rails(images: NDArrayAny, *, least: int = 10) -> tuple[float, float]:
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
-    """A first guess of the detector's response: the brightest regions are vacuum in bright field, the darkest in HAADF."""
+    """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF."""
     images = tilt_series.images.astype(np.float32)
     block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
     tilts, height, width = (images.shape[0], *(size // block * block for size in images.shape[1:]))
@@ -204,7 +215,9 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
         return Linear(offset=float(np.quantile(means, 0.02)), estimate=estimate)
     intensity = float(np.quantile(means, 0.95))
     if intensity <= 0:
-        raise ValueError("a transmission series must be brightest where there is vacuum; these images are negative: try --mode linear")
+        raise ValueError(
+            "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
+        )
     return Transmission(intensity, estimate=estimate)
 
 

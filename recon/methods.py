@@ -61,8 +61,8 @@ def reconstruct(
     Args:
         tilt_series: the images.
         grid: the lattice.
-        method: ``joint`` learns volume and noise together (``auto`` takes it); ``l2`` is least squares with total variation in the
-            same field, ``tv`` the same on plain voxels; ``sirt`` and ``wbp`` are the classical ones.
+        method: ``joint`` learns volume and noise together (``auto`` takes it); ``l2`` is least squares with total
+            variation in the same field, ``tv`` the same on plain voxels; ``sirt`` and ``wbp`` are the classical ones.
         weight: of the total variation; see `TomographySignal`.
         num_steps: steps or iterations.
         noise_model: a fitted noise model to keep as it is, for ``joint``.
@@ -120,7 +120,11 @@ def _classical(
     images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32)).to(device)
     with torch.no_grad():
         line_integrals = response.invert(images).contiguous()
-        volume = sirt(line_integrals, projector, num_iterations=num_iterations) if method == "sirt" else wbp(line_integrals, projector)
+        volume = (
+            sirt(line_integrals, projector, num_iterations=num_iterations)
+            if method == "sirt"
+            else wbp(line_integrals, projector)
+        )
         predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
     choices: dict[str, float | str] = {"iterations": num_iterations} if method == "sirt" else {}
     result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)

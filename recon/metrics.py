@@ -35,8 +35,8 @@ def compare(result: Array, reference: Array, *, scaling: Scaling = "raw") -> Err
     Args:
         result: (z, y, x) or (y, x).
         reference: the truth, same shape.
-        scaling: ``raw`` takes the numbers as they are; ``affine`` first fits gain and offset of `result` by least squares;
-            ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
+        scaling: ``raw`` takes the numbers as they are; ``affine`` first fits gain and offset of `result` by least
+            squares; ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
 
     Raises:
         ValueError: shapes differ, pixels are not finite, or the reference is flat.
@@ -61,7 +61,7 @@ def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
         centred = result - result.mean()
         power = float(np.mean(centred**2))
         gain = float(np.mean(centred * (reference - reference.mean()))) / power if power > 0 else 0.0
-        return centred * gain + reference.mean()
+        return np.asarray(centred * gain + reference.mean())
     raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
 
 
@@ -97,7 +97,8 @@ def _dssim(result: Array, reference: Array, span: float) -> float:
         result, reference = result[None], reference[None]
     window = min(7, (min(reference.shape[1:]) - 1) // 2 * 2 + 1)
     values = [
-        structural_similarity(a, b, data_range=span, win_size=window) for a, b in zip(result, reference, strict=True)
+        structural_similarity(a, b, data_range=span, win_size=window)  # type: ignore[no-untyped-call]
+        for a, b in zip(result, reference, strict=True)
     ]
     return (1 - float(np.mean(values))) / 2
 

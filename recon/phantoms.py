@@ -37,9 +37,7 @@ def shells(size: int, *, generator: np.random.Generator, count: int = 22) -> Vol
     return volume
 
 
-def _ellipsoid(
-    size: int, centre: NDArray[Any], axes: NDArray[Any], rotation: NDArray[Any]
-) -> NDArray[np.float32]:
+def _ellipsoid(size: int, centre: NDArray[Any], axes: NDArray[Any], rotation: NDArray[Any]) -> NDArray[np.float32]:
     """The covered share of each voxel, the cube being [-1, 1]³."""
     coordinate = ((np.arange(size) + 0.5) * 2 / size - 1).astype(np.float32)
     steps = [coordinate - np.float32(middle) for middle in centre]

@@ -1,4 +1,4 @@
-"""The shared slice operator: parallel rays around one tilt axis project every y-slice by the same small sparse matrix."""
+"""The shared slice operator: around one tilt axis, every y-slice is projected by the same small sparse matrix."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torch import Tensor
 class SliceProjector:
     """Line integrals of a volume along all rays of a single-axis tilt series.
 
-    A point (x, z) relative to the volume's centre lands on the detector at u = x cos θ + z sin θ; y does not change. The
-    matrix holds Joseph's interpolation (two voxels per ray and row; doi:10.1109/TMI.1982.4307572), once for all slices.
-    The tilt axis passes through the volume's centre and, but for ``detector_offset``, the detector's middle.
+    A point (x, z) relative to the volume's centre lands on the detector at u = x cos θ + z sin θ; y does not change.
+    The matrix holds Joseph's interpolation (two voxels per ray and row; doi:10.1109/TMI.1982.4307572), once for all
+    slices. The tilt axis passes through the volume's centre and, but for ``detector_offset``, the detector's middle.
 
     Args:
         tilt_angles: (tilts,) degrees.
@@ -48,10 +48,14 @@ class SliceProjector:
         if angles.ndim != 1 or angles.size == 0 or not np.isfinite(angles).all():
             raise ValueError("tilt_angles must be a list of finite degrees, one for each tilt")
         if min(depth, width, detector_width) < 1:
-            raise ValueError(f"depth {depth}, width {width} and detector_width {detector_width} must be at least one voxel")
+            raise ValueError(
+                f"depth {depth}, width {width} and detector_width {detector_width} must be at least one voxel"
+            )
         offsets = np.asarray(detector_offset, dtype=np.float64)
         if offsets.size not in (1, angles.size):
-            raise ValueError(f"detector_offset has {offsets.size} values for {angles.size} tilts; give one, or one per tilt")
+            raise ValueError(
+                f"detector_offset has {offsets.size} values for {angles.size} tilts; give one, or one per tilt"
+            )
         self.tilt_angles = angles
         self.depth, self.width, self.detector_width = depth, width, detector_width
         self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
@@ -66,7 +70,7 @@ class SliceProjector:
         return int(self.tilt_angles.size)
 
     def project(self, columns: Tensor) -> Tensor:
-        """Native layout, no copies: (depth * width, slices) attenuation -> (tilts * detector_width, slices) line integrals."""
+        """Native layout, no copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
         result: Tensor = _Product.apply(columns, self.matrix, self.transposed)  # type: ignore[no-untyped-call]
         return result
 
@@ -80,7 +84,7 @@ class SliceProjector:
         _require(attenuation, "attenuation (z, y, x)", self.depth, self.width)
         return from_rays(self.project(to_columns(attenuation)), self.num_tilts)
 
-    def T(self, line_integrals: Tensor) -> Tensor:  # noqa: N802: reads as the transposed operator it is
+    def T(self, line_integrals: Tensor) -> Tensor:  # reads as the transposed operator it is
         """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
         _require(line_integrals, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
         return from_columns(self.backproject(to_rays(line_integrals)), self.depth)
@@ -103,7 +107,7 @@ from_rays = from_columns
 
 
 class _Product(torch.autograd.Function):
-    """Sparse times dense, whose gradient is the transposed product, and whose gradient's gradient is the product again."""
+    """Sparse times dense; its gradient is the transposed product, and the gradient's gradient the product again."""
 
     @staticmethod
     def forward(ctx: Any, dense: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
@@ -111,7 +115,7 @@ class _Product(torch.autograd.Function):
         return matrix @ dense
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         matrix, transposed = ctx.matrices
         return _Product.apply(gradient, transposed, matrix), None, None  # type: ignore[no-untyped-call]
 

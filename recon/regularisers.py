@@ -9,9 +9,9 @@ from torch import Tensor
 
 
 def total_variation(volume: Tensor, *, smoothing: float) -> Tensor:
-    """Isotropic total variation of a 3D array, summed: Σ √(|∇v|² + ε²) − ε, with forward differences (doi:10.1016/0167-2789(92)90242-F).
+    """Isotropic total variation of a 3D array, summed: Σ √(|∇v|² + ε²) − ε (doi:10.1016/0167-2789(92)90242-F).
 
-    The gradient is defined everywhere and computed in the same pass as the value; a flat volume has none of either.
+    Forward differences; the gradient is defined everywhere and comes in the same pass. A flat volume has none of either.
 
     Args:
         volume: (a, b, c), any axis order.
@@ -47,7 +47,7 @@ class _TotalVariation(torch.autograd.Function):
         return total
 
     @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * outer, None
 

@@ -33,7 +33,10 @@ def _add_slices(report: Report, outcome: Outcome) -> None:
     limits = float(np.percentile(volume, 0.5)), max(float(np.percentile(volume, 99.8)), float(volume.max()) * 0.05)
     figure, axes = new_figure(3)
     for axis, image, title in zip(
-        axes[0], (volume[z], volume[:, y], volume[:, :, x]), (f"z = {z} (y, x)", f"y = {y} (z, x)", f"x = {x} (z, y)"), strict=True
+        axes[0],
+        (volume[z], volume[:, y], volume[:, :, x]),
+        (f"z = {z} (y, x)", f"y = {y} (z, x)", f"x = {x} (z, y)"),
+        strict=True,
     ):
         show_image(axis, image, title, limits=limits)
     report.heading("Volume")

@@ -17,7 +17,7 @@ from recon.tilt_series import Mode, TiltSeries
 
 
 class AffineGaussian(nn.Module):
-    """Gaussian noise whose standard deviation is ``floor + slope · signal``; a truth to simulate from, nothing to learn.
+    """Gaussian noise with standard deviation ``floor + slope · signal``: a truth to simulate from, nothing to learn.
 
     Args:
         floor: standard deviation at zero signal, detector units.
@@ -62,7 +62,7 @@ class AffineGaussianDistribution(LatentDistribution):
 
 
 def clipped_noise() -> nn.Module:
-    """Signal-dependent Gaussian noise clipped to [0, 1], in the spirit of the synthetic data of Kniesel et al. (CVPR 2022)."""
+    """Signal-dependent Gaussian noise clipped to [0, 1], like the synthetic data of Kniesel et al. (CVPR 2022)."""
     return Digitised(AffineGaussian(), step=0.0, low=0.0, high=1.0)
 
 
@@ -92,7 +92,9 @@ def clean_tilt_series(
     Raises:
         ValueError: an empty volume.
     """
-    projector = SliceProjector(tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2], dtype=torch.float32)
+    projector = SliceProjector(
+        tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2], dtype=torch.float32
+    )
     line_integrals = projector(torch.from_numpy(np.asarray(volume, dtype=np.float32)))
     highest = float(line_integrals.max())
     if not highest > 0:

@@ -28,7 +28,7 @@ def sirt(
     Returns:
         (z, y, x) attenuation per voxel.
     """
-    A = projector  # noqa: N806: reads as the paper does
+    A = projector
     ones = torch.ones((A.depth, 1, A.width), dtype=line_integrals.dtype, device=line_integrals.device)
     R = _inverse(A(ones))
     C = _inverse(A.T(torch.ones_like(R)))

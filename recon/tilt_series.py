@@ -44,7 +44,8 @@ class TiltSeries:
             raise ValueError(f"a tilt series is a stack (tilt, y, x); this array has shape {self.images.shape}")
         if len(self.images) != len(self.tilt_angles):
             raise ValueError(
-                f"the stack has {len(self.images)} images and there are {len(self.tilt_angles)} tilt angles; give the angle file of this stack"
+                f"the stack has {len(self.images)} images and there are {len(self.tilt_angles)} tilt angles; "
+                "give the angle file of this stack"
             )
         if len(self.images) < 2:
             raise ValueError("a tilt series needs at least two tilts")
@@ -84,7 +85,7 @@ class VolumeGrid:
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, thickness: int | None = None) -> VolumeGrid:
-        """The grid with one voxel per pixel: as high and wide as the images, `thickness` voxels deep (the width if None)."""
+        """One voxel per pixel: as high and wide as the images, `thickness` voxels deep (the width if None)."""
         _, height, width = tilt_series.images.shape
         return cls(width if thickness is None else thickness, height, width, tilt_series.pixel_size)
 
@@ -112,7 +113,8 @@ def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode
 
     Args:
         path: the stack: MRC, TIFF or ``.npy``.
-        angles: text file with one angle in degrees per line; by default the ``.rawtlt`` or ``.tlt`` file beside the stack.
+        angles: text file with one angle in degrees per line; by default the ``.rawtlt`` or ``.tlt`` file beside the
+            stack.
         mode: how the images were formed.
 
     Raises:
@@ -121,7 +123,9 @@ def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode
     """
     image_file = io.read(path)
     if image_file.data.ndim != 3:
-        raise ValueError(f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed")
+        raise ValueError(
+            f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed"
+        )
     tilt_angles = read_angles(_angle_file(Path(path)) if angles is None else angles)
     io.require_finite(image_file.data, path)
     io.require_contrast(image_file.data, path)
@@ -176,6 +180,11 @@ def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
         raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
-        warnings.warn(f"tilt angles appear more than once ({repeated}); each image is used as its own view", stacklevel=4)
+        warnings.warn(
+            f"tilt angles appear more than once ({repeated}); each image is used as its own view", stacklevel=4
+        )
     if np.abs(angles).max() < 1.6:
-        warnings.warn(f"all tilt angles are within ±{np.abs(angles).max():.2f}: are they in radians? Degrees are expected", stacklevel=4)
+        warnings.warn(
+            f"all tilt angles are within ±{np.abs(angles).max():.2f}: are they in radians? Degrees are expected",
+            stacklevel=4,
+        )

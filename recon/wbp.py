@@ -1,4 +1,4 @@
-"""Weighted back-projection: the ramp filter and one back-projection (doi:10.1016/0022-5193(71)90056-0 and Kak & Slaney, ch. 3)."""
+"""Weighted back-projection: a ramp filter and one back-projection (Kak & Slaney 1988, doi:10.1137/1.9780898719277)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from recon.projector import SliceProjector
 def wbp(line_integrals: Tensor, projector: SliceProjector, *, cutoff: float = 1.0) -> Tensor:
     """Reconstruct by filtered back-projection.
 
-    The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are kept;
-    each tilt weighs as much as the angle it stands for.
+    The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are
+    kept; each tilt weighs as much as the angle it stands for.
 
     Args:
         line_integrals: (tilt, y, u).
@@ -38,7 +38,9 @@ def wbp(line_integrals: Tensor, projector: SliceProjector, *, cutoff: float = 1.
     return projector.T((filtered * shares[:, None, None]).contiguous())
 
 
-def angular_shares(tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def angular_shares(
+    tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]],
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """The angle (radians) that each tilt stands for: half the way to each neighbour, at the ends as much as inside."""
     theta = np.deg2rad(np.asarray(tilt_angles, dtype=np.float64))
     values, back, counts = np.unique(theta, return_inverse=True, return_counts=True)
@@ -56,7 +58,7 @@ def _ramp(padded: int, cutoff: float, *, like: Tensor) -> Tensor:
     distance = torch.minimum(index, padded - index)
     kernel = torch.where(distance % 2 == 1, -1 / (math.pi * distance.clamp_min(1)) ** 2, torch.zeros(()).double())
     kernel[0] = 0.25
-    response = torch.fft.rfft(kernel).real
+    response: Tensor = torch.fft.rfft(kernel).real
     frequency = torch.linspace(0, 1, len(response), dtype=torch.float64)
     if cutoff < 1:
         response = response * torch.where(frequency < cutoff, torch.cos(math.pi / 2 * frequency / cutoff) ** 2, 0.0)

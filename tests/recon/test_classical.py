@@ -36,7 +36,10 @@ def test_thirty_iterations_are_ten_and_twenty(full_circle):
     _, projector, images = full_circle
     ten = sirt(images, projector, num_iterations=10)
     torch.testing.assert_close(
-        sirt(images, projector, num_iterations=20, start=ten), sirt(images, projector, num_iterations=30), rtol=1e-10, atol=1e-12
+        sirt(images, projector, num_iterations=20, start=ten),
+        sirt(images, projector, num_iterations=30),
+        rtol=1e-10,
+        atol=1e-12,
     )
 
 
@@ -81,7 +84,10 @@ def test_shell_correlation_of_equal_and_of_unrelated_volumes():
     assert np.abs(fourier_shell_correlation(first, second)[1][4:]).max() < 0.1
 
 
-@pytest.mark.parametrize(("first", "second", "words"), [(np.zeros((2, 2)), np.zeros((3, 3)), "shapes"), (np.ones((2, 2)), np.ones((2, 2)), "flat")])
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [(np.zeros((2, 2)), np.zeros((3, 3)), "shapes"), (np.ones((2, 2)), np.ones((2, 2)), "flat")],
+)
 def test_incomparable_arrays_are_refused(first, second, words):
     with pytest.raises(ValueError, match=words):
         compare(first, second)

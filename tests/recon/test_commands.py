@@ -37,7 +37,9 @@ def test_every_method_writes_a_volume_and_a_report(series, tmp_path, method):
     with mrcfile.open(series / "tilts.mrc", "r+") as stack:
         stack.voxel_size = 7.5
     out, page = tmp_path / "volume.mrc", tmp_path / "report"
-    result = run("reconstruct", series / "tilts.mrc", "-o", out, "--method", method, "--steps", 20, "--report", page, "--json")
+    result = run(
+        "reconstruct", series / "tilts.mrc", "-o", out, "--method", method, "--steps", 20, "--report", page, "--json"
+    )
     assert result["method"] == method
     with mrcfile.open(out) as volume:
         assert volume.data.shape == (16, 16, 16)

@@ -39,7 +39,13 @@ def test_empty_lattice_is_refused(shape):
 
 def slow_total_variation(volume, smoothing):
     padded = functional.pad(volume[None, None], (0, 1, 0, 1, 0, 1), mode="replicate")[0, 0]
-    squares = sum(torch.diff(padded, dim=axis)[:-1 if axis != 0 else None, :-1 if axis != 1 else None, :-1 if axis != 2 else None] ** 2 for axis in range(3))
+    squares = sum(
+        torch.diff(padded, dim=axis)[
+            : -1 if axis != 0 else None, : -1 if axis != 1 else None, : -1 if axis != 2 else None
+        ]
+        ** 2
+        for axis in range(3)
+    )
     return (torch.sqrt(squares + smoothing**2) - smoothing).sum()
 
 
@@ -80,7 +86,9 @@ def test_response_is_inverted(response):
 
 def test_responses():
     line_integrals = torch.tensor([[[0.0, 1.0]]])
-    torch.testing.assert_close(Transmission(2.0, offset=1.0)(line_integrals).detach(), 1 + 2 * torch.exp(-line_integrals))
+    torch.testing.assert_close(
+        Transmission(2.0, offset=1.0)(line_integrals).detach(), 1 + 2 * torch.exp(-line_integrals)
+    )
     torch.testing.assert_close(Linear(3.0, offset=1.0)(line_integrals).detach(), 1 + 3 * line_integrals)
     per_tilt = Transmission(torch.tensor([1.0, 2.0]))(torch.zeros(2, 1, 1)).detach().flatten()
     torch.testing.assert_close(per_tilt, torch.tensor([1.0, 2.0]))
