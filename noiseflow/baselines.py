@@ -68,8 +68,8 @@ class GaussianDistribution(LatentDistribution):
 class Poisson(nn.Module):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
-    Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell, so that
-    it is a density per detector unit like that of the other models, for observations between lattice points too.
+    Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell: it
+    is a density per detector unit like that of the other models, for observations between lattice points too.
 
     Args:
         gain: counts per electron.
@@ -102,19 +102,23 @@ class Poisson(nn.Module):
 
 
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain and offset of pure shot noise: least squares of squared residual on signal, ``variance = gain·(signal − offset)``.
+    """Gain and offset of pure shot noise, ``variance = gain·(signal − offset)``, for (N,) signals and observations.
 
-    The offset is kept below every signal, so that no rate is negative.
+    Least squares of squared residual on signal gives the line. Where it makes readings impossible (shot noise never falls below
+    the offset), the offset moves one count below the lowest reading and the gain keeps the mean variance.
     """
-    signal = signal.double()
-    squared = (observation.double() - signal) ** 2
+    signal, observation = signal.double(), observation.double()
+    squared = (observation - signal) ** 2
     centred = signal - signal.mean()
     spread = (centred**2).mean()
-    slope = (centred * squared).mean() / spread if spread > 0 else torch.zeros((), dtype=signal.dtype)
-    least_gain = squared.mean() / (signal.mean() - signal.min() + 100 * signal.std(correction=0) + 1).abs()
-    gain = torch.maximum(slope, least_gain)
-    offset = torch.minimum(signal.mean() - squared.mean() / gain, signal.min())
-    return gain, offset
+    gain = (centred * squared).mean() / spread if spread > 0 else torch.zeros_like(spread)
+    lowest = torch.minimum(signal.min(), observation.min())
+    if gain > 0 and signal.mean() - squared.mean() / gain <= lowest:
+        return gain, signal.mean() - squared.mean() / gain
+    # gain·(mean − lowest + gain) = mean variance
+    reach = signal.mean() - lowest
+    gain = 2 * squared.mean() / (reach + torch.sqrt(reach**2 + 4 * squared.mean()))
+    return gain, lowest - gain
 
 
 class PoissonDistribution(NoiseDistribution):
@@ -163,7 +167,7 @@ class PoissonDistribution(NoiseDistribution):
     def _value(self, count: Tensor) -> Tensor:
         return count * self.gain + self.offset
 
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:  # type: ignore[override]
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
             return self._value(torch.poisson(self.rate.expand(*sample_shape, *self.batch_shape), generator=generator))
 

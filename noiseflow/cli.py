@@ -58,7 +58,9 @@ def _show_version(asked: bool) -> None:
 def _options(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
-    show_version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")] = False,
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
+    ] = False,
 ) -> None:
     """Learn a microscope's noise, sample it, and reconstruct clean volumes from noisy tilt series."""
     del context, debug, show_version

@@ -35,10 +35,13 @@ def sample(
     out = Output(json)
     standardisation = next((m for m in noise_model.modules() if hasattr(m, "signal_low")), None)
     if standardisation is not None:
-        low, high = float(standardisation.signal_low), float(standardisation.signal_high)
+        low, high = (getattr(standardisation, name).item() for name in ("signal_low", "signal_high"))
         outside = float(((image.data < low) | (image.data > high)).mean())
         if outside > 0.01:
-            out.line(f"note: {outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} the model was fitted on; they get the noise of the nearest end")
+            out.line(
+                f"note: {outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
+                "they get the noise of the nearest end"
+            )
     out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))}, mean {noisy.double().mean():.6g}")
     out.result({"output": str(output), "shape": list(noisy.shape), "mean": float(noisy.double().mean()), "seed": seed})
 
@@ -47,7 +50,9 @@ def evaluate(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; once for each pair.")],
     observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of the same size.")],
-    baselines: Annotated[bool, typer.Option("--baselines", help="Fit Gaussian and Poisson models on one half, judge all on the other.")] = False,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Fit Gaussian and Poisson models on one half, judge all on the other.")
+    ] = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -66,7 +71,9 @@ def evaluate(
         half = torch.rand(clean.shape, generator=torch.Generator().manual_seed(seed)) < 0.5
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
         for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
-            noiseflow.fit(baseline.to(where), train_signal, train_observation, generator=torch.Generator().manual_seed(seed))
+            noiseflow.fit(
+                baseline.to(where), train_signal, train_observation, generator=torch.Generator().manual_seed(seed)
+            )
             models[type(baseline).__name__] = baseline
     results = {name: metrics.evaluate(item, clean, noisy, seed=seed) for name, item in models.items()}
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
@@ -79,14 +86,18 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> tuple[Tensor, 
     from noiseflow import io
 
     if len(signals) != len(observations):
-        raise ValueError(f"{len(signals)} --signal and {len(observations)} --observation files; give one of each per pair")
+        raise ValueError(
+            f"{len(signals)} --signal and {len(observations)} --observation files; give one of each per pair"
+        )
     pairs = []
     for paths in zip(signals, observations, strict=True):
         clean, noisy = (io.read(path).data for path in paths)
         for data, path in zip((clean, noisy), paths, strict=True):
             io.require_finite(data, path)
         if clean.shape != noisy.shape:
-            raise ValueError(f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes")
+            raise ValueError(
+                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes"
+            )
         pairs.append((_tensor(clean).reshape(-1), _tensor(noisy).reshape(-1)))
     return torch.cat([clean for clean, _ in pairs]), torch.cat([noisy for _, noisy in pairs])
 
@@ -96,7 +107,10 @@ def _sample(noise_model: nn.Module, signal: Tensor, seed: int) -> Tensor:
 
     device = next(noise_model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
-    pieces = [noise_model(piece.to(device)).sample(generator=generator).cpu() for piece in torch.split(signal.reshape(-1), 2**20)]
+    pieces = [
+        noise_model(piece.to(device)).sample(generator=generator).cpu()
+        for piece in torch.split(signal.reshape(-1), 2**20)
+    ]
     return torch.cat(pieces).reshape(signal.shape)
 
 

@@ -94,8 +94,10 @@ def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
     from noiseflow.report import new_figure, show_image
 
     images = [io.read_image(path) for path in (clean, noisy, short)]
-    limits = tuple(float(v) for v in np.percentile(images[2], (0.5, 99.5)))
+    low, high = np.percentile(images[2], (0.5, 99.5))
     figure, axes = new_figure(3)
-    for axis, image, title in zip(axes[0], images, ("clean (long exposure)", "sampled noise", "real short exposure"), strict=True):
-        show_image(axis, image[100:300, 100:300], title, limits=limits)
+    for axis, image, title in zip(
+        axes[0], images, ("clean (long exposure)", "sampled noise", "real short exposure"), strict=True
+    ):
+        show_image(axis, image[100:300, 100:300], title, limits=(float(low), float(high)))
     report.figure(figure, caption="The sampled image should be impossible to tell from the real short exposure.")

@@ -42,7 +42,7 @@ class Digitised(nn.Module):
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Standardise the model inside; see its own method."""
-        self.model.standardise(signal, observation)
+        self.model.standardise(signal, observation)  # type: ignore[operator]
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""
@@ -115,7 +115,7 @@ class DigitisedDistribution(NoiseDistribution):
     def icdf(self, value: Tensor) -> Tensor:
         return self.digitise(self.base.icdf(value))
 
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:  # type: ignore[override]
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         return self.digitise(self.base.sample(sample_shape, generator))
 
     @property

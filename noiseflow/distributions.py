@@ -45,7 +45,7 @@ class NoiseDistribution(Distribution):
         """The quantile: smallest observation whose CDF reaches `value`."""
 
     @abstractmethod
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:  # type: ignore[override]
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Draw observations, ``(*sample_shape, *batch_shape)``."""
 
 
@@ -65,7 +65,8 @@ class LatentDistribution(NoiseDistribution):
         return ladj - 0.5 * latent * latent - _LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
-        return torch.special.ndtr(self.to_latent(value)[0])
+        probability: Tensor = torch.special.ndtr(self.to_latent(value)[0])
+        return probability
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return log_normal_interval(self._latent_bound(low), self._latent_bound(high))
@@ -78,7 +79,7 @@ class LatentDistribution(NoiseDistribution):
     def icdf(self, value: Tensor) -> Tensor:
         return self.from_latent(torch.special.ndtri(value))
 
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:  # type: ignore[override]
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         like = self._like()
         shape = (*sample_shape, *self.batch_shape)
         with torch.no_grad():
@@ -141,7 +142,9 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     return torch.where(narrow, log_narrow, log_wide)
 
 
-def bisect_quantile(distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 60) -> Tensor:
+def bisect_quantile(
+    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 60
+) -> Tensor:
     """The quantile by bisection between bounds that bracket it, for distributions without a closed form."""
     for _ in range(num_steps):
         middle = low + (high - low) / 2

@@ -110,7 +110,9 @@ class _Loop:
         generator: torch.Generator | None,
     ) -> None:
         if isinstance(signal, Tensor) and signal.shape != observation.shape:
-            raise ValueError(f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal")
+            raise ValueError(
+                f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
+            )
         self.noise_model = noise_model
         self.signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
         self.observation = observation.reshape(-1)
@@ -124,7 +126,9 @@ class _Loop:
         self.train = torch.nonzero(use & ~judge).squeeze(1)
         self.judge = torch.nonzero(use & judge).squeeze(1)
         if self.train.numel() < 2 or self.judge.numel() < 1:
-            raise ValueError(f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image")
+            raise ValueError(
+                f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image"
+            )
         self.weight = (use & ~judge).to(self.observation.dtype) / self.train.numel()
         self.result = FitResult()
         self.best: dict[str, Any] | None = None
@@ -136,7 +140,9 @@ class _Loop:
             bad |= ~torch.isfinite(self.signal_model.flat)
         count = int((bad & use).sum())
         if count:
-            raise ValueError(f"{count} pixels of signal or observation are NaN or infinite; pass a mask that leaves them out")
+            raise ValueError(
+                f"{count} pixels of signal or observation are NaN or infinite; pass a mask that leaves them out"
+            )
         if bool(bad.any()):  # masked pixels get weight 0, and 0·NaN must not reach the sum
             self.observation = torch.where(bad, self.observation[use].mean(), self.observation)
 
@@ -224,7 +230,9 @@ class _Loop:
         def loss() -> Tensor:
             if hasattr(self.signal_model, "signal"):
                 signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
-                log_prob = table.log_prob(signal) if table is not None else self.noise_model(signal).log_prob(self.observation)
+                log_prob = (
+                    table.log_prob(signal) if table is not None else self.noise_model(signal).log_prob(self.observation)
+                )
                 value = -torch.dot(log_prob, self.weight.to(log_prob.dtype))
             else:
                 pixels = self._batch(batch_size)
@@ -270,7 +278,9 @@ class _Loop:
     def _recover(self, good: dict[str, Any]) -> None:
         self.result.recoveries += 1
         if self.result.recoveries > _MAX_RECOVERIES:
-            raise ValueError("the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale")
+            raise ValueError(
+                "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
+            )
         self._load_models(good)
         for optimiser in self.optimisers:
             optimiser.state.clear()

@@ -54,7 +54,7 @@ def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = 
     """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
 
     def build(raw: Tensor) -> Transform:
-        widths, heights, slopes = raw.split((num_bins, num_bins, num_bins + 1), dim=-1)
+        widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
         return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
 
     return Layer((0.0,) * (3 * num_bins + 1), build, conditional)

@@ -53,7 +53,7 @@ def read(path: str | Path) -> ImageFile:
         raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
     reader = _read_mrc if suffix in MRC_SUFFIXES else _read_tiff if suffix in TIFF_SUFFIXES else _read_npy
     try:
-        image = reader(path)
+        image: ImageFile = reader(path)
     except PermissionError:
         raise
     except Exception as error:  # each library raises its own types on damaged bytes
@@ -66,7 +66,7 @@ def read_image(path: str | Path) -> NDArray[Any]:
     """Read one 2D image, (y, x); a stack of one section counts as one image. Raises as `read`."""
     data = read(path).data
     if data.ndim == 3 and data.shape[0] == 1:
-        return data[0]
+        return np.asarray(data[0])
     if data.ndim != 2:
         raise ValueError(f"{path} holds an array of shape {data.shape}; a single 2D image is needed here")
     return data
@@ -100,7 +100,9 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] = SUFFIXES) -> Pa
     """Fail now, before long work, where a result could not be written; returns the path."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}")
+        raise ValueError(
+            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
+        )
     if path.is_dir():
         raise ValueError(f"{path} is a folder; name an output file")
     if not path.parent.is_dir():
@@ -169,7 +171,9 @@ def _read_mrc(path: Path) -> ImageFile:
         expected = count * mode.itemsize + 1024 + int(header.nsymbt)
     size = path.stat().st_size
     if min(header.nx, header.ny, header.nz) < 1 or expected > size:
-        raise ValueError(f"its header claims {header.nx} x {header.ny} x {header.nz} pixels, {expected} bytes; the file has {size}")
+        raise ValueError(
+            f"its header claims {header.nx} x {header.ny} x {header.nz} pixels, {expected} bytes; the file has {size}"
+        )
     with mrcfile.open(path) as mrc:
         data = np.array(mrc.data)
         x, y, z = (float(mrc.voxel_size[axis]) for axis in "xyz")

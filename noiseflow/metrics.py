@@ -78,7 +78,13 @@ class Evaluation:
 
 
 def evaluate(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, *, num_bins: int = 64, num_signal_bins: int = 16, seed: int = 0
+    noise_model: nn.Module,
+    signal: Tensor,
+    observation: Tensor,
+    *,
+    num_bins: int = 64,
+    num_signal_bins: int = 16,
+    seed: int = 0,
 ) -> Evaluation:
     """Judge a noise model on clean signals and observations that it was not fitted to.
 
@@ -94,7 +100,9 @@ def evaluate(
     """
     signal, observation = signal.reshape(-1), observation.reshape(-1)
     if signal.shape != observation.shape or not signal.numel():
-        raise ValueError(f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}")
+        raise ValueError(
+            f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
+        )
     random = np.random.default_rng(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
@@ -104,7 +112,9 @@ def evaluate(
         nll=-float(log_prob.mean()),
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
-        per_signal=tuple(divergence(noise_model, signal[g], observation[g], num_bins=num_bins, random=random) for g in groups),
+        per_signal=tuple(
+            divergence(noise_model, signal[g], observation[g], num_bins=num_bins, random=random) for g in groups
+        ),
         pit=np.histogram(u, bins=20, range=(0, 1), density=True)[0],
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
@@ -120,7 +130,12 @@ def pixel_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) 
 
 
 def divergence(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, *, num_bins: int = 64, random: np.random.Generator | None = None
+    noise_model: nn.Module,
+    signal: Tensor,
+    observation: Tensor,
+    *,
+    num_bins: int = 64,
+    random: np.random.Generator | None = None,
 ) -> Divergence:
     """Divergence between the residuals observation − signal and the model's exact masses in the same bins; both (N,)."""
     random = random or np.random.default_rng(0)
@@ -145,7 +160,9 @@ def residual_masses(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> ND
     return (mass / mass.sum()).numpy()
 
 
-def compare_histogram(counts: NDArray[np.int64], masses: NDArray[np.float64], random: np.random.Generator) -> Divergence:
+def compare_histogram(
+    counts: NDArray[np.int64], masses: NDArray[np.float64], random: np.random.Generator
+) -> Divergence:
     """Divergence between counts (K,) and exact masses (K,), with floors from draws of the model and a bootstrap interval."""
     total = int(counts.sum())
     frequencies = counts / total
@@ -204,7 +221,20 @@ def kolmogorov_smirnov(u: NDArray[np.float64]) -> float:
     return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
 
 
-TABLE_HEADER = ("model", "NLL (nats/px)", "± s.e.", "JSD ×100", "floor", "JSD/signal bin", "floor", "1−BC ×100", "floor", "BD ×100", "floor", "KS")
+TABLE_HEADER = (
+    "model",
+    "NLL (nats/px)",
+    "± s.e.",
+    "JSD ×100",
+    "floor",
+    "JSD/signal bin",
+    "floor",
+    "1−BC ×100",
+    "floor",
+    "BD ×100",
+    "floor",
+    "KS",
+)
 
 
 def table_row(name: str, evaluation: Evaluation) -> list[str]:
@@ -220,4 +250,10 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
         overall.bd,
         overall.bd_floor,
     )
-    return [name, f"{evaluation.nll:.4f}", f"{evaluation.nll_error:.4f}", *(f"{100 * p:.3f}" for p in percent), f"{evaluation.ks:.4f}"]
+    return [
+        name,
+        f"{evaluation.nll:.4f}",
+        f"{evaluation.nll_error:.4f}",
+        *(f"{100 * p:.3f}" for p in percent),
+        f"{evaluation.ks:.4f}",
+    ]

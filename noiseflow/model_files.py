@@ -21,12 +21,18 @@ MODEL_SUFFIXES = frozenset({".safetensors"})
 def kinds() -> dict[str, type[nn.Module]]:
     """Every noise model that a file may name: the public ones here, and those of installed packages (entry points
     ``noiseflow.noise_models``)."""
-    own = {name: getattr(noiseflow, name) for name in noiseflow.__all__}
-    found = {name: kind for name, kind in own.items() if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")}
+    own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
+    found = {
+        name: kind
+        for name, kind in own.items()
+        if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")
+    }
     return found | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
 
 
-def save(model: nn.Module, path: str | Path, *, units: str = "detector units", provenance: Mapping[str, Any] | None = None) -> Path:
+def save(
+    model: nn.Module, path: str | Path, *, units: str = "detector units", provenance: Mapping[str, Any] | None = None
+) -> Path:
     """Save a noise model.
 
     Args:
@@ -67,7 +73,9 @@ def load(path: str | Path) -> nn.Module:
         description = json.loads(metadata["model"])
         model = _build(description)
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})") from error
+        raise ValueError(
+            f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     expected = model.state_dict()
@@ -76,7 +84,9 @@ def load(path: str | Path) -> nn.Module:
         | {name for name in set(expected) & set(tensors) if expected[name].shape != tensors[name].shape}
     )
     if wrong:
-        raise ValueError(f"{path}: parameters do not fit a {description['kind']}: {', '.join(wrong[:3])}; fit and save the model again")
+        raise ValueError(
+            f"{path}: parameters do not fit a {description['kind']}: {', '.join(wrong[:3])}; fit and save the model again"
+        )
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
     model.load_state_dict(tensors)
@@ -109,7 +119,9 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
                 raise ValueError(f"{path} is not a noiseflow noise model; make one with: noiseflow calibrate")
             found = metadata.get("format_version", "")
             if not found.isdigit() or int(found) > FORMAT_VERSION:
-                raise ValueError(f"{path} has format version {found!r}, this library reads up to {FORMAT_VERSION}; update noiseflow")
+                raise ValueError(
+                    f"{path} has format version {found!r}, this library reads up to {FORMAT_VERSION}; update noiseflow"
+                )
             return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"{path} is not a noise-model file, or is damaged ({error})") from error
@@ -118,7 +130,9 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
-        raise ValueError(f"{kind} is not a known kind of noise model; register it as an entry point of 'noiseflow.noise_models'")
+        raise ValueError(
+            f"{kind} is not a known kind of noise model; register it as an entry point of 'noiseflow.noise_models'"
+        )
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
 

@@ -36,12 +36,7 @@ class Standardisation(nn.Module):
     def coordinate(self, signal: Tensor) -> Tensor:
         """Coordinate in [0, 1] of each signal."""
         fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)
-        return (torch.sqrt(fraction + _ROOT_SHIFT) - _ROOT_SHIFT**0.5) / _root_span()
-
-    def signal(self, coordinate: Tensor) -> Tensor:
-        """The signal of a coordinate; inverse of `coordinate` inside the range."""
-        fraction = (coordinate * _root_span() + _ROOT_SHIFT**0.5) ** 2 - _ROOT_SHIFT
-        return self.signal_low + fraction * (self.signal_high - self.signal_low)
+        return _root(fraction)
 
     def forward(self, coordinate: Tensor) -> tuple[Tensor, Tensor]:
         """Residual location and log-scale at each coordinate."""
@@ -57,21 +52,26 @@ class Standardisation(nn.Module):
         signal, residual = signal.double(), observation.double() - signal.double()
         spread = residual.std(correction=0)
         if not spread > 0:
-            raise ValueError("observation − signal is constant: there is no noise to learn; check that the two images differ")
+            raise ValueError(
+                "observation − signal is constant: there is no noise to learn; check that the two images differ"
+            )
         low, high = signal.min(), signal.max()
         if high <= low:  # one signal level: give the coordinate a width of its own
             low, high = low - spread, high + spread
         self.signal_low.copy_(low)
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
-        coordinate = (torch.sqrt(fraction + _ROOT_SHIFT) - _ROOT_SHIFT**0.5) / _root_span()
+        coordinate = _root(fraction)
         location, scale = _moments_by_level((coordinate * (_NUM_KNOTS - 1)).round().long(), residual)
         self.location.copy_(location)
         self.log_scale.copy_(torch.log(scale.clamp(min=1e-3 * float(spread))))
 
 
-def _root_span() -> float:
-    return float((1 + _ROOT_SHIFT) ** 0.5 - _ROOT_SHIFT**0.5)
+def _root(fraction: Tensor) -> Tensor:
+    """√fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
+    start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
+    root: Tensor = (torch.sqrt(fraction + _ROOT_SHIFT) - start) / (end - start)
+    return root
 
 
 def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
@@ -80,7 +80,11 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
 
     known, location, scale = [], [], []
     order = torch.argsort(level)
-    for knot, values in zip(range(_NUM_KNOTS), torch.split(residual[order], torch.bincount(level, minlength=_NUM_KNOTS).tolist()), strict=True):
+    for knot, values in zip(
+        range(_NUM_KNOTS),
+        torch.split(residual[order], torch.bincount(level, minlength=_NUM_KNOTS).tolist()),
+        strict=True,
+    ):
         if values.numel() >= min(least, residual.numel()):
             values = values[:: max(1, values.numel() // 100_000)]
             q16, q50, q84 = torch.quantile(values, torch.tensor([0.1587, 0.5, 0.8413], dtype=values.dtype))

@@ -30,7 +30,13 @@ class ObservationTable:
     """
 
     def __init__(
-        self, noise_model: nn.Module, observation: Tensor, signal_low: float, signal_high: float, *, tolerance: float = 1e-3
+        self,
+        noise_model: nn.Module,
+        observation: Tensor,
+        signal_low: float,
+        signal_high: float,
+        *,
+        tolerance: float = 1e-3,
     ) -> None:
         self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
         self._observation, self._tolerance = observation, tolerance
@@ -133,10 +139,14 @@ def _knots(observation: Tensor, count: int) -> Tensor:
     ordered = torch.sort(observation[:: max(1, observation.numel() // 1_000_000)].double())[0]
     low, high = float(observation.min()), float(observation.max())
     quantile = ordered[(torch.linspace(0, 1, count // 2, dtype=torch.float64) * (ordered.numel() - 1)).long()]
-    bulk_low, bulk_high = float(ordered[int(0.002 * (ordered.numel() - 1))]), float(ordered[int(0.998 * (ordered.numel() - 1))])
+    bulk_low, bulk_high = (
+        float(ordered[int(0.002 * (ordered.numel() - 1))]),
+        float(ordered[int(0.998 * (ordered.numel() - 1))]),
+    )
     even = torch.linspace(bulk_low, bulk_high, count // 2, dtype=torch.float64, device=ordered.device)
     fence = 1e-5 * (high - low)
     ends = torch.tensor([low, low + fence, high - fence, high], dtype=torch.float64, device=ordered.device)
     inner = torch.cat([quantile, even])
     inner = inner[(inner > low + fence) & (inner < high - fence)]
-    return torch.unique(torch.cat([inner, ends]).to(observation.dtype))
+    knots: Tensor = torch.unique(torch.cat([inner, ends]).to(observation.dtype))
+    return knots

@@ -127,5 +127,18 @@ def test_digitised_masses_sum_to_one() -> None:
 
 @pytest.mark.parametrize(("step", "low", "high"), [(-1.0, 0.0, 1.0), (1.0, 2.0, 1.0)])
 def test_digitised_refuses_impossible_settings(step: float, low: float, high: float) -> None:
-    with pytest.raises(ValueError, match="step is|rail"):
+    with pytest.raises(ValueError, match=r"step is|rail"):
         noiseflow.Digitised(noiseflow.Gaussian(), step=step, low=low, high=high)
+
+
+def test_poisson_finds_gain_and_offset_and_allows_every_reading() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = 30 + 400 * torch.rand(200_000, generator=generator)
+    observation = 2 * torch.poisson((signal - 20) / 2, generator=generator) + 20
+    model = noiseflow.Poisson()
+    model.standardise(signal, observation)
+    assert float(model.log_gain.exp()) == pytest.approx(2, rel=0.02)
+    assert float(model.offset) == pytest.approx(20, abs=2)
+    with_read_noise = observation + 30 * torch.randn(observation.shape, generator=generator)
+    model.standardise(signal, with_read_noise)
+    assert torch.isfinite(model(signal).log_prob(with_read_noise)).all()
