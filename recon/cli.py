@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from recon.methods import Outcome
+    from recon.simulation import Acquisition
     from recon.tilt_series import Mode, TiltSeries
 
 
@@ -21,9 +22,11 @@ def simulate(
     folder: Annotated[Path, typer.Argument(help="New folder for tilts.mrc, tilts.rawtlt, clean.mrc and truth.mrc.")],
     size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
     tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees.")] = "-59.5:59:1.5",
-    phantom: Annotated[str, typer.Option(help="Kind of volume: shells.")] = "shells",
-    noise: Annotated[str, typer.Option(help="clipped, none, or a noise-model file.")] = "clipped",
-    mode: Annotated[str, typer.Option(help="transmission or linear.")] = "transmission",
+    phantom: Annotated[str, typer.Option(help="shells, virions, filaments, particles or slab.")] = "shells",
+    noise: Annotated[
+        str, typer.Option(help="clipped, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file.")
+    ] = "clipped",
+    mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
@@ -36,15 +39,15 @@ def simulate(
 
     output = Output(json)
     angles = tilt_range(tilts)
-    noise_model = _simulated_noise(noise)
+    acquisition, noise_model = _acquisition(noise, mode)
     volume = make_phantom(phantom, size, generator=np.random.default_rng(seed))
-    clean, unit = clean_tilt_series(volume, angles, mode=_mode(mode))
+    clean, unit = clean_tilt_series(volume, angles, acquisition=acquisition)
     noisy = clean if noise_model is None else add_noise(clean, noise_model, seed=seed)
     folder.mkdir(parents=True, exist_ok=True)
     write_tilt_series(folder / "tilts.mrc", noisy)
     write_tilt_series(folder / "clean.mrc", clean)
     Volume(volume * np.float32(unit)).write(folder / "truth.mrc")
-    output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {mode}, noise: {noise}) in {folder}")
+    output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
     output.result(
         {"folder": folder, "tilts": folder / "tilts.mrc", "truth": folder / "truth.mrc", "num_tilts": len(angles)}
     )
@@ -148,12 +151,16 @@ def _mode(text: str) -> Mode:
     return "linear" if text == "linear" else "transmission"
 
 
-def _simulated_noise(text: str) -> nn.Module | None:
-    from recon.simulation import NOISES
+def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module | None]:
+    from dataclasses import replace
 
-    if text == "none":
-        return None
-    return NOISES[text]() if text in NOISES else _load_noise_model(Path(text))
+    from recon.simulation import ACQUISITIONS
+
+    acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
+    noise_model = acquisition.noise() if acquisition.noise is not None else None
+    if noise not in ACQUISITIONS:
+        noise_model = _load_noise_model(Path(noise))
+    return acquisition if mode is None else replace(acquisition, mode=_mode(mode)), noise_model
 
 
 def _load_noise_model(path: Path | None) -> nn.Module | None:

@@ -124,6 +124,7 @@ class JointReconstructor:
         make_field: makes the field from shape and scale.
         num_steps: steps of the joint fit.
         warm_up: steps of least squares before it.
+        noise_warm_up: steps of the noise model alone, after those.
         estimate_response: whether incident intensity or offset are learnt.
         seed: of every random choice.
         device: where to compute.
@@ -134,6 +135,7 @@ class JointReconstructor:
     make_field: Callable[..., Field] = MultiresolutionField
     num_steps: int = 150
     warm_up: int = 40
+    noise_warm_up: int = 150
     estimate_response: bool = True
     seed: int = 0
     device: torch.device | str = "cpu"
@@ -155,8 +157,12 @@ class JointReconstructor:
             torch.manual_seed(self.seed)
             noise_model = self.noise_model(tilt_series.images).to(self.device)
         options: dict[str, Any] = {"held_out": held_out, "generator": generator}
-        if self.warm_up and not isinstance(noise_model, Gaussian):
+        if not isinstance(noise_model, Gaussian):
             fit(Gaussian().to(self.device), signal_model, observation, num_steps=self.warm_up, **options)
+            with torch.no_grad():
+                signal = signal_model.signal().view_as(observation)
+            fit(noise_model, signal, observation, num_steps=self.noise_warm_up, **options)
+            options["standardise"] = False
         result = fit(noise_model, signal_model, observation, num_steps=self.num_steps, progress=progress, **options)
         return _finished(signal_model, noise_model, result, grid)
 

@@ -2,79 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from noiseflow import Digitised
-from noiseflow.distributions import LatentDistribution
+from recon.noises import CountingNoise, OutlierNoise, SkewedNoise
 from recon.projector import SliceProjector
 from recon.tilt_series import Mode, TiltSeries
 
 
-class AffineGaussian(nn.Module):
-    """Gaussian noise with standard deviation ``floor + slope · signal``: a truth to simulate from, nothing to learn.
+@dataclass(frozen=True)
+class Acquisition:
+    """How a simulated series is taken.
 
-    Args:
-        floor: standard deviation at zero signal, detector units.
-        slope: growth with the signal.
+    Attributes:
+        noise: makes the true noise model, or None for clean images.
+        mode: how the images are formed.
+        peak: the largest line integral, which sets the unit of attenuation.
+        intensity: incident intensity (transmission) or gain (linear), detector units.
     """
 
-    def __init__(self, floor: float = 0.05, slope: float = 0.2) -> None:
-        super().__init__()
-        self.floor, self.slope = floor, slope
-
-    def forward(self, signal: Tensor) -> AffineGaussianDistribution:
-        return AffineGaussianDistribution(signal, self.floor + self.slope * signal.clamp_min(0))
-
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Nothing to measure: the noise is known."""
+    noise: Callable[[], nn.Module] | None
+    mode: Mode = "transmission"
+    peak: float = 1.5
+    intensity: float = 1.0
 
 
-class AffineGaussianDistribution(LatentDistribution):
-    """The distribution that `AffineGaussian` returns."""
-
-    def __init__(self, signal: Tensor, scale: Tensor) -> None:
-        super().__init__(signal.shape)
-        self.signal, self.scale = signal, scale
-
-    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        latent = (value - self.signal) / self.scale
-        return latent, -torch.log(self.scale).expand_as(latent)
-
-    def from_latent(self, latent: Tensor) -> Tensor:
-        return self.signal + self.scale * latent
-
-    def _like(self) -> Tensor:
-        return self.signal
-
-    @property
-    def mean(self) -> Tensor:
-        return self.signal
-
-    @property
-    def variance(self) -> Tensor:
-        return self.scale**2
-
-
-def clipped_noise() -> nn.Module:
-    """Signal-dependent Gaussian noise clipped to [0, 1], like the synthetic data of Kniesel et al. (CVPR 2022)."""
-    return Digitised(AffineGaussian(), step=0.0, low=0.0, high=1.0)
-
-
-NOISES = {"clipped": clipped_noise}
+ACQUISITIONS = {
+    "none": Acquisition(None),
+    "clipped": Acquisition(lambda: Digitised(SkewedNoise(0.05, 0.2), step=0.0, low=0.0, high=1.0)),
+    "skewed": Acquisition(lambda: SkewedNoise(0.05, 0.15, skewness=0.7)),
+    "outliers": Acquisition(lambda: OutlierNoise(0.05, 0.1, share=0.05, factor=8.0)),
+    "low-dose": Acquisition(lambda: CountingNoise(read_noise=0.5), mode="linear", peak=8.0),
+    "8-bit": Acquisition(
+        lambda: Digitised(SkewedNoise(10.0, 0.15, skewness=0.3), step=1.0, low=0.0, high=255.0), intensity=200.0
+    ),
+}
+"""Acquisitions by name; ``clipped`` is like the synthetic data of Kniesel et al. (CVPR 2022)."""
 
 
 def clean_tilt_series(
     volume: NDArray[np.floating[Any]],
     tilt_angles: Sequence[float] | NDArray[np.floating[Any]],
     *,
-    mode: Mode = "transmission",
-    peak: float = 1.5,
+    acquisition: Acquisition = ACQUISITIONS["none"],
     pixel_size: float | None = None,
 ) -> tuple[TiltSeries, float]:
     """Project a known volume without noise.
@@ -82,34 +59,36 @@ def clean_tilt_series(
     Args:
         volume: (z, y, x) density, any unit.
         tilt_angles: degrees.
-        mode: ``transmission`` with unit incident intensity, or ``linear`` with unit gain.
-        peak: largest line integral, which sets the unit of attenuation.
+        acquisition: how the images are formed.
         pixel_size: Å.
 
     Returns:
-        The series, and the factor from density to attenuation per voxel.
+        The series, and the factor from density to attenuation per voxel (times the gain, in linear mode).
 
     Raises:
         ValueError: an empty volume.
     """
-    projector = SliceProjector(
-        tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2], dtype=torch.float32
-    )
+    projector = SliceProjector(tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2])
     line_integrals = projector(torch.from_numpy(np.asarray(volume, dtype=np.float32)))
     highest = float(line_integrals.max())
     if not highest > 0:
         raise ValueError("the volume is empty: there is nothing to project")
-    line_integrals = line_integrals * (peak / highest)
-    signal = torch.exp(-line_integrals) if mode == "transmission" else line_integrals
-    return TiltSeries(signal.contiguous().numpy(), np.asarray(tilt_angles), pixel_size, mode), peak / highest
+    line_integrals = line_integrals * (acquisition.peak / highest)
+    linear = acquisition.mode == "linear"
+    signal = acquisition.intensity * (line_integrals if linear else torch.exp(-line_integrals))
+    unit = acquisition.peak / highest * (acquisition.intensity if linear else 1.0)
+    return TiltSeries(signal.contiguous().numpy(), np.asarray(tilt_angles), pixel_size, acquisition.mode), unit
 
 
 def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
-    """Draw one noisy reading of every pixel of a clean series."""
+    """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        noisy = noise_model(torch.from_numpy(tilt_series.images)).sample(generator=generator)
-    return TiltSeries(noisy.numpy(), tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
+        images = torch.from_numpy(tilt_series.images)
+        noisy = torch.stack([noise_model(image).sample(generator=generator) for image in images]).numpy()
+    if isinstance(noise_model, Digitised) and noise_model.step == 1:
+        noisy = noisy.astype(np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32)
+    return TiltSeries(noisy, tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
 
 
 def tilt_range(text: str) -> NDArray[np.float64]:

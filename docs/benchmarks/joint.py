@@ -3,10 +3,10 @@
     python docs/benchmarks/joint.py                              # the 96³ scene of the README
     python docs/benchmarks/joint.py --size 64 --seeds 0 1 2      # others
 
-For each scene: least squares + total variation at the best of many weights, with the incident intensity both learnt and
-known (the better one counts); the oracle, the same field and regulariser with the true noise, at its best weight; and the
-joint fit as a user gets it, with no knowledge of either. Best weights are found by looking at the truth, which only the
-rivals may do. PSNR is over the range of the truth, without any rescaling.
+For each scene: least squares + total variation at the best of many weights, with the incident intensity learnt and
+known (the better one counts); the oracle, the same field and regulariser with the true noise, at its best weight; and
+the joint fit as a user gets it, with no knowledge of either. Best weights are found by looking at the truth, which only
+the rivals may do. PSNR is over the range of the truth, without any rescaling.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import nn
 
 from noiseflow import Gaussian
 from noiseflow.console import Output
 from recon.joint import JointReconstructor
 from recon.metrics import compare
 from recon.phantoms import PHANTOMS, make_phantom
-from recon.simulation import NOISES, add_noise, clean_tilt_series, tilt_range
+from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series, tilt_range
 from recon.tilt_series import TiltSeries
 
 HEADER = ("method", "weight", "volume PSNR", "projection PSNR", "seconds")
@@ -51,8 +52,16 @@ class Score:
 
 def make_scene(phantom: str, noise: str, size: int, tilts: str, seed: int) -> Scene:
     density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
-    clean, unit = clean_tilt_series(density, tilt_range(tilts))
-    return Scene(density * unit, clean, add_noise(clean, NOISES[noise](), seed=seed + 1))
+    acquisition = ACQUISITIONS[noise]
+    clean, unit = clean_tilt_series(density, tilt_range(tilts), acquisition=acquisition)
+    return Scene(density * unit, clean, add_noise(clean, true_noise(noise), seed=seed + 1))
+
+
+def true_noise(name: str) -> nn.Module:
+    make = ACQUISITIONS[name].noise
+    if make is None:
+        raise ValueError(f"{name} has no noise to learn")
+    return make()
 
 
 def score(reconstructor: JointReconstructor, scene: Scene) -> Score:
@@ -81,7 +90,7 @@ def best_weight(reconstructor: JointReconstructor, scene: Scene) -> Score:
 
 def rivals(noise: str) -> dict[str, Callable[[Scene], Score]]:
     least_squares = JointReconstructor(noise_model=lambda images: Gaussian())
-    oracle = JointReconstructor(noise_model=lambda images: NOISES[noise]())
+    oracle = JointReconstructor(noise_model=lambda images: true_noise(noise))
 
     def of_two(reconstructor: JointReconstructor) -> Callable[[Scene], Score]:
         def run(scene: Scene) -> Score:
@@ -102,7 +111,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--tilts", default="-59.5:58:1.5", help="START:STOP:STEP in degrees; 79 tilts by default")
     parser.add_argument("--phantoms", nargs="+", default=["shells"], choices=list(PHANTOMS))
-    parser.add_argument("--noises", nargs="+", default=["clipped"], choices=list(NOISES))
+    parser.add_argument(
+        "--noises", nargs="+", default=["clipped"], choices=[name for name in ACQUISITIONS if name != "none"]
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     arguments = parser.parse_args()

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from recon.metrics import compare, fourier_shell_correlation, match
+from recon.noises import SkewedNoise
 from recon.phantoms import make_phantom, shells
 from recon.projector import SliceProjector
-from recon.simulation import AffineGaussian, add_noise, clean_tilt_series, tilt_range
+from recon.simulation import Acquisition, add_noise, clean_tilt_series, tilt_range
 from recon.sirt import sirt
 from recon.wbp import wbp
 
@@ -104,10 +105,10 @@ def test_shells_are_mostly_vacuum_and_stay_in_the_field_of_view():
 
 def test_simulated_series_has_the_peak_and_the_noise_asked_for():
     volume = shells(24, generator=np.random.default_rng(0))
-    clean, unit = clean_tilt_series(volume, [-30.0, 0.0, 30.0], peak=1.2)
+    clean, unit = clean_tilt_series(volume, [-30.0, 0.0, 30.0], acquisition=Acquisition(None, peak=1.2))
     assert -math.log(clean.images.min()) == pytest.approx(1.2, rel=1e-5)
     assert -math.log(clean.images[1].min()) == pytest.approx(float((unit * volume).sum(0).max()), rel=1e-4)
-    noise = add_noise(clean, AffineGaussian(0.1, 0.0), seed=1).images - clean.images
+    noise = add_noise(clean, SkewedNoise(0.1, 0.0), seed=1).images - clean.images
     assert noise.std() == pytest.approx(0.1, rel=0.05)
 
 

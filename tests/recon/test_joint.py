@@ -18,7 +18,7 @@ from recon.joint import (
 from recon.metrics import compare
 from recon.phantoms import shells
 from recon.projector import SliceProjector
-from recon.simulation import add_noise, clean_tilt_series, clipped_noise
+from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.tilt_series import TiltSeries, VolumeGrid
 
 
@@ -34,7 +34,7 @@ def _one_thread():
 def scene():
     density = shells(32, generator=np.random.default_rng(1), count=10)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 3.0))
-    return density * unit, clean, add_noise(clean, clipped_noise(), seed=2)
+    return density * unit, clean, add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
 
 def small_signal_model(weight=1.0):
