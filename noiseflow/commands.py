@@ -58,6 +58,7 @@ def evaluate(
     json: JsonOption = False,
 ) -> None:
     """Judge a noise model on pairs of clean and noisy images: likelihood and divergences, each beside its floor."""
+    import numpy as np
     import torch
 
     import noiseflow
@@ -68,7 +69,8 @@ def evaluate(
     clean, noisy = (tensor.to(where) for tensor in _read_pairs(signal, observation))
     models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
     if baselines:
-        half = torch.rand(clean.shape, generator=torch.Generator().manual_seed(seed)) < 0.5
+        # NumPy's stream, not torch's: noise that `sample` drew with the same seed must not decide which pixels judge
+        half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
         for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
             noiseflow.fit(

@@ -116,7 +116,7 @@ class _Loop:
         self.noise_model = noise_model
         self.signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
         self.observation = observation.reshape(-1)
-        self.generator = generator if generator is not None else torch.Generator().manual_seed(0)
+        self.generator = _own_generator(generator)
         use = torch.ones_like(self.observation, dtype=torch.bool) if mask is None else mask.reshape(-1).bool()
         self._check(use)
         if isinstance(held_out, Tensor):
@@ -191,6 +191,8 @@ class _Loop:
                 self.done = step
                 if step % check_every == 0 or step == num_steps:
                     good = self._judge(step) or good
+                    if table is not None:
+                        self.result.table_error = table.check(self.noise_model)
                     if checkpoint is not None:
                         checkpoint(self.state())
                 if progress is not None:
@@ -203,8 +205,6 @@ class _Loop:
             self._judge(0)
         if self.best is not None:
             self._load_models(self.best)
-        if table is not None:
-            self.result.table_error = table.measure_error(self.noise_model)
         self.result.num_steps, self.result.seconds = num_steps, time.perf_counter() - started
         return self.result
 
@@ -312,6 +312,12 @@ class _Loop:
         self.best, self.done = state["best"], state["done"]
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries = state["recoveries"]
+
+
+def _own_generator(generator: torch.Generator | None) -> torch.Generator:
+    """A stream of its own: data sampled with the same seed must not share its random numbers with the choice of pixels."""
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))
 
 
 def _adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:

@@ -184,23 +184,27 @@ class FlowDistribution(LatentDistribution):
 class RadialFlow(ConditionalFlow):
     """The noise model of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018), with a normalised density.
 
-    A conditional affine layer, then radial layers of which the half next to the data depends on the signal.
+    A conditional affine layer, then radial layers of which those next to the data depend on the signal.
 
     Args:
         num_layers: number of radial layers.
+        num_conditional: how many of them depend on the signal, half of them by default; with none, all signals share the shape
+            of the noise and only its location and scale vary.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
     """
 
-    def __init__(self, num_layers: int = 8, *, mean_preserving: bool = False, width: int = 32) -> None:
-        conditional = num_layers - num_layers // 2
+    def __init__(
+        self, num_layers: int = 8, *, num_conditional: int | None = None, mean_preserving: bool = False, width: int = 32
+    ) -> None:
+        conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
         radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
         super().__init__([affine_layer(), *radials], mean_preserving=mean_preserving, width=width)
-        self.num_layers = num_layers
+        self.num_layers, self.num_layers_conditional = num_layers, conditional
 
     def config(self) -> dict[str, Any]:
-        return super().config() | {"num_layers": self.num_layers}
+        return super().config() | {"num_layers": self.num_layers, "num_conditional": self.num_layers_conditional}
 
 
 class SplineFlow(ConditionalFlow):

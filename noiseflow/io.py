@@ -193,11 +193,11 @@ def _read_tiff(path: Path) -> ImageFile:
         spacing = (tiff.imagej_metadata or {}).get("spacing")
         unit = (tiff.imagej_metadata or {}).get("unit")
         page = tiff.pages[0]
-        resolution = page.tags.get("XResolution") if isinstance(page, tifffile.TiffPage) else None
-    if unit == "angstrom" and spacing and resolution is not None:
-        numerator, denominator = resolution.value
-        pixel = denominator / numerator
-        return ImageFile(data, (float(spacing), pixel, pixel))
+        tags = page.tags if isinstance(page, tifffile.TiffPage) else {}
+        resolution = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
+    if unit == "angstrom" and spacing and len(resolution) == 2:
+        y, x = (denominator / numerator for numerator, denominator in resolution)
+        return ImageFile(data, (float(spacing), y, x))
     return ImageFile(data)
 
 

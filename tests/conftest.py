@@ -1,0 +1,53 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from noiseflow.cli import main
+
+DATA = Path(__file__).parent.parent / "noiseflow" / "data"
+
+
+@pytest.fixture
+def data() -> Path:
+    """Folder of the shipped microscope data."""
+    return DATA
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    """Run a command that must succeed; returns its JSON result."""
+
+    def call(*arguments: str | Path) -> dict[str, Any]:
+        with pytest.raises(SystemExit) as stop:
+            main([*map(str, arguments), "--json"])
+        captured = capsys.readouterr()
+        assert stop.value.code in (0, None), captured.err
+        result: dict[str, Any] = json.loads(captured.out.splitlines()[-1])
+        return result
+
+    return call
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command that must fail with exit 1 and one line on stderr; returns that line."""
+
+    def call(*arguments: str | Path) -> str:
+        with pytest.raises(SystemExit) as stop:
+            main([*map(str, arguments)])
+        captured = capsys.readouterr()
+        assert stop.value.code == 1, captured.err
+        lines = captured.err.strip().splitlines()
+        assert len(lines) == 1, captured.err
+        assert lines[0].startswith("noiseflow: ")
+        assert "Traceback" not in captured.err
+        return lines[0]
+
+    return call

@@ -1,0 +1,75 @@
+"""The commands as a user runs them: results, reproducibility, and one clear line for each mistake."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import noiseflow
+from noiseflow import io
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return noiseflow.save(noiseflow.Gaussian(0.1), tmp_path / "model.safetensors")
+
+
+@pytest.fixture
+def clean(tmp_path: Path) -> Path:
+    path = tmp_path / "clean.mrc"
+    io.write(path, np.linspace(0, 1, 4096, dtype=np.float32).reshape(64, 64), voxel_size=(1.0, 2.0, 2.0))
+    return path
+
+
+def test_sample_is_reproducible_and_noisy(run, model: Path, clean: Path, tmp_path: Path) -> None:
+    noisy = [tmp_path / f"noisy{i}.mrc" for i in range(3)]
+    for path, seed in zip(noisy, ("7", "7", "8"), strict=True):
+        run("sample", model, clean, "-o", path, "--seed", seed)
+    first, again, other = (io.read(path) for path in noisy)
+    assert np.array_equal(first.data, again.data)
+    assert not np.array_equal(first.data, other.data)
+    assert (first.data - io.read(clean).data).std() == pytest.approx(0.1, rel=0.05)
+    assert first.voxel_size == pytest.approx((1, 2, 2))
+
+
+def test_evaluate_with_baselines(run, model: Path, clean: Path, tmp_path: Path) -> None:
+    noisy = tmp_path / "noisy.tif"
+    run("sample", model, clean, "-o", noisy)
+    result = run("evaluate", model, "--signal", clean, "--observation", noisy, "--baselines")
+    assert result["models"]["model"]["nll"] == pytest.approx(0.5 * np.log(2 * np.pi * np.e * 0.01), abs=0.1)
+    assert set(result["models"]) == {"model", "Gaussian", "Poisson"}
+
+
+@pytest.mark.parametrize("bad", ["missing", "empty", "nan", "truncated", "not a model", "folder", "wrong suffix"])
+def test_mistakes_are_one_line_and_leave_nothing(refused, bad: str, model: Path, clean: Path, tmp_path: Path) -> None:
+    image, output = clean, tmp_path / "out" / "noisy.mrc"
+    output.parent.mkdir()
+    if bad == "missing":
+        image = tmp_path / "none.mrc"
+    elif bad == "empty":
+        image.write_bytes(b"")
+    elif bad == "nan":
+        io.write(image, np.full((4, 4), np.nan, np.float32))
+    elif bad == "truncated":
+        image.write_bytes(image.read_bytes()[:2000])
+    elif bad == "not a model":
+        model = clean
+    elif bad == "folder":
+        image = tmp_path
+    else:
+        output = tmp_path / "out" / "noisy.jpg"
+    refused("sample", model, image, "-o", output)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_evaluate_refuses_unequal_pairs(refused, model: Path, clean: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.npy"
+    io.write(other, np.zeros((3, 3)))
+    assert "equal sizes" in refused("evaluate", model, "--signal", clean, "--observation", other)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_missing_gpu_is_explained(refused, model: Path, clean: Path, tmp_path: Path) -> None:
+    message = refused("sample", model, clean, "-o", tmp_path / "n.mrc", "--device", "cuda")
+    assert "--device cpu" in message

@@ -1,0 +1,182 @@
+"""The one loop: it finds known truths, alone and jointly, and survives what goes wrong."""
+
+import math
+
+import pytest
+import torch
+
+import noiseflow
+from noiseflow.tabulated import ObservationTable
+
+
+def gradient_image(size: int = 256) -> torch.Tensor:
+    return torch.linspace(0.05, 1, size * size).reshape(size, size)
+
+
+def skewed_noise(signal: torch.Tensor, seed: int = 0) -> tuple[torch.Tensor, float]:
+    """Gamma noise of unit skewness growing with the signal, and its entropy in nats per pixel."""
+    generator = torch.Generator().manual_seed(seed)
+    shape, scale = 4, 0.02 + 0.04 * signal
+    gamma = -torch.log(torch.rand((shape, *signal.shape), generator=generator)).sum(0)
+    entropy = torch.distributions.Gamma(torch.tensor(4.0), torch.tensor(1.0)).entropy() - math.log(2)
+    return signal + scale * (gamma - shape) / 2, float((entropy + torch.log(scale)).mean())
+
+
+@pytest.mark.parametrize("name", ["RadialFlow", "SplineFlow"])
+def test_flow_reaches_the_entropy_of_skewed_noise(name: str) -> None:
+    signal = gradient_image()
+    observation, _ = skewed_noise(signal)
+    model = getattr(noiseflow, name)(mean_preserving=True)
+    noiseflow.fit(model, signal, observation, num_steps=300)
+    fresh, entropy = skewed_noise(signal, seed=1)
+    with torch.no_grad():
+        nll = -float(model(signal).log_prob(fresh).mean())
+    gaussian = noiseflow.SignalDependentGaussian()
+    noiseflow.fit(gaussian, signal, observation, num_steps=100)
+    with torch.no_grad():
+        assert nll < -float(gaussian(signal).log_prob(fresh).mean()) - 0.05
+    assert nll == pytest.approx(entropy, abs=0.03)
+
+
+def test_gaussian_finds_its_standard_deviation() -> None:
+    signal = gradient_image()
+    observation = signal + 0.3 * torch.randn(signal.shape, generator=torch.Generator().manual_seed(0))
+    model = noiseflow.Gaussian()
+    noiseflow.fit(model, signal, observation, num_steps=50)
+    assert model.log_scale.exp().item() == pytest.approx(0.3, rel=0.01)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_fit_does_not_depend_on_units(scale: float) -> None:
+    signal = gradient_image(64)
+    observation, entropy = skewed_noise(signal)
+    result = noiseflow.fit(noiseflow.SplineFlow(), signal * scale, observation * scale, num_steps=100)
+    assert result.held_out_nll - math.log(scale) == pytest.approx(entropy, abs=0.1)
+
+
+def test_same_seed_gives_the_same_model() -> None:
+    signal = gradient_image(64)
+    observation, _ = skewed_noise(signal)
+    states = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        model = noiseflow.RadialFlow()
+        noiseflow.fit(model, signal, observation, num_steps=20, generator=torch.Generator().manual_seed(5))
+        states.append(model.state_dict())
+    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+def test_masked_pixels_may_hold_anything() -> None:
+    signal = gradient_image(64)
+    observation, _ = skewed_noise(signal)
+    broken, mask = observation.clone(), torch.ones_like(observation, dtype=torch.bool)
+    broken[:8], mask[:8] = math.nan, False
+    with pytest.raises(ValueError, match="512 pixels of signal or observation are NaN"):
+        noiseflow.fit(noiseflow.Gaussian(), signal, broken)
+    result = noiseflow.fit(noiseflow.Gaussian(), signal, broken, mask=mask, num_steps=20)
+    assert math.isfinite(result.held_out_nll)
+
+
+@pytest.mark.parametrize(
+    ("signal", "observation", "message"),
+    [
+        (torch.zeros(4, 4), torch.zeros(4, 5), "they must be equal"),
+        (torch.zeros(0), torch.zeros(0), "too few"),
+        (torch.zeros(100), torch.zeros(100), "no noise to learn"),
+    ],
+)
+def test_unusable_data_is_refused(signal: torch.Tensor, observation: torch.Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        noiseflow.fit(noiseflow.RadialFlow(), signal, observation)
+
+
+class Explodes(noiseflow.Gaussian):
+    """A Gaussian whose likelihood is NaN on some calls."""
+
+    calls = 0
+
+    def forward(self, signal: torch.Tensor):  # type: ignore[no-untyped-def]
+        Explodes.calls += 1
+        return super().forward(signal * (math.nan if Explodes.calls % 10 == 0 else 1))
+
+
+def test_fit_recovers_from_non_finite_steps() -> None:
+    signal = gradient_image(64)
+    observation, _ = skewed_noise(signal)
+    model = Explodes()
+    result = noiseflow.fit(model, signal, observation, num_steps=40, standardise=False)
+    assert 1 <= result.recoveries <= 8
+    assert math.isfinite(model.log_scale.item())
+
+
+def exposures(count: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
+    scene = gradient_image(48)
+    return scene, torch.stack([skewed_noise(scene, seed)[0] for seed in range(count)])
+
+
+def test_static_scene_is_learnt_with_its_noise() -> None:
+    scene, observation = exposures()
+    model, signal_model = noiseflow.SplineFlow(mean_preserving=True), noiseflow.StaticScene(observation)
+    with torch.no_grad():
+        signal_model.scene.add_(0.1 * torch.randn(signal_model.scene.shape, generator=torch.Generator().manual_seed(0)))
+    before = float((signal_model.image() - scene).square().mean())
+    noiseflow.fit(model, signal_model, observation, num_steps=150)
+    after = float((signal_model.image() - scene).square().mean())
+    assert after < 0.05 * before
+
+
+def test_resumed_fit_ends_where_the_uninterrupted_one_does() -> None:
+    _, observation = exposures()
+
+    def run(**options):  # type: ignore[no-untyped-def]
+        torch.manual_seed(0)
+        model, scene = noiseflow.RadialFlow(mean_preserving=True), noiseflow.StaticScene(observation)
+        noiseflow.fit(model, scene, observation, num_steps=40, generator=torch.Generator().manual_seed(1), **options)
+        return scene.image()
+
+    states: list[dict] = []
+
+    def stop_half_way(state: dict) -> None:
+        states.append(state)
+        if state["done"] == 20:
+            raise KeyboardInterrupt
+
+    whole = run()
+    with pytest.raises(KeyboardInterrupt):
+        run(checkpoint=stop_half_way)
+    resumed = run(resume=states[-1])
+    assert torch.allclose(resumed, whole, rtol=1e-6, atol=1e-7)
+
+
+def test_frozen_noise_model_stays_as_it_is() -> None:
+    _, observation = exposures()
+    model = noiseflow.Gaussian(0.05).requires_grad_(False)
+    noiseflow.fit(model, noiseflow.StaticScene(observation), observation, num_steps=10, standardise=False)
+    assert model.log_scale.exp().item() == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("clipped", [False, True])
+def test_table_agrees_with_the_exact_likelihood(clipped: bool) -> None:
+    scene, observation = exposures()
+    observation = observation.clamp(0, 1) if clipped else observation
+    base = noiseflow.SplineFlow(mean_preserving=True)
+    model = noiseflow.Digitised(base, step=0.0, low=0.0, high=1.0) if clipped else base
+    flat = scene.repeat(12, 1, 1)
+    noiseflow.fit(model, flat, observation, num_steps=100)
+    table = ObservationTable(model, observation.reshape(-1), -0.1, 1.2)
+    assert table.error <= 1e-3
+    jitter = 0.002 * torch.randn(flat.numel(), generator=torch.Generator().manual_seed(0))
+    signal = (flat.reshape(-1) + jitter).requires_grad_()
+    exact = model(signal).log_prob(observation.reshape(-1))
+    found = table.log_prob(signal)
+    assert float((found - exact).detach().abs().mean()) < 1.5e-3
+    (slope,) = torch.autograd.grad(exact.sum(), signal)
+    (found_slope,) = torch.autograd.grad(found.sum(), signal)
+    assert float((found_slope - slope).abs().mean()) < 0.05 * float(slope.abs().mean())
+
+
+def test_held_out_pixels_do_not_depend_on_noise_of_the_same_seed() -> None:
+    signal = gradient_image()
+    observation = noiseflow.Gaussian(0.1)(signal).sample(generator=torch.Generator().manual_seed(0))
+    result = noiseflow.fit(noiseflow.Gaussian(0.1).requires_grad_(False), signal, observation, standardise=False)
+    assert result.held_out_nll == pytest.approx(0.5 * math.log(2 * math.pi * math.e * 0.01), abs=0.04)

@@ -1,0 +1,112 @@
+"""Files in and out: round trips, damage of every kind, and nothing half-written."""
+
+from pathlib import Path
+
+import mrcfile
+import numpy as np
+import pytest
+import tifffile
+
+from noiseflow import io
+
+IMAGE = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+
+
+@pytest.mark.parametrize("suffix", [".mrc", ".tif", ".npy", ".st", ".rec"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint16, np.float32])
+def test_round_trip(tmp_path: Path, suffix: str, dtype: type) -> None:
+    path = tmp_path / f"image{suffix}"
+    io.write(path, IMAGE.astype(dtype))
+    assert np.array_equal(io.read(path).data, IMAGE.astype(dtype))
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", [".mrc", ".tif"])
+def test_voxel_size_is_carried(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    io.write(path, IMAGE, voxel_size=(3.0, 2.0, 1.5))
+    assert io.read(path).voxel_size == pytest.approx((3.0, 2.0, 1.5), rel=1e-5)
+
+
+def test_real_files_open(data: Path) -> None:
+    series = io.read(data / "tilt_needle" / "needle_aligned.mrc")
+    assert series.data.shape == (91, 64, 64)
+    assert series.voxel_size == pytest.approx((179.949,) * 3, rel=1e-5)
+    assert io.read_image(data / "exposures_miro" / "channel1_050ms.tif").dtype == np.uint16
+
+
+def test_truncation_at_any_place_is_one_clear_error(tmp_path: Path, data: Path) -> None:
+    for source in (data / "tilt_needle" / "needle_aligned.mrc", data / "exposures_miro" / "channel1_050ms.tif"):
+        whole = source.read_bytes()
+        for size in [1, 3, 100, 1023, 1024, *range(2048, len(whole) - 1, len(whole) // 20)]:
+            path = tmp_path / f"cut{source.suffix}"
+            path.write_bytes(whole[:size])
+            with pytest.raises(ValueError, match="cannot be read"):
+                io.read(path)
+
+
+def test_absurd_header_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "absurd.mrc"
+    with mrcfile.new(path, data=IMAGE) as mrc:
+        mrc.header.nx = mrc.header.ny = 1_000_000
+    with pytest.raises(ValueError, match="claims 1000000 x 1000000"):
+        io.read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("empty.mrc", b"", "empty"),
+        ("text.tif", b"not an image at all", "cannot be read"),
+        ("text.mrc", b"x" * 4096, "cannot be read"),
+        ("code.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", "cannot be read"),
+        ("image.jpeg", b"x", "unknown file type"),
+    ],
+)
+def test_wrong_content_is_refused(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        io.read(path)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        io.read(tmp_path / "none.mrc")
+    with pytest.raises(ValueError, match="is a folder"):
+        io.read(tmp_path)
+
+
+def test_colour_and_complex_images_are_refused(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
+    np.save(tmp_path / "complex.npy", np.zeros((2, 2), complex))
+    with pytest.raises(ValueError, match="colour"):
+        io.read(tmp_path / "colour.tif")
+    with pytest.raises(ValueError, match="complex128"):
+        io.read(tmp_path / "complex.npy")
+
+
+def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "image.npy"
+    io.write(path, IMAGE)
+    with pytest.raises(RuntimeError), io.atomic_path(path) as partial:
+        partial.write_bytes(b"half")
+        raise RuntimeError
+    assert np.array_equal(io.read(path).data, IMAGE)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_output_is_checked_before_work(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot write"):
+        io.check_output(tmp_path / "volume.jpg")
+    with pytest.raises(FileNotFoundError, match="create the folder"):
+        io.check_output(tmp_path / "none" / "volume.mrc")
+
+
+def test_bad_pixels_are_named() -> None:
+    bad = IMAGE.copy()
+    bad[1, 2, 3] = np.nan
+    with pytest.raises(ValueError, match=r"1 NaN or infinite pixels, the first at \(1, 2, 3\)"):
+        io.require_finite(bad, "tilts.mrc")
+    with pytest.raises(ValueError, match="flat"):
+        io.require_contrast(np.ones((2, 2)), "tilts.mrc")
