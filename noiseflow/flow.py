@@ -13,7 +13,7 @@ from noiseflow.distributions import LatentDistribution, normal_quadrature
 from noiseflow.standardisation import Standardisation, interpolate_cubic
 from noiseflow.transforms import Affine, Radial, Spline, StudentTail, Transform
 
-_MEAN_NODES = 65
+_MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,19 @@ def tail_layer(*, conditional: bool = False) -> Layer:
     return Layer((-4.0, -4.0), build, conditional)
 
 
+def conditioning_network(num_outputs: int, width: int) -> nn.Sequential:
+    """A small network of two features of the signal; its outputs start at zero, and its weights at the same numbers always."""
+    generator = torch.Generator().manual_seed(0)
+    first, hidden, last = nn.Linear(2, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
+    with torch.no_grad():
+        for layer in (first, hidden):
+            nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+            nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+        last.weight.zero_()
+        last.bias.zero_()
+    return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)
+
+
 def _bounded(raw: Tensor, limit: float) -> Tensor:
     return limit * torch.tanh(raw / limit)
 
@@ -100,11 +113,7 @@ class ConditionalFlow(nn.Module):
         self.standardisation = Standardisation()
         self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
         self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
-        last = nn.Linear(width, self.num_conditional)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        hidden = nn.Linear(width, width)
-        self.conditioner = nn.Sequential(nn.Linear(2, width), nn.Tanh(), hidden, nn.Tanh(), last)
+        self.conditioner = conditioning_network(self.num_conditional, width)
 
     def forward(self, signal: Tensor) -> FlowDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
@@ -137,9 +146,10 @@ class ConditionalFlow(nn.Module):
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual on a grid of signal coordinates, by quadrature."""
         dtype, device = self.bias.dtype, self.bias.device
-        nodes, weights = normal_quadrature(dtype, device)
-        coordinate = torch.linspace(0, 1, _MEAN_NODES, dtype=dtype, device=device)
-        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(_MEAN_NODES, -1))
+        nodes, weights = normal_quadrature(dtype, device, limit=9.0, count=401)
+        count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
+        coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
+        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(count, -1))
         return x @ weights
 
     def extra_repr(self) -> str:
