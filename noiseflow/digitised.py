@@ -65,12 +65,13 @@ class DigitisedDistribution(NoiseDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         result = self._log_cell(value) if self.step > 0 else self.base.log_prob(value)
-        infinity = torch.full_like(value, math.inf)
+        # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
+        infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)
         if math.isfinite(self.low):
-            edge = torch.full_like(value, self.low + self.step / 2)
+            edge = torch.full_like(infinity, self.low + self.step / 2)
             result = torch.where(value <= self.low, self.base.log_interval_prob(-infinity, edge), result)
         if math.isfinite(self.high):
-            edge = torch.full_like(value, self.high - self.step / 2)
+            edge = torch.full_like(infinity, self.high - self.step / 2)
             result = torch.where(value >= self.high, self.base.log_interval_prob(edge, infinity), result)
         return result
 

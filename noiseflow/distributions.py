@@ -72,6 +72,8 @@ class LatentDistribution(NoiseDistribution):
 
     def _latent_bound(self, value: Tensor) -> Tensor:
         finite = torch.isfinite(value)
+        if not bool(finite.any()):
+            return value
         latent = self.to_latent(torch.where(finite, value, torch.zeros_like(value)))[0]
         return torch.where(finite, latent, value)
 

@@ -19,6 +19,7 @@ Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
+_LOOK_COUNT = 20_000
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 
@@ -192,7 +193,7 @@ class _Loop:
                 if step % check_every == 0 or step == num_steps:
                     good = self._judge(step) or good
                     if table is not None:
-                        self.result.table_error = table.check(self.noise_model)
+                        self._check_table(table, rarely=step < num_steps)
                     if checkpoint is not None:
                         checkpoint(self.state())
                 if progress is not None:
@@ -205,11 +206,12 @@ class _Loop:
             self._judge(0)
         if self.best is not None:
             self._load_models(self.best)
+            self.result.held_out_nll = self.held_out_nll()
         self.result.num_steps, self.result.seconds = num_steps, time.perf_counter() - started
         return self.result
 
     def _judge(self, step: int) -> dict[str, Any] | None:
-        nll = self.held_out_nll()
+        nll = self.held_out_nll(_LOOK_COUNT)
         if not math.isfinite(nll):
             return None
         state = self._models()
@@ -217,6 +219,12 @@ class _Loop:
             self.best, self.result.held_out_nll = state, nll
         self.result.history[step] = nll
         return state
+
+    def _check_table(self, table: ObservationTable, *, rarely: bool) -> None:
+        """A model that learns may outgrow its table; that is slow, and seen in every fifth look."""
+        if self.noise_optimiser is not None and (not rarely or len(self.result.history) % 5 == 0):
+            table.check(self.noise_model)
+        self.result.table_error = table.error
 
     def _table(self) -> ObservationTable:
         with torch.no_grad():
@@ -256,9 +264,9 @@ class _Loop:
         return self.train[draw.to(self.train.device)]
 
     @torch.no_grad()
-    def held_out_nll(self) -> float:
-        """Mean negative log-likelihood of at most 10⁵ held-out pixels, nats per pixel."""
-        pixels = self.judge[:: max(1, self.judge.numel() // 100_000)]
+    def held_out_nll(self, most: int = 100_000) -> float:
+        """Mean negative log-likelihood of at most so many held-out pixels, nats per pixel."""
+        pixels = self.judge[:: max(1, self.judge.numel() // most)]
         total = 0.0
         for part in torch.split(pixels, 32768):
             total -= float(self.noise_model(self._signal(part)).log_prob(self.observation[part]).double().sum())

@@ -22,8 +22,8 @@ _SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
 class ObservationTable:
     """log p(o | s) and its signal derivative for pixels whose observations stay fixed while their signals change.
 
-    Rows are signals, spaced evenly in the square root because weak signals change the noise fastest. Columns are equally spaced residuals o − s, along which noise changes fast while it changes
-    slowly along the rows; observations on a rail have columns of their own. Where that is not accurate enough and the
+    Rows are signals, spaced evenly in the square root because weak signals change the noise fastest. Columns are equally
+    spaced residuals o − s, along which noise changes fast while it changes slowly along the rows; observations on a rail have columns of their own. Where that is not accurate enough and the
     observations have few levels (counts of a few electrons), columns are the levels themselves. Beyond the rows the
     log-likelihood continues along its slope, so that a stray signal is still pulled back.
 
@@ -158,7 +158,7 @@ class ObservationTable:
         part = slice(None, None, max(1, self._observation.numel() // count))
         observation = self._observation[part]
         generator = torch.Generator().manual_seed(0)
-        coarse = torch.linspace(self.low, self.high, 128, dtype=observation.dtype, device=observation.device)
+        coarse = torch.linspace(self.low, self.high, 64, dtype=observation.dtype, device=observation.device)
         likelihood = noise_model(coarse[:, None]).log_prob(observation.expand(coarse.numel(), -1)).cpu()
         gumbel = -torch.log(-torch.log(torch.rand(likelihood.shape, generator=generator).clamp(1e-7, 1 - 1e-7)))
         row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
@@ -178,11 +178,12 @@ def _everywhere(noise_model: nn.Module, signals: Tensor, values: Tensor) -> Tens
 
 def _between_rails(noise_model: nn.Module, signals: Tensor, values: Tensor) -> Tensor:
     """Log-likelihood on the table: its outer columns as they are, the inner ones as if there were no rails."""
-    value = _everywhere(noise_model, signals, values)
-    if isinstance(noise_model, Digitised):
-        free = Digitised(noise_model.model, step=noise_model.step)
-        value = torch.cat([value[:, :1], free(signals).log_prob(values[:, 1:-1]), value[:, -1:]], dim=1)
-    return value
+    if not isinstance(noise_model, Digitised):
+        return _everywhere(noise_model, signals, values)
+    free = Digitised(noise_model.model, step=noise_model.step)
+    low, inner, high = values[:, :1], values[:, 1:-1], values[:, -1:]
+    outer = [_everywhere(noise_model, signals, rail) for rail in (low, high)]
+    return torch.cat([outer[0], _everywhere(free, signals, inner), outer[1]], dim=1)
 
 
 class _Lookup(torch.autograd.Function):
