@@ -1,3 +1,5 @@
+from . import io as io
+from . import metrics as metrics
 from .baselines import Gaussian as Gaussian
 from .baselines import Poisson as Poisson
 from .digitised import Digitised as Digitised
