@@ -2,6 +2,11 @@ from .align import Registration as Registration
 from .align import register as register
 from .aligned import AlignedPair as AlignedPair
 from .aligned import align_pair as align_pair
+from .aligned import align_with as align_with
+from .bursts import BurstReport as BurstReport
+from .bursts import align_burst as align_burst
+from .detector import Detector as Detector
+from .detector import measure_detector as measure_detector
 from .exposures import Burst as Burst
 from .exposures import ExposurePair as ExposurePair
 from .exposures import read_burst as read_burst
@@ -10,3 +15,11 @@ from .models import ModelScore as ModelScore
 from .models import collect_pixels as collect_pixels
 from .models import fit_models as fit_models
 from .models import simplest_sufficient as simplest_sufficient
+from .photon_transfer import PhotonTransfer as PhotonTransfer
+from .photon_transfer import collect_levels as collect_levels
+from .photon_transfer import fit_photon_transfer as fit_photon_transfer
+from .pipeline import Findings as Findings
+from .pipeline import calibrate_exposures as calibrate_exposures
+from .posterior import DetectorPosterior as DetectorPosterior
+from .posterior import sample_posterior as sample_posterior
+from .report import write_report as write_report

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.align import Registration, register
-from calibration.exposures import ExposurePair, Image, saturation_level
-from calibration.masks import Mask, MaskCounts, defects, saturated
-from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance
+from calibration.exposures import ExposurePair, Image, rails
+from calibration.masks import Mask, MaskCounts, clear_of_rails, defects, saturated
+from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
 
 LARGEST_SHARE = 0.5
 """Share of the residual's variance above which the 'long' exposure is the noisier of the two."""
@@ -35,6 +34,7 @@ class AlignedPair:
         signal_variance: the part of it that is the signal's own noise.
         counts: the pixels left out.
         exposure_ratio: as given; None if unknown.
+        frames: of the burst whose mean is the signal; 1 for an exposure pair.
     """
 
     short: Image
@@ -47,6 +47,7 @@ class AlignedPair:
     signal_variance: VarianceLine
     counts: MaskCounts
     exposure_ratio: float | None = None
+    frames: int = 1
 
     @property
     def observation(self) -> Image:
@@ -71,16 +72,26 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier
             one, or it is a copy of the short one.
     """
-    registration = register(pair.short, pair.long, names=(pair.short_name, pair.long_name))
+    return align_with(pair, register(pair.short, pair.long, names=(pair.short_name, pair.long_name)))
+
+
+def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
+    """Warp and scale a pair whose transform is known already. Raises as `align_pair`."""
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = (hot | dead | saturated(pair.long)).astype(float)
     reached, _ = registration.warp(bad)  # a bad pixel spoils all that its interpolation reaches
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
+    level = ring_mean(long, trusted, inner=0, blur=1.5)
+    trusted &= clear_of_rails(long, level, trusted)
+    _require_pixels(trusted, pair)
     scaling = fit_scaling(pair.short, long, trusted)
+    free = trusted & clear_of_rails(pair.short, scaling.slope * level + scaling.intercept, trusted, deviations=3.0)
+    if MINIMUM_PIXELS <= free.sum() < trusted.sum():
+        scaling = fit_scaling(pair.short, long, free)
     signal = scaling.slope * long + scaling.intercept
-    railed = _near_rail(pair.short, signal, trusted)
+    railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
@@ -113,18 +124,6 @@ def block_split(
     chosen[generator.permutation(number)[: max(1, round(fraction * number))]] = True
     whole = np.kron(chosen.reshape(rows, columns), np.ones((block, block), bool))
     return np.asarray(whole[: shape[0], : shape[1]])
-
-
-def _near_rail(short: Image, signal: Image, mask: Mask) -> Mask:
-    """Pixels whose signal lies within four standard deviations of the converter's upper rail: their noise is cut off.
-
-    Chosen by the signal, not by the reading, which would cut the noise itself.
-    """
-    rail = saturation_level(short)
-    if not np.isfinite(rail):
-        return np.zeros(short.shape, bool)
-    spread = float(np.median(np.abs(short - signal)[mask])) * 1.4826
-    return np.asarray(ndimage.gaussian_filter(signal, 1.0) > rail - 4 * spread)
 
 
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,53 +13,76 @@ from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choo
 if TYPE_CHECKING:
     from calibration.aligned import AlignedPair
     from calibration.models import ModelScore
+    from calibration.pipeline import Findings
+    from calibration.posterior import Interval
 
 
 def calibrate(
-    short: Annotated[list[Path], typer.Option(help="Short exposures, in order; alone, a stack or files of one burst.")],
+    short: Annotated[
+        list[Path], typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Noise-model file to write, .safetensors.")],
     long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short one, or one for all.")] = None,
+    dark: Annotated[
+        list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")
+    ] = None,
+    flat: Annotated[list[Path] | None, typer.Option(help="Two or more equal frames of even illumination.")] = None,
     kind: Annotated[str, typer.Option(help="auto, or the model to save: gaussian, poisson, …, flow, spline.")] = "auto",
     exposure_ratio: Annotated[
-        float | None, typer.Option(help="Long over short, if both come from one detector setting.")
+        float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for report.html.")] = None,
     json: JsonOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Learn a detector's noise from short and long exposures of one scene."""
+    """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
     import noiseflow
-    from calibration import align_pair, collect_pixels, fit_models, read_pairs, simplest_sufficient
-    from calibration.models import KINDS, NUM_STEPS, require_kind
-    from calibration.report import TABLE_HEADER, describe_registration, table_rows, verdict, write_report
+    from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
+    from calibration.models import require_kind
+    from calibration.report import write_report
     from noiseflow.io import check_output
     from noiseflow.model_files import MODEL_SUFFIXES
 
-    out = Output(json)
     check_output(output, suffixes=MODEL_SUFFIXES)
     require_kind(kind)
     chosen_device = _device(device)
-    pairs = [align_pair(pair) for pair in read_pairs(short, long or [], exposure_ratio=exposure_ratio)]
-    for name, pair in zip(short, pairs, strict=True):
-        out.line(f"{name}: {describe_registration(pair)}")
-    pixels = collect_pixels(pairs, seed=seed)
-    with progress_bar("Fitting noise models", NUM_STEPS * len(KINDS), json_mode=json) as progress:
-        scores = fit_models(pixels, seed=seed, device=chosen_device, progress=progress)
+    if not long and exposure_ratio is not None:
+        raise ValueError("--exposure-ratio is given without --long; a burst of equal exposures has none")
+    exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
+    findings = calibrate_exposures(
+        exposures,
+        dark=read_burst(dark, name="the dark frames") if dark else None,
+        flat=read_burst(flat, name="the flat frames") if flat else None,
+        seed=seed,
+        device=chosen_device,
+        bar=partial(progress_bar, json_mode=json),
+    )
+    scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
-    out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
-    out.table(TABLE_HEADER, table_rows(scores))
-    out.line(f"\n{verdict(scores)}")
-    page = None if report is None else write_report(report, pairs, pixels, scores, title="Detector calibration")
-    provenance = {"short": [str(p) for p in short], "long": [str(p) for p in long or []], "seed": seed, "nll": best.nll}
+    page = None if report is None else write_report(report, findings)
+    provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
     noiseflow.save(best.model, output, units="counts", provenance=provenance)
+    out = Output(json)
+    _tell(out, findings)
     out.line(f"Noise model ({best.name}): {output}" + (f"\nReport: {page}" if page else ""))
-    out.result(_summary(pairs, scores, best, output, page))
+    out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
+
+
+def summary(findings: Findings) -> dict[str, Any]:
+    """What the findings hold, as plain values: ``detector``, ``registration``, ``models``."""
+    found: dict[str, Any] = {
+        "detector": _detector(findings),
+        "registration": [_registration(pair) for pair in findings.pairs],
+        "models": {score.name: _figures(score) for score in findings.scores},
+    }
+    if findings.burst is not None:
+        found["burst"] = vars(findings.burst)
+    return found
 
 
 def _device(name: str) -> Any:
-    """The device to fit on; on the processor with one thread, because batches of some thousand pixels gain nothing
-    from more."""
+    """The device to fit on; with one thread on a processor: batches of some thousand pixels gain nothing from more."""
     import torch
 
     chosen = choose_device(name)
@@ -67,35 +91,54 @@ def _device(name: str) -> Any:
     return chosen
 
 
-def _summary(
-    pairs: list[AlignedPair], scores: list[ModelScore], best: ModelScore, output: Path, page: Path | None
-) -> dict[str, Any]:
+def _tell(out: Output, findings: Findings) -> None:
+    from calibration.report import (
+        TABLE_HEADER,
+        describe_burst,
+        describe_detector,
+        describe_registration,
+        table_rows,
+        verdict,
+    )
+
+    if findings.burst is not None:
+        out.line(describe_burst(findings.burst))
+    for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
+        out.line(f"Pair {number}: {describe_registration(pair)}")
+    detector = findings.detector
+    out.line("\nDetector: " + (describe_detector(detector) if detector else f"not measured: {findings.no_detector}"))
+    out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
+    out.table(TABLE_HEADER, table_rows(findings.scores))
+    out.line(f"\n{verdict(findings.scores)}")
+
+
+def _detector(findings: Findings) -> dict[str, Any] | None:
+    detector = findings.detector
+    if detector is None:
+        return None
+
+    def interval(value: Interval) -> dict[str, float]:
+        return {"median": value.median, "q05": value.q05, "q95": value.q95}
+
+    found = detector.posterior
     return {
-        "model": output,
-        "kind": best.name,
-        "report": page,
-        "registration": [_registration(pair) for pair in pairs],
-        "models": {score.name: _figures(score) for score in scores},
+        "gain": interval(found.gain),
+        "offset": interval(found.offset),
+        "read_noise": interval(found.read_noise),
+        "rhat": found.rhat,
+        "autocorrelation_time": found.autocorrelation_time,
+        "num_steps": found.num_steps,
+        "misfit": detector.misfit,
+        "offset_measured": detector.offset is not None,
     }
 
 
 def _registration(pair: AlignedPair) -> dict[str, Any]:
     found = pair.registration
-    return {
-        "rms_px": found.rms_px,
-        "error_px": found.error_px,
-        "inliers": found.inliers,
-        "matches": found.matches,
-        "matrix": found.matrix,
-        "method": found.method,
-        "motion": found.motion,
-        "shift": found.shift(pair.short.shape),
-        "rotation": found.rotation,
-        "scale": found.scale,
-        "slope": pair.scaling.slope,
-        "intercept": pair.scaling.intercept,
-        "masked": vars(pair.counts),
-    }
+    names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
+    scaling = {"slope": pair.scaling.slope, "intercept": pair.scaling.intercept}
+    values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
+    return values | scaling | {"masked": vars(pair.counts)}
 
 
 def _figures(score: ModelScore) -> dict[str, Any]:

@@ -141,6 +141,17 @@ def saturation_level(frame: NDArray[Any]) -> float:
     return float(top) if at_top > 3 * at_next else float("inf")
 
 
+def rounding_step(frame: Image) -> float:
+    """1 where all readings are whole numbers, else 0: not rounded."""
+    return 1.0 if np.array_equal(frame, np.round(frame)) else 0.0
+
+
+def rails(frame: Image) -> tuple[float, float]:
+    """Lower and upper rail of the converter as the frame shows them; infinite where it shows none."""
+    low = -saturation_level(-frame)
+    return (0.0 if frame.min() == 0 else low), saturation_level(frame)
+
+
 def _largest_value(data: NDArray[Any]) -> float:
     return float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else float("inf")
 
@@ -174,8 +185,12 @@ def read_pairs(
     ]
 
 
-def read_burst(paths: Sequence[str | Path]) -> Burst:
+def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst:
     """Read a burst from one stack, or from files of one frame each in the order taken.
+
+    Args:
+        paths: the files.
+        name: how messages call it; by default the file, or "the burst".
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -189,7 +204,7 @@ def read_burst(paths: Sequence[str | Path]) -> Burst:
         frames += list(data) if data.ndim == 3 else [data]
     for frame in frames[1:]:
         _require_same_size(frames[0], "the first frame", frame, "a later one")
-    return Burst(np.stack(frames), name=str(paths[0]) if len(paths) == 1 else "the burst")
+    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"))
 
 
 def _require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from calibration.exposures import Image, saturation_level
+from calibration.exposures import Image, rails, saturation_level
 
 Mask = NDArray[np.bool_]
 
@@ -52,6 +52,25 @@ def saturated(frame: Image, *, margin: int = 0) -> Mask:
     """Pixels at the upper rail, grown by `margin` pixels."""
     at_rail = frame >= saturation_level(frame)
     return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
+
+
+def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float = 3.5) -> Mask:
+    """Pixels whose level lies at least some standard deviations off the converter's rails, so that no noise is cut off.
+
+    Args:
+        frame: (y, x) readings.
+        level: (y, x) the signal by other readings than the frame's own: a choice by these would cut their noise.
+        mask: (y, x) pixels to judge the noise by.
+        deviations: the distance asked for.
+    """
+    low, high = rails(frame)
+    clear = np.ones(frame.shape, bool)
+    for rail, side in ((low, 1.0), (high, -1.0)):
+        if np.isfinite(rail):
+            near = mask & (side * level < np.percentile(side * level[mask], 25))
+            middle, far = np.percentile(side * (frame - level)[near], (50, 84.13))  # the other side is the clipped one
+            clear &= side * (level - rail) > deviations * (far - middle)
+    return clear
 
 
 def _deviation(frame: Image) -> Image:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +11,19 @@ from numpy.typing import NDArray
 from calibration.exposures import Image
 from calibration.scaling import fit_line
 
-NUM_LEVELS = 24
+NUM_LEVELS = 16
 """Signal levels into which the pixels of a pair are sorted, equally filled."""
 
-NUM_BINS = 192
+NUM_BINS = 128
 """Bins of each level's residual histogram."""
 
 REACH = 8.0
 """Standard deviations of the residual that the histogram covers either way; readings beyond it are defects, not
 noise."""
+
+
+class NotMeasurable(ValueError):
+    """The exposures cannot tell the detector's gain, though a noise model can still be fitted."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,6 @@ class Readings:
         weight: independent information per reading, 1 unless readings share their estimates.
         dark: taken without light: read noise alone.
         step: rounding step of the observation, counts; 0 if it is not rounded.
-        low: lower rail of the converter, counts.
-        high: upper rail, counts.
     """
 
     observation: Image
@@ -47,8 +49,6 @@ class Readings:
     weight: float = 1.0
     dark: bool = False
     step: float = 1.0
-    low: float = -np.inf
-    high: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,6 @@ class Levels:
         count: (L,) readings.
         width: (L,) of a histogram bin, counts.
         histogram: (L, NUM_BINS) readings, the middle of the bins at residual 0.
-        below: (L, NUM_BINS) fraction of pixels whose lower rail lies in each bin.
-        above: (L, NUM_BINS) the same for the upper rail.
         shot_share, read_share, weight, dark, step: (L,) as in `Readings`.
     """
 
@@ -73,8 +71,6 @@ class Levels:
     count: Image
     width: Image
     histogram: Image
-    below: Image
-    above: Image
     shot_share: Image
     read_share: Image
     weight: Image
@@ -105,30 +101,32 @@ class PhotonTransfer:
 def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS) -> Levels:
     """Sort readings into levels of like signal and count their residuals.
 
+    Rounded readings are dithered by one step, so that their lattice does not beat with the bins; the likelihood knows.
+
     Args:
         readings: of one detector setting; each is sorted into levels of its own.
         num_levels: at most, per exposure; fewer where a level would hold under 200 readings.
     """
     rows = []
+    generator = np.random.default_rng(0)
     for one in readings:
+        one = replace(one, observation=one.observation + one.step * (generator.random(one.observation.shape) - 0.5))
         number = 1 if one.dark else max(1, min(num_levels, len(one.level) // 200))
         rows += [_level(one, group) for group in np.array_split(np.argsort(one.level), number)]
     return Levels(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def fit_photon_transfer(levels: Levels) -> PhotonTransfer:
-    """Fit the line of variance against signal, over levels that no rail clips.
+    """Fit the line of variance against signal.
 
     Raises:
-        ValueError: the variance does not grow with the signal, so that no gain shows.
+        NotMeasurable: the variance does not grow with the signal, so that no gain shows.
     """
-    free = (levels.below.sum(1) == 0) & (levels.above.sum(1) == 0)
-    free = free if free.sum() >= 2 else np.ones_like(free)
-    variance = (levels.variance - levels.step**2 / 12) / (1 + levels.shot_share)
+    variance = (levels.variance - levels.step**2 / 6) / (1 + levels.shot_share)
     error = variance * np.sqrt(2 / np.maximum(levels.count * levels.weight, 1))
-    line = fit_line(levels.signal[free], variance[free])
+    line = fit_line(levels.signal, variance)
     if not line.rate > 0:
-        raise ValueError(
+        raise NotMeasurable(
             "the noise does not grow with the signal, so the gain cannot be measured; give exposures with more "
             "contrast, or flat frames at several levels"
         )
@@ -141,45 +139,12 @@ def _level(one: Readings, group: NDArray[np.int64]) -> tuple[Image | float, ...]
     inner = np.percentile(residual, (15.87, 84.13))
     robust = max((inner[1] - inner[0]) / 2, one.step / np.sqrt(12), np.finfo(float).tiny)
     kept = np.abs(residual - np.median(residual)) < REACH * robust
-    clipped = _rail_bins(one, signal, robust)
-    free = not any(bins.any() for bins in clipped)
-    centre = residual[kept].mean() if free and not one.dark else 0.0
     width = 2 * REACH * robust / NUM_BINS
-    variance = float(np.mean((residual[kept] - residual[kept].mean()) ** 2))
-    index = _with_rails(one, group, np.floor((residual - centre) / width + NUM_BINS / 2), width)[kept]
+    residual = residual[kept] - residual[kept].mean()
+    variance = float(np.mean(residual**2))
+    index = np.floor(residual / width + NUM_BINS / 2)
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
     share = one.shot_share / (1 + one.shot_share)
     spread = 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0)
     constants = (one.shot_share, one.read_share, one.weight, float(one.dark), one.step)
-    return float(signal.mean()), spread, variance, float(kept.sum()), width, histogram, *clipped, *constants
-
-
-def _rail_bins(one: Readings, signal: Image, robust: float) -> tuple[Image, Image]:
-    """In which bins of the residual the rails lie, as fractions of the level's pixels; zero where they do not
-    matter."""
-    width = 2 * REACH * robust / NUM_BINS
-    found = []
-    for side, rail in ((1, one.low), (-1, one.high)):
-        matters = np.isfinite(rail) and np.abs(rail - signal).min() < 5 * robust
-        index = _rail_index(rail, signal, one.step, width, side) if matters else np.empty(0)
-        inside = index[(index >= 0) & (index < NUM_BINS)].astype(int)
-        found.append(np.bincount(inside, minlength=NUM_BINS) / len(signal))
-    return found[0], found[1]
-
-
-def _rail_index(rail: float, signal: Image, step: float, width: float, side: int) -> Image:
-    """Bin whose far edge comes nearest to where readings start to be clipped; side 1: lower rail, −1: upper rail."""
-    edge = np.round((rail + side * step / 2 - signal) / width + NUM_BINS / 2)
-    return edge - 1 if side > 0 else edge
-
-
-def _with_rails(one: Readings, group: NDArray[np.int64], index: Image, width: float) -> Image:
-    """Bins of the residuals, with the readings at a rail in the bin of that rail and the others inside it."""
-    observation, signal = one.observation[group], one.signal[group]
-    if np.isfinite(one.low):
-        first = _rail_index(one.low, signal, one.step, width, 1)
-        index = np.where(observation <= one.low, first, np.maximum(index, first + 1))
-    if np.isfinite(one.high):
-        last = _rail_index(one.high, signal, one.step, width, -1)
-        index = np.where(observation >= one.high, last, np.minimum(index, last - 1))
-    return index
+    return float(signal.mean()), spread, variance, float(kept.sum()), width, histogram, *constants

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calibration.aligned import AlignedPair
-from calibration.exposures import Image
-from calibration.models import ModelScore, Pixels, simplest_sufficient
-from noiseflow.report import Report, new_figure, show_image
+from calibration.bursts import BurstReport
+from calibration.detector import EXCESS_NOISE, Detector
+from calibration.figures import (
+    corner_figure,
+    histogram_figure,
+    photon_transfer_figure,
+    pit_figure,
+    registration_figure,
+    residual_figure,
+)
+from calibration.models import ModelScore, simplest_sufficient
+from calibration.pipeline import Findings
+from noiseflow.report import Report
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+LARGEST_MISFIT = 1.3
+"""χ² per degree of freedom above which the readings do not come from a Poisson-Gaussian detector."""
 
 LABELS = {
     "gaussian": "Gaussian, one width",
@@ -66,30 +75,43 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     return text
 
 
-def write_report(
-    folder: str | Path, pairs: Sequence[AlignedPair], pixels: Pixels, scores: Sequence[ModelScore], *, title: str
-) -> Path:
-    """Write ``report.html`` into a folder, which is made if need be; returns its path."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    page = Report(title)
-    page.text(verdict(scores))
-    page.heading("Noise models")
-    caption = (
-        "NLL: negative log-likelihood of pixels kept apart from the fit, nats per pixel, lower is better. JSD (nats), "
-        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: what the model's own samples would give."
-    )
-    page.table(TABLE_HEADER, table_rows(scores), caption=caption)
-    page.figure(
-        histogram_figure(pixels, scores), caption="Residuals of the pixels kept apart, by signal, and every model."
-    )
-    page.heading("Registration")
-    for number, pair in enumerate(pairs, 1):
-        page.text(f"Pair {number}: {describe_registration(pair)}")
-        page.figure(
-            registration_figure(pair), caption="Magenta: short, green: long; grey where they agree. Residual in σ."
+def describe_detector(detector: Detector) -> str:
+    """Gain, offset and read noise with their 90 % intervals, and what they rest on."""
+    found = detector.posterior
+    parts = [
+        f"{name} {value.median:.4g} {unit} (90 %: {value.q05:.4g} … {value.q95:.4g})"
+        for name, unit, value in (
+            ("gain", "counts/e⁻", found.gain),
+            ("offset", "counts", found.offset),
+            ("read noise", "e⁻ rms", found.read_noise),
         )
-    return page.save(folder / "report.html")
+    ]
+    text = ", ".join(parts) + f". Chain of {found.num_steps} steps, {found.num_steps / found.autocorrelation_time:.0f} "
+    text += f"autocorrelation times, R-hat {found.rhat:.3f}. "
+    if found.read_noise.q95 > 3 * found.read_noise.q05:
+        text += (
+            "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it. "
+        )
+    if detector.misfit > LARGEST_MISFIT:
+        text += (
+            f"The readings depart from any Poisson-Gaussian detector (χ² per degree of freedom {detector.misfit:.2f}), so "
+            "the true errors are larger than these intervals. "
+        )
+    return text + EXCESS_NOISE
+
+
+def describe_burst(burst: BurstReport) -> str:
+    """What moved or faded along a burst, in words."""
+    if not np.isfinite(burst.drift):
+        drift = "The scene has too few features to measure a drift."
+    else:
+        drift = f"Largest drift between frames {burst.drift:.2f} px; " + (
+            "the other frames were moved onto each before they were compared."
+            if burst.drifting
+            else "the frames were compared as they are."
+        )
+    dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
+    return drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
 
 
 def describe_registration(pair: AlignedPair) -> str:
@@ -106,55 +128,47 @@ def describe_registration(pair: AlignedPair) -> str:
     )
 
 
-def registration_figure(pair: AlignedPair) -> Figure:
-    """Overlay before and after, and the residual in standard deviations."""
-    figure, axes = new_figure(3, width=12.0, height=4.0)
-    before = pair.scaling.slope * pair.long + pair.scaling.intercept
-    for axis, image, title in zip(axes[0], (before, pair.signal), ("before", "after registration"), strict=False):
-        axis.imshow(_overlay(pair.short, image), interpolation="nearest")
-        axis.set_title(title, fontsize=10)
-        axis.set_axis_off()
-    residual = (pair.short - pair.signal) / np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
-    show_image(axes[0, 2], np.where(pair.mask, residual, np.nan), "residual, σ", limits=(-4.0, 4.0))
-    return figure
+def write_report(folder: str | Path, findings: Findings, *, title: str = "Detector calibration") -> Path:
+    """Write ``report.html`` into a folder, which is made if need be; returns its path."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    page = Report(title)
+    page.text(verdict(findings.scores))
+    _add_detector(page, findings)
+    _add_models(page, findings)
+    _add_registration(page, findings)
+    return page.save(folder / "report.html")
 
 
-def histogram_figure(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> Figure:
-    """Residual histograms of the pixels kept apart at each of some signal levels, with every model's density on top."""
-    figure, axes = new_figure(3, -(-num_levels // 3), width=12.0, height=3.2)
-    signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
-    order = np.argsort(signal)
-    for axis, group in zip(axes.flat, np.array_split(order, num_levels), strict=False):
-        residual = observation[group] - signal[group]
-        low, high = np.percentile(residual, (0.1, 99.9))
-        edges = np.linspace(low, high, 61)
-        axis.hist(residual, bins=edges, density=True, color="0.8", label="data")
-        for score in scores:
-            axis.plot(
-                (edges[1:] + edges[:-1]) / 2,
-                _mean_density(score, signal[group], edges),
-                label=score.name,
-                linewidth=1.2,
-            )
-        axis.set_title(f"signal {signal[group].min():.4g} … {signal[group].max():.4g}", fontsize=10)
-        axis.set_yscale("log")
-        axis.set_ylim(bottom=2e-5 / (edges[1] - edges[0]))
-    axes.flat[0].legend(fontsize=8)
-    return figure
+def _add_detector(page: Report, findings: Findings) -> None:
+    page.heading("Detector")
+    if findings.detector is None:
+        page.text(f"Not measured: {findings.no_detector}")
+        return
+    page.text(describe_detector(findings.detector))
+    page.figure(photon_transfer_figure(findings.detector), caption="Photon transfer: variance against signal.")
+    page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
 
 
-def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
-    """Density of observation − signal in each bin, averaged over a sample of the level's signals."""
-    import torch
+def _add_models(page: Report, findings: Findings) -> None:
+    page.heading("Noise models")
+    caption = (
+        "NLL: negative log-likelihood of pixels kept apart from the fit, nats per pixel, lower is better. JSD (nats), "
+        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: what the model's own samples would give."
+    )
+    page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
+    histograms = histogram_figure(findings.pixels, findings.scores)
+    page.figure(histograms, caption="Residuals of the pixels kept apart, by signal, and every model.")
+    page.figure(pit_figure(findings.scores), caption="Calibration of each model on the pixels kept apart.")
 
-    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 200)]).float()
-    with torch.no_grad():
-        below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
-    return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
 
-
-def _overlay(short: Image, long: Image) -> Any:
-    """Short in magenta, long in green, both between the 1st and 99.5th percentiles of the long."""
-    low, high = np.percentile(long, (1, 99.5))
-    first, second = (np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) for image in (short, long))
-    return np.stack([first, second, first], -1)
+def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
+    page.heading("Registration and residual")
+    if findings.burst is not None:
+        page.text(describe_burst(findings.burst))
+    for number, pair in enumerate(findings.pairs[:most], 1):
+        page.text(f"Pair {number}: {describe_registration(pair)}")
+        page.figure(registration_figure(pair), caption="Magenta: short, green: long; grey where they agree.")
+        page.figure(residual_figure(pair), caption="What is left must be structureless.")
+    if len(findings.pairs) > most:
+        page.text(f"{len(findings.pairs) - most} more pairs are not drawn.")

@@ -24,12 +24,22 @@ class Scaling:
         intercept: counts.
         slope_error: standard error of the slope.
         intercept_error: standard error of the intercept.
+        centre: long reading at which slope and signal err independently.
+        level_error: standard error of the signal there.
     """
 
     slope: float
     intercept: float
     slope_error: float
     intercept_error: float
+    centre: float = 0.0
+    level_error: float = 0.0
+
+    def common_offset(self) -> tuple[float, float]:
+        """Offset of both exposures, counts, and its standard error, if one detector setting took them: intercept/(1 − slope)."""
+        offset = self.intercept / (1 - self.slope)
+        lever = (offset - self.centre) / (1 - self.slope)
+        return offset, float(np.hypot(self.level_error / (1 - self.slope), lever * self.slope_error))
 
 
 @dataclass(frozen=True)
@@ -79,9 +89,9 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
         raise ValueError(
             "the two exposures do not rise and fall together once registered; check that they show the same scene"
         )
-    centre = weight @ x / total
-    level = 1 / np.sqrt(total)
-    return Scaling(float(slope), float(intercept), float(error), float(np.hypot(level, error * centre)))
+    middle, own = float(weight @ x / total), float(1 / np.sqrt(total))
+    intercept_error = float(np.hypot(own, error * middle))
+    return Scaling(float(slope), float(intercept), float(error), intercept_error, middle, own)
 
 
 def own_variance(

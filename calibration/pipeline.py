@@ -1,0 +1,113 @@
+"""The whole calibration in one call: align, measure the detector, fit and judge the noise models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.aligned import AlignedPair, align_pair
+from calibration.bursts import BurstReport, align_burst
+from calibration.detector import Detector, measure_detector
+from calibration.exposures import Burst, ExposurePair, Image
+from calibration.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
+from calibration.photon_transfer import NotMeasurable
+
+if TYPE_CHECKING:
+    from noiseflow.console import Progress
+
+Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
+"""``bar(title, total)``: a context that gives a progress callback."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that a calibration found.
+
+    Attributes:
+        pairs: aligned pairs, or the frames of a burst.
+        pixels: what the models were fitted to and judged by.
+        scores: of the models.
+        detector: None where no gain shows.
+        no_detector: why not.
+        burst: what moved or faded; None for pairs.
+    """
+
+    pairs: Sequence[AlignedPair]
+    pixels: Pixels
+    scores: Sequence[ModelScore]
+    detector: Detector | None = None
+    no_detector: str = ""
+    burst: BurstReport | None = None
+
+
+def calibrate_exposures(
+    exposures: Sequence[ExposurePair] | Burst,
+    *,
+    dark: Burst | None = None,
+    flat: Burst | None = None,
+    seed: int = 0,
+    device: Any = "cpu",
+    bar: Bar = lambda title, total: nullcontext(),
+) -> Findings:
+    """Align exposures, measure the detector, and fit and judge every noise model.
+
+    Args:
+        exposures: pairs, or one burst.
+        dark: frames without light.
+        flat: equal frames of even illumination.
+        seed: of every random choice.
+        device: torch device of the fits.
+        bar: makes progress bars.
+
+    Raises:
+        ValueError: exposures that cannot be aligned, or a posterior that does not converge.
+    """
+    if dark is not None:
+        exposures = without_pattern(exposures, dark)
+    burst = None
+    if isinstance(exposures, Burst):
+        pairs, burst = align_burst(exposures)
+    else:
+        pairs = [align_pair(pair) for pair in exposures]
+    detector, reason = None, ""
+    try:
+        with bar("Sampling the detector's posterior", 16000) as progress:
+            detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+    except NotMeasurable as error:
+        reason = str(error)
+    pixels = collect_pixels(pairs, seed=seed)
+    with bar("Fitting noise models", NUM_STEPS * len(KINDS)) as progress:
+        scores = fit_models(pixels, seed=seed, device=device, progress=progress)
+    return Findings(pairs, pixels, scores, detector, reason, burst)
+
+
+def without_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Sequence[ExposurePair] | Burst:
+    """Exposures less the dark frames' fixed pattern, where the mean dark frame knows it better than its own noise.
+
+    The pattern's mean stays in, so that the offset does.
+
+    Raises:
+        ValueError: dark frames of another size.
+    """
+    pattern = dark.frames.mean(0)
+    first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
+    if pattern.shape != first.shape:
+        raise ValueError(
+            f"{dark.name} is {pattern.shape} and the exposures are {first.shape} pixels; take dark frames with the same "
+            "binning and region"
+        )
+    noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
+    if np.var(pattern) < 2 * noise:
+        return exposures
+    pattern = pattern - pattern.mean()
+    if isinstance(exposures, Burst):
+        return replace(exposures, frames=exposures.frames - pattern)
+    return [_less(pair, pattern) for pair in exposures]
+
+
+def _less(pair: ExposurePair, pattern: Image) -> ExposurePair:
+    return replace(pair, short=pair.short - pattern, long=pair.long - pattern)

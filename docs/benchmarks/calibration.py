@@ -1,0 +1,175 @@
+"""Accuracy and speed of the calibration: `python docs/benchmarks/calibration.py registration|parameters|real|speed`.
+
+Each part prints its figures and stores them in ``results/calibration.json`` beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+# this file bears the package's name: keep its folder from hiding the package
+sys.path = [path for path in sys.path if Path(path or ".").resolve() != Path(__file__).resolve().parent]
+
+Image = NDArray[np.float64]
+RESULTS = Path(__file__).with_name("results") / "calibration.json"
+RATIO = 16.0
+
+
+def textured(generator: np.random.Generator, size: int) -> Any:
+    """A random field with detail from 2 to 20 pixels, mean 0 and standard deviation 1, at every real position."""
+    pad = size // 3
+    shape = (size + 2 * pad,) * 2
+    field = sum(ndimage.gaussian_filter(generator.standard_normal(shape), blur) * blur for blur in (2.0, 6.0, 20.0))
+    coefficients = ndimage.spline_filter((field - field.mean()) / field.std(), 5)
+    return lambda x, y: ndimage.map_coordinates(coefficients, [y + pad, x + pad], order=5, prefilter=False)
+
+
+def sparse(generator: np.random.Generator, size: int) -> Any:
+    """12 to 39 round particles of height 1 and radius 3 to 8 pixels on a flat support."""
+    centres = generator.uniform(0.05 * size, 0.95 * size, (generator.integers(12, 40), 2))
+    radii = generator.uniform(3, 8, len(centres))
+    return lambda x, y: sum(
+        0.5 - 0.5 * np.tanh(np.hypot(x - cx, y - cy) - radius) for (cx, cy), radius in zip(centres, radii, strict=True)
+    )
+
+
+def registration_trial(kind: str, seed: int, size: int = 256) -> dict[str, Any]:
+    """One pair of known transform: rotation up to 3°, shifts up to 10 %, SNR 2 to 5 in the short exposure."""
+    from calibration import register
+
+    generator = np.random.default_rng(seed)
+    scene = {"textured": textured, "sparse": sparse}[kind](generator, size)
+    snr, angle = generator.uniform(2, 5), np.radians(generator.uniform(-3, 3))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centre = np.full(2, (size - 1) / 2)
+    matrix = np.column_stack([turn, centre - turn @ centre + generator.uniform(-0.1, 0.1, 2) * size])
+    y, x = np.mgrid[:size, :size].astype(float)
+    moved = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([x, y])) + matrix[:, 2][:, None, None]
+    short = scene(*moved) + generator.standard_normal(x.shape) / snr
+    long = RATIO * scene(x, y) + np.sqrt(RATIO) * generator.standard_normal(x.shape) / snr
+    try:
+        found = register(100 + 20 * short, 300 + 20 * long)
+    except ValueError:
+        return {"found": False}
+    difference = np.einsum("ij,jkl->ikl", (found.matrix - matrix)[:, :2], np.stack([x, y]))
+    difference += (found.matrix - matrix)[:, 2][:, None, None]
+    error = float(np.sqrt((difference**2).sum(0).mean()))
+    return {"found": True, "error": error, "predicted": found.error_px, "method": found.method}
+
+
+def registration(pool: ProcessPoolExecutor, trials: int) -> dict[str, Any]:
+    """Error against the known transform, success rate, and failures that no message told."""
+    results = {}
+    for kind, limit in (("textured", 0.1), ("sparse", 0.3)):
+        found = list(pool.map(registration_trial, [kind] * trials, range(trials)))
+        errors = np.array([one["error"] for one in found if one["found"]])
+        predicted = np.array([one["predicted"] for one in found if one["found"]])
+        results[kind] = {
+            "trials": trials,
+            "limit_px": limit,
+            "rms_error_px": float(np.sqrt(np.mean(errors**2))),
+            "median_error_px": float(np.median(errors)),
+            "largest_error_px": float(errors.max()),
+            "predicted_rms_px": float(np.sqrt(np.mean(predicted**2))),
+            "success": float(np.mean(errors <= limit) * len(errors) / trials),
+            "detected_failures": trials - len(errors),
+            "silent_failures": int(np.sum(errors > limit)),
+            "by_sift": float(np.mean([one["method"] == "sift" for one in found if one["found"]])),
+        }
+    return results
+
+
+def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
+    """One simulated Poisson-Gaussian pair of random parameters, already registered, with ratio 16."""
+    from calibration import ExposurePair, align_with, measure_detector
+    from calibration.align import Registration
+
+    generator = np.random.default_rng(seed)
+    gain, read_noise, electrons = (
+        float(np.exp(generator.uniform(np.log(low), np.log(high)))) for low, high in ((0.5, 20), (0.2, 10), (1, 500))
+    )
+    clipped = bool(generator.random() < 0.5)
+    offset = 0.0 if clipped else 100.0
+    dose = np.exp(0.8 * textured(generator, size)(*np.mgrid[:size, :size][::-1].astype(float)))
+    dose *= electrons / dose.mean()
+    top = offset + gain * (dose.max() + 6 * np.sqrt(dose.max() + read_noise**2))
+    allowed = [bits for bits in (8, 10, 12, 14, 16) if 2**bits - 1 > top] or [16]
+    bits = int(generator.choice(allowed))
+
+    def reading(rate: Image, rail: float) -> Image:
+        electrons_read = generator.poisson(rate) + read_noise * generator.standard_normal(rate.shape)
+        return np.clip(np.round(offset + gain * electrons_read), 0, rail)
+
+    pair = ExposurePair(reading(dose, 2**bits - 1), reading(RATIO * dose, np.inf), RATIO)
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    truth = {"gain": gain, "read_noise": read_noise, "offset": offset}
+    setting = truth | {"electrons": electrons, "clipped": clipped, "bits": bits, "seed": seed}
+    try:
+        posterior = measure_detector([align_with(pair, still)], seed=seed).posterior
+    except ValueError as error:
+        return setting | {"failed": str(error)}
+    return setting | {f"{name}_found": vars(getattr(posterior, name)) for name in truth}
+
+
+def parameters(pool: ProcessPoolExecutor, trials: int) -> dict[str, Any]:
+    """Errors and coverage of the 90 % interval over random draws from the grid's ranges."""
+    found = list(pool.map(parameter_trial, range(trials)))
+    good = [one for one in found if "failed" not in one]
+    results: dict[str, Any] = {"trials": trials, "failed": [one for one in found if "failed" in one]}
+    for name in ("gain", "read_noise", "offset"):
+        truth, median, low, high = (
+            np.array(column)
+            for column in zip(
+                *((one[name], *(one[f"{name}_found"][key] for key in ("median", "q05", "q95"))) for one in good), strict=True
+            )
+        )
+        inside = (low <= truth) & (truth <= high)
+        results[name] = {"coverage_90": float(inside.mean())}
+        for part, chosen in (("clipped", True), ("unclipped", False)):
+            mask = np.array([one["clipped"] for one in good]) == chosen
+            results[name][f"coverage_90_{part}"] = float(inside[mask].mean())
+        if name != "offset":
+            error = np.abs(median / truth - 1)
+            identifiable = high / low < 1.5
+            results[name] |= {
+                "median_error": float(np.median(error)),
+                "identifiable": float(identifiable.mean()),
+                "median_error_identifiable": float(np.median(error[identifiable])),
+            }
+    results["draws"] = found
+    return results
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("registration", "parameters", "real", "speed"))
+    parser.add_argument("--trials", type=int, default=None, help="default: 200 registrations, 300 parameter sets")
+    parser.add_argument("--data", type=Path, default=None, help="folder with exposures_miro/ and detector_zhuang/")
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    started = time.perf_counter()
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        if arguments.part == "registration":
+            result = registration(pool, arguments.trials or 200)
+        elif arguments.part == "parameters":
+            result = parameters(pool, arguments.trials or 300)
+    result["seconds"] = time.perf_counter() - started
+    RESULTS.parent.mkdir(exist_ok=True)
+    stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    stored[arguments.part] = result
+    RESULTS.write_text(json.dumps(stored, indent=1) + "\n")
+    print(json.dumps({key: value for key, value in result.items() if key != "draws"}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
