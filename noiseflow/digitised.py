@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow import tabulated
 from noiseflow.distributions import NoiseDistribution
 
 _MOMENT_NODES = 257
@@ -38,7 +39,11 @@ class Digitised(nn.Module):
         self.step, self.low, self.high = float(step), float(low), float(high)
 
     def forward(self, signal: Tensor) -> DigitisedDistribution:
-        return DigitisedDistribution(self.model(signal), self.step, self.low, self.high)
+        return DigitisedDistribution(self, signal)
+
+    def without_rails(self) -> Digitised:
+        """The same detector with the same model inside, rounding but never clipping."""
+        return Digitised(self.model, step=self.step)
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Standardise the model inside; see its own method."""
@@ -59,11 +64,17 @@ class DigitisedDistribution(NoiseDistribution):
     With ``step = 0`` the readings between the rails keep their log-density.
     """
 
-    def __init__(self, base: NoiseDistribution, step: float, low: float, high: float) -> None:
-        super().__init__(base.batch_shape)
-        self.base, self.step, self.low, self.high = base, step, low, high
+    def __init__(self, detector: Digitised, signal: Tensor) -> None:
+        super().__init__(signal.shape)
+        self.base: NoiseDistribution = detector.model(signal)
+        self.step, self.low, self.high = detector.step, detector.low, detector.high
+        self._detector, self._signal = detector, signal
 
     def log_prob(self, value: Tensor) -> Tensor:
+        if tabulated.is_large(self._detector, self._signal, value):
+            found = tabulated.log_prob(self._detector, self._signal, value)
+            if found is not None:
+                return found
         result = self._log_cell(value) if self.step > 0 else self.base.log_prob(value)
         # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
         infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)

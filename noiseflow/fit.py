@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow.observation_table import ObservationTable
 from noiseflow.signal_models import KnownSignal
-from noiseflow.tabulated import ObservationTable
 
 Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]

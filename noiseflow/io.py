@@ -193,7 +193,7 @@ def _read_tiff(path: Path) -> ImageFile:
         spacing = (tiff.imagej_metadata or {}).get("spacing")
         unit = (tiff.imagej_metadata or {}).get("unit")
         page = tiff.pages[0]
-        tags = page.tags if isinstance(page, tifffile.TiffPage) else {}
+        tags: Any = page.tags if isinstance(page, tifffile.TiffPage) else {}
         resolution = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
     if unit == "angstrom" and spacing and len(resolution) == 2:
         y, x = (denominator / numerator for numerator, denominator in resolution)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.tabulated import ObservationTable
+from noiseflow.observation_table import ObservationTable
 
 
 def gradient_image(size: int = 256) -> torch.Tensor:

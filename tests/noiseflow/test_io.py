@@ -89,9 +89,14 @@ def test_colour_and_complex_images_are_refused(tmp_path: Path) -> None:
 def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "image.npy"
     io.write(path, IMAGE)
-    with pytest.raises(RuntimeError), io.atomic_path(path) as partial:
-        partial.write_bytes(b"half")
-        raise RuntimeError
+
+    def fail_half_way() -> None:
+        with io.atomic_path(path) as partial:
+            partial.write_bytes(b"half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
     assert np.array_equal(io.read(path).data, IMAGE)
     assert len(list(tmp_path.iterdir())) == 1
 

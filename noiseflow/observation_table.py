@@ -1,0 +1,139 @@
+"""The tabulated likelihood of a joint fit: observations stay fixed while their signals change."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.tabulated import SIZES, Columns, Rows, interpolate, log_likelihood, mean_error
+
+_MAX_LEVELS = 1024
+
+
+class ObservationTable:
+    """log p(o | s) and its signal derivative for pixels whose observations stay fixed while their signals change.
+
+    Rows are signals, columns residuals (noise changes fast along the residual and slowly along the signal). Where that is not
+    accurate enough and the observations have few levels (counts of a few electrons), columns are the levels themselves. Beyond
+    the rows the log-likelihood continues along its slope, so that a stray signal is still pulled back.
+
+    Args:
+        noise_model: the model to tabulate; call `rebuild` after it changes.
+        observation: (N,) readings.
+        signal_low, signal_high: range of the signals to expect.
+        tolerance: accepted mean absolute interpolation error, nats per pixel.
+
+    Attributes:
+        error: the error last measured, nats per pixel.
+    """
+
+    def __init__(
+        self,
+        noise_model: nn.Module,
+        observation: Tensor,
+        signal_low: float,
+        signal_high: float,
+        *,
+        tolerance: float = 1e-3,
+    ) -> None:
+        self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
+        self._observation, self._tolerance, self._size = observation, tolerance, 0
+        self._grid = torch.empty(observation.numel(), 2, dtype=observation.dtype, device=observation.device)
+        levels = torch.unique(observation[:: max(1, observation.numel() // 65536)])
+        self._choices: list[tuple[int, int, Tensor | None]] = [(rows, columns, None) for rows, columns in SIZES]
+        if levels.numel() <= _MAX_LEVELS:
+            levels = torch.unique(observation)
+            self._choices += [(rows, 0, levels) for rows, _ in SIZES]
+        self.error = math.inf
+        self._refine(noise_model)
+
+    def _refine(self, noise_model: nn.Module) -> None:
+        """Take the first size from the present one on that is accurate enough, or else the most accurate one."""
+        errors = {}
+        for size in range(self._size, len(self._choices)):
+            errors[size] = self.error = self._build(noise_model, *self._choices[size])
+            self._size = size
+            if self.error <= self._tolerance:
+                return
+        self._size = min(errors, key=lambda size: errors[size])
+        self.error = self._build(noise_model, *self._choices[self._size])
+
+    def check(self, noise_model: nn.Module) -> float:
+        """Measure the error again, and refine the table where the model has outgrown it."""
+        self.error = self.measure_error(noise_model)
+        if self.error > self._tolerance and self._size < len(self._choices) - 1:
+            self._refine(noise_model)
+        return self.error
+
+    def _build(self, noise_model: nn.Module, num_rows: int, num_columns: int, levels: Tensor | None) -> float:
+        self._rows = Rows(self.low, self.high, num_rows)
+        self._signals = self._rows.signals(self._observation)
+        self._columns = None
+        if levels is None:
+            self._columns = Columns.of(noise_model, self._observation, self._rows, num_columns)
+            self._offset, self._rate, self._bounds = self._columns.position(self._observation)
+            self._values = self._columns.values(self._signals)
+        else:
+            last = max(levels.numel() - 1, 1)
+            self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._grid.dtype) / last - 1
+            self._rate, self._bounds = torch.zeros_like(self._offset), None
+            column = torch.cat([levels, levels]) if levels.numel() == 1 else levels
+            self._values = column[None, :].expand(num_rows, -1)
+        self.rebuild(noise_model)
+        return self.measure_error(noise_model)
+
+    @torch.no_grad()
+    def rebuild(self, noise_model: nn.Module) -> None:
+        """Tabulate the model as it is now."""
+        value = log_likelihood(noise_model, self._signals, self._values, between_rails=self._columns is not None)
+        (slope,) = torch.gradient(value, spacing=(self._signals[:, 0],), dim=0)
+        if self._columns is not None:
+            # along a row of equal residual the observation moves with the signal: ∂/∂s at fixed o = ∂/∂s at fixed r − ∂/∂r
+            (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
+            slope[:, 1:-1] -= along
+        self._table = torch.stack([value, slope])[None].contiguous()
+
+    def log_prob(self, signal: Tensor) -> Tensor:
+        """Log-likelihood of each pixel at (N,) signals, differentiable in the signal."""
+        found: Tensor = _Lookup.apply(signal, self)
+        return found
+
+    def lookup(self, signal: Tensor, part: slice = slice(None)) -> tuple[Tensor, Tensor]:
+        """Log-likelihood and its signal derivative at (N,) signals; of a part of the pixels, where one is given."""
+        grid, clamped = self._grid[part], signal.detach().clamp(self.low, self.high)
+        torch.addcmul(self._offset[part], clamped, self._rate[part], value=-1, out=grid[:, 0])
+        if self._bounds is not None:
+            torch.clamp(grid[:, 0], self._bounds[0][part], self._bounds[1][part], out=grid[:, 0])
+        self._rows.position(clamped, grid[:, 1])
+        value, slope = interpolate(self._table, grid)
+        return torch.addcmul(value, slope, signal.detach() - clamped), slope
+
+    @torch.no_grad()
+    def measure_error(self, noise_model: nn.Module, *, count: int = 1024) -> float:
+        """Mean absolute interpolation error, nats, at pixels paired with signals in proportion to their likelihood."""
+        part = slice(None, None, max(1, self._observation.numel() // count))
+        observation = self._observation[part]
+        generator = torch.Generator().manual_seed(0)
+        coarse = torch.linspace(self.low, self.high, 64, dtype=observation.dtype, device=observation.device)
+        likelihood = noise_model(coarse[:, None]).log_prob(observation.expand(coarse.numel(), -1)).cpu()
+        gumbel = -torch.log(-torch.log(torch.rand(likelihood.shape, generator=generator).clamp(1e-7, 1 - 1e-7)))
+        row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
+        jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
+        signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)
+        return mean_error(self.lookup(signal, part)[0], noise_model(signal).log_prob(observation))
+
+
+class _Lookup(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, signal: Tensor, table: ObservationTable) -> Tensor:
+        value, slope = table.lookup(signal)
+        ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        (slope,) = ctx.saved_tensors
+        return gradient * slope, None
