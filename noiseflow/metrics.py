@@ -257,3 +257,57 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
         *(f"{100 * p:.3f}" for p in percent),
         f"{evaluation.ks:.4f}",
     ]
+
+
+@torch.no_grad()
+def kl_divergence(truth: nn.Module, noise_model: nn.Module, signal: Tensor, *, seed: int = 0) -> tuple[float, float]:
+    """Kullback–Leibler divergence from a known truth, E[log p_true − log p_model] in nats per pixel, and its standard error.
+
+    Args:
+        truth: the noise model that the data really follow.
+        noise_model: the model to judge.
+        signal: (N,) signals; one observation is drawn at each.
+        seed: of the draws.
+    """
+    generator = torch.Generator(signal.device).manual_seed(seed)
+    observation = truth(signal).sample(generator=generator)
+    difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)
+    return float(difference.mean()), float(difference.std(correction=0)) / math.sqrt(difference.numel())
+
+
+@dataclass(frozen=True)
+class SpatialStructure:
+    """Correlations that a per-pixel noise model cannot have, of standardised residuals of an image.
+
+    Attributes:
+        rows, columns: variance of row and column means over what independent pixels would give; 1 where there is no structure.
+        horizontal, vertical: correlation of neighbouring pixels.
+        error: standard error of `horizontal` and `vertical` under independence.
+        suffices: whether a per-pixel model suffices: nothing stands out by over four standard errors.
+    """
+
+    rows: float
+    columns: float
+    horizontal: float
+    vertical: float
+    error: float
+    suffices: bool
+
+
+@torch.no_grad()
+def spatial_structure(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> SpatialStructure:
+    """Residual row, column and neighbour correlation of (y, x) images under a noise model."""
+    u = probability_integral_transform(noise_model, signal.reshape(-1), observation.reshape(-1), np.random.default_rng(0))
+    z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).reshape(signal.shape).numpy()
+    z = (z - z.mean()) / z.std()
+    height, width = z.shape
+    rows, columns = float(z.mean(1).var() * width), float(z.mean(0).var() * height)
+    horizontal, vertical = float((z[:, 1:] * z[:, :-1]).mean()), float((z[1:] * z[:-1]).mean())
+    error = 1 / math.sqrt(z.size)
+    stands_out = (
+        abs(horizontal) > 4 * error
+        or abs(vertical) > 4 * error
+        or rows > 1 + 4 * math.sqrt(2 / height)
+        or columns > 1 + 4 * math.sqrt(2 / width)
+    )
+    return SpatialStructure(rows, columns, horizontal, vertical, error, not stands_out)

@@ -1,0 +1,71 @@
+"""Detection of rounding and rails, choice of models, divergence from a known truth, and residual structure."""
+
+import math
+
+import pytest
+import torch
+
+import noiseflow
+from noiseflow import metrics
+from noiseflow.digitised import detect_digitisation
+from noiseflow.selection import select
+
+
+def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    signal = torch.rand(count, generator=generator)
+    return signal, signal + 0.1 * torch.randn(count, generator=generator)
+
+
+def test_rounding_and_rails_are_detected() -> None:
+    _, observation = noisy()
+    assert detect_digitisation(observation) == (0.0, -math.inf, math.inf)
+    assert detect_digitisation(observation.clamp(0, 1)) == (0.0, 0.0, 1.0)
+    assert detect_digitisation((observation * 40).round().int()) == (1.0, -math.inf, math.inf)
+    step, low, high = detect_digitisation(((observation * 255).round() / 255).clamp(0, 1))
+    assert step == pytest.approx(1 / 255, rel=1e-3)
+    assert (low, high) == (0.0, 1.0)
+    assert detect_digitisation((3 * observation).round().clamp(min=1)) == (1.0, 1.0, math.inf)
+
+
+def test_simplest_sufficient_model_is_chosen() -> None:
+    signal, observation = noisy()
+    found = select(signal, observation, num_steps=100)
+    assert found.chosen.name == "Gaussian"
+    assert found.digitisation == (0.0, -math.inf, math.inf)
+    clipped = select(signal, observation.clamp(0, 1), num_steps=100)
+    assert isinstance(clipped.chosen.model, noiseflow.Digitised)
+
+
+def test_flow_is_chosen_for_skewed_noise() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(60_000, generator=generator)
+    gamma = -torch.log(torch.rand((2, *signal.shape), generator=generator)).sum(0)
+    found = select(signal, signal + 0.1 * (gamma - 2), num_steps=150)
+    assert "Flow" in found.chosen.name
+    by_name = {candidate.name: candidate for candidate in found.candidates}
+    assert by_name["Gaussian"].excess > 0.05
+
+
+def test_kl_divergence_of_gaussians_is_the_formula() -> None:
+    signal = torch.rand(400_000, generator=torch.Generator().manual_seed(0))
+    found, error = metrics.kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.12), signal)
+    exact = math.log(1.2) + 1 / (2 * 1.44) - 0.5
+    assert found == pytest.approx(exact, abs=4 * error)
+    assert metrics.kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.1), signal)[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["none", "rows", "neighbours"])
+def test_spatial_structure_is_seen(kind: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal, noise = torch.rand((200, 300), generator=generator), torch.randn((200, 300), generator=generator)
+    if kind == "rows":
+        noise = noise + 0.3 * torch.randn((200, 1), generator=generator)
+    elif kind == "neighbours":
+        noise = noise + 0.2 * torch.roll(noise, 1, dims=1)
+    found = metrics.spatial_structure(noiseflow.Gaussian(float(noise.std()) * 0.1), signal, signal + 0.1 * noise)
+    assert found.suffices == (kind == "none")
+    if kind == "rows":
+        assert found.rows == pytest.approx(1 + 0.09 * 300, rel=0.3)
+    elif kind == "neighbours":
+        assert found.horizontal == pytest.approx(0.2, abs=0.03)
