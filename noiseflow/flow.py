@@ -72,9 +72,34 @@ def tail_layer(*, conditional: bool = False) -> Layer:
     return Layer((-4.0, -4.0), build, conditional)
 
 
+def conditioning_network(num_outputs: int, width: int) -> nn.Sequential:
+    """A small network of two features of the signal; its outputs start at zero, and its weights at the same numbers always."""
+    generator = torch.Generator().manual_seed(0)
+    first, hidden, last = nn.Linear(2, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
+    with torch.no_grad():
+        for layer in (first, hidden):
+            nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+            nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+        last.weight.zero_()
+        last.bias.zero_()
+    return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)
+
+
 def conditioning_features(coordinate: Tensor) -> Tensor:
     """(..., 2) features of signal coordinates in [0, 1]."""
     return torch.stack([2 * coordinate - 1, 2 * coordinate * coordinate - 1], -1)
+
+
+def _bounded(raw: Tensor, limit: float) -> Tensor:
+    return limit * torch.tanh(raw / limit)
+
+
+def _knots(raw: Tensor, reach: float) -> Tensor:
+    least = 0.02 / raw.shape[-1]
+    steps = least + (1 - least * raw.shape[-1]) * torch.softmax(raw, -1)
+    inner = 2 * reach * torch.cumsum(steps, -1)[..., :-1] - reach
+    end = torch.full_like(raw[..., :1], reach)
+    return torch.cat([-end, inner, end], -1)
 
 
 class ConditionalFlow(nn.Module):
@@ -100,7 +125,7 @@ class ConditionalFlow(nn.Module):
         self.standardisation = Standardisation()
         self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
         self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
-        self.conditioner = conditioning_network(width, self.num_conditional)
+        self.conditioner = conditioning_network(self.num_conditional, width)
 
     def forward(self, signal: Tensor) -> FlowDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
