@@ -8,8 +8,10 @@ from .fit import fit as fit
 from .flow import RadialFlow as RadialFlow
 from .flow import SignalDependentGaussian as SignalDependentGaussian
 from .flow import SplineFlow as SplineFlow
+from .mixture import Mixture as Mixture
 from .model_files import load as load
 from .model_files import save as save
+from .physical import PoissonGaussian as PoissonGaussian
 from .protocols import NoiseModel as NoiseModel
 from .protocols import SignalModel as SignalModel
 from .signal_models import KnownSignal as KnownSignal

@@ -1,0 +1,121 @@
+"""A mixture of Gaussians whose weights, means and widths are smooth functions of the signal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions import NoiseDistribution, bisect_quantile, log_normal_interval
+from noiseflow.flow import conditioning_features, conditioning_network
+from noiseflow.standardisation import Standardisation
+
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+class Mixture(nn.Module):
+    """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
+
+    Args:
+        num_components: number of Gaussians.
+        mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
+        width: hidden units of the network that turns a signal into the parameters.
+
+    Raises:
+        ValueError: fewer than one component.
+    """
+
+    def __init__(self, num_components: int = 3, *, mean_preserving: bool = False, width: int = 32) -> None:
+        super().__init__()
+        if num_components < 1:
+            raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
+        self.num_components, self.mean_preserving, self.width = num_components, mean_preserving, width
+        self.standardisation = Standardisation()
+        # apart from the start, or all components would stay equal: means ±½, the outer ones wider
+        place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
+        self.bias = nn.Parameter(torch.stack([-place.abs(), place, place.abs() - 0.2]))
+        self.conditioner = conditioning_network(3 * num_components, width)
+
+    def forward(self, signal: Tensor) -> MixtureDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        coordinate = self.standardisation.coordinate(signal)
+        location, log_scale = self.standardisation(coordinate)
+        with torch.autocast(coordinate.device.type, enabled=False):
+            conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
+            raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
+        log_weight = torch.log_softmax(raw[..., 0, :], -1)
+        centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
+        if self.mean_preserving:
+            centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)
+            location = torch.zeros_like(location)
+        means = (signal + location)[..., None] + torch.exp(log_scale)[..., None] * centre
+        return MixtureDistribution(signal, log_weight, means, log_width + log_scale[..., None])
+
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Measure and store the scaling of the data; both (N,), detector units."""
+        self.standardisation.set_from(signal, observation)
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again."""
+        return {"num_components": self.num_components, "mean_preserving": self.mean_preserving, "width": self.width}
+
+    def extra_repr(self) -> str:
+        return f"{self.num_components} components, mean_preserving={self.mean_preserving}"
+
+
+class MixtureDistribution(NoiseDistribution):
+    """A mixture of normal distributions.
+
+    Args:
+        signal: clean readings, any shape.
+        log_weight, means, log_scale: (*signal.shape, K).
+    """
+
+    def __init__(self, signal: Tensor, log_weight: Tensor, means: Tensor, log_scale: Tensor) -> None:
+        super().__init__(signal.shape)
+        self.signal, self.log_weight, self.means, self.log_scale = signal, log_weight, means, log_scale
+
+    def _standard(self, value: Tensor) -> Tensor:
+        return (value[..., None] - self.means) * torch.exp(-self.log_scale)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        z = self._standard(value)
+        return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - _LOG_SQRT_2PI
+
+    def cdf(self, value: Tensor) -> Tensor:
+        probability: Tensor = (self.log_weight.exp() * torch.special.ndtr(self._standard(value))).sum(-1)
+        return probability
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        masses = log_normal_interval(self._standard(low), self._standard(high))
+        return torch.logsumexp(self.log_weight + masses, -1)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        spread = 40 * self.log_scale.exp()
+        low, high = (self.means - spread).amin(-1), (self.means + spread).amax(-1)
+        return bisect_quantile(self, value, low + 0 * value, high + 0 * value)
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            shape = (*sample_shape, *self.batch_shape)
+            dtype, device = self.means.dtype, self.means.device
+            uniform = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+            chosen = (uniform[..., None] > self.log_weight.exp().cumsum(-1))[..., :-1].sum(-1, keepdim=True)
+            full = (*shape, self.means.shape[-1])
+            means, log_scale = (each.expand(full).gather(-1, chosen)[..., 0] for each in (self.means, self.log_scale))
+            normal = torch.randn(shape, generator=generator, dtype=dtype, device=device)
+            return means + log_scale.exp() * normal
+
+    @property
+    def mean(self) -> Tensor:
+        mean: Tensor = (self.log_weight.exp() * self.means).sum(-1)
+        return mean
+
+    @property
+    def variance(self) -> Tensor:
+        about = self.means - self.mean[..., None]
+        variance: Tensor = (self.log_weight.exp() * (torch.exp(2 * self.log_scale) + about**2)).sum(-1)
+        return variance
