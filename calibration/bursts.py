@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibration.align import Registration, register
 from calibration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.exposures import Burst, Image
-from calibration.masks import Mask, MaskCounts, defects, saturated
+from calibration.masks import Mask, MaskCounts, defects, restless, saturated
 from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling
 
 LEAST_DRIFT = 0.1
@@ -67,15 +67,14 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     registrations = [_registered(frames, index) for index in range(len(frames))]
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
     drift, drifting = _drift(shift, registrations)
+    references = [_others_on(frames, shift if drifting else np.zeros_like(shift), i) for i in range(len(frames))]
+    moving = _restless(frames, references, trusted)
     pairs = []
-    for index, frame in enumerate(frames):
-        if drifting:
-            others, covered = _others_on(frames, shift, index)
-        else:
-            others, covered = (frames.sum(0) - frame) / (len(frames) - 1), np.ones(frame.shape, bool)
-        counts = MaskCounts(*(int(mask.sum()) for mask in (~covered, ~trusted & ~hot & ~dead, hot, dead)))
-        registration = registrations[index] or _still()
-        pairs.append(_pair(frame, others, trusted & covered, registration, counts, len(frames)))
+    for frame, (others, covered), registration in zip(frames, references, registrations, strict=True):
+        lost = (~covered, ~trusted & ~hot & ~dead, hot, dead, moving)
+        counts = MaskCounts(*(int(mask.sum()) for mask in lost))
+        mask = trusted & covered & ~moving
+        pairs.append(_pair(frame, others, mask, registration or _still(), counts, len(frames)))
     dose = np.array([pair.scaling.slope for pair in pairs])
     error = np.array([pair.scaling.slope_error for pair in pairs])
     fading = bool(np.any(np.abs(dose - 1) > np.maximum(3 * error, LEAST_DOSE_CHANGE)))
@@ -101,19 +100,30 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
     return drift, drift > max(LEAST_DRIFT, 5 * error) and len(known) == len(registrations)
 
 
+def _restless(frames: Image, references: list[tuple[Image, Mask]], trusted: Mask) -> Mask:
+    """Where the scene itself changes between frames; nowhere if there are too few frames to tell."""
+    if len(frames) < 4:
+        return np.zeros(frames[0].shape, bool)
+    covered = np.logical_and.reduce([mask for _, mask in references]) & trusted
+    residual = np.stack([frame - others for frame, (others, _) in zip(frames, references, strict=True)])
+    residual -= residual[:, covered].mean(axis=1)[:, None, None]
+    moving = restless(residual, frames.mean(0), covered)
+    return moving if (covered & ~moving).sum() >= MINIMUM_PIXELS else np.zeros_like(moving)
+
+
 def _others_on(frames: Image, shift: Image, index: int) -> tuple[Image, Mask]:
     """Mean of the other frames, each moved onto frame `index`, and the pixels that all of them cover.
 
     The mean of the others lies at minus 1/(n − 1) of the frame's own displacement, so that the shift found against it is
     n/(n − 1) times the displacement from the mean of all.
     """
+    if not shift.any():
+        return (frames.sum(0) - frames[index]) / (len(frames) - 1), np.ones(frames[0].shape, bool)
     displacement = shift * (len(shift) - 1) / len(shift)
     total, covered = np.zeros(frames[0].shape), np.ones(frames[0].shape, bool)
-    for other, frame in enumerate(frames):
-        if other == index:
-            continue
+    for other in set(range(len(frames))) - {index}:
         matrix = np.column_stack([np.eye(2), displacement[index] - displacement[other]])
-        moved, inside = _still(matrix).warp(frame)
+        moved, inside = _still(matrix).warp(frames[other])
         total += moved
         covered &= inside
     return total / (len(frames) - 1), covered

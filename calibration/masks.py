@@ -24,6 +24,7 @@ class MaskCounts:
     saturated: int
     hot: int
     dead: int
+    restless: int = 0
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
@@ -71,6 +72,32 @@ def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float 
             middle, far = np.percentile(side * (frame - level)[near], (50, 84.13))  # the other side is the clipped one
             clear &= side * (level - rail) > deviations * (far - middle)
     return clear
+
+
+def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, num_levels: int = 24) -> Mask:
+    """Places where a burst does not stand still: they vary by far more than others of like brightness.
+
+    Judged by the variance over blocks of pixels and all frames, each square capped at four deviations so that a single
+    outlier, which is noise, condemns nothing.
+
+    Args:
+        residual: (frame, y, x) each frame less the mean of the others, four frames or more.
+        level: (y, x) mean of the frames.
+        mask: (y, x) pixels to judge.
+        side: of the neighbourhood, pixels.
+        num_levels: of like brightness.
+    """
+    smooth = ndimage.uniform_filter(level, side)
+    quiet = mask.copy()
+    expected = np.full(level.shape, np.mean(residual[:, mask] ** 2))
+    for _ in range(6):
+        squares = np.minimum(residual**2, 16 * expected).mean(axis=0)
+        local = ndimage.uniform_filter(squares, side)
+        groups = np.array_split(np.argsort(smooth[quiet]), num_levels)
+        levels = [float(smooth[quiet][group].mean()) for group in groups]
+        expected = np.interp(smooth, levels, [float(np.median(local[quiet][group])) for group in groups])
+        quiet = mask & (local < expected * (1 + 4 * np.sqrt(2 / (side**2 * (len(residual) - 1)))))
+    return mask & ~quiet
 
 
 def _deviation(frame: Image) -> Image:

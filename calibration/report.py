@@ -124,7 +124,7 @@ def describe_registration(pair: AlignedPair) -> str:
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
         f"{found.scale:.5f}, standard error {found.error_px:.3f} px, matches' rms {found.rms_px:.2f} px. Left out: "
         f"{counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
-        f"{counts.dead} dead."
+        f"{counts.dead} dead" + (f", {counts.restless} in places that change." if counts.restless else ".")
     )
 
 

@@ -7,9 +7,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
+import subprocess
 import sys
+import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from functools import partial
+from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +72,25 @@ def registration_trial(kind: str, seed: int, size: int = 256) -> dict[str, Any]:
     return {"found": True, "error": error, "predicted": found.error_px, "method": found.method}
 
 
-def registration(pool: ProcessPoolExecutor, trials: int) -> dict[str, Any]:
+def run(trial: Callable[[int], dict[str, Any]], trials: int, workers: int, minutes: float) -> list[dict[str, Any]]:
+    """Results of trials 0, 1, …, as many as end in time."""
+    deadline = time.perf_counter() + 60 * minutes
+    found = []
+    with Pool(workers) as pool:
+        for one in pool.imap(trial, range(trials)):
+            found.append(one)
+            print(f"\r{len(found)}/{trials}", end="", file=sys.stderr, flush=True)
+            if time.perf_counter() > deadline:
+                break
+    return found
+
+
+def registration(trials: int, workers: int, minutes: float) -> dict[str, Any]:
     """Error against the known transform, success rate, and failures that no message told."""
     results = {}
     for kind, limit in (("textured", 0.1), ("sparse", 0.3)):
-        found = list(pool.map(registration_trial, [kind] * trials, range(trials)))
+        found = run(partial(registration_trial, kind), trials, workers, minutes / 2)
+        trials = len(found)
         errors = np.array([one["error"] for one in found if one["found"]])
         predicted = np.array([one["predicted"] for one in found if one["found"]])
         results[kind] = {
@@ -121,23 +140,24 @@ def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     return setting | {f"{name}_found": vars(getattr(posterior, name)) for name in truth}
 
 
-def parameters(pool: ProcessPoolExecutor, trials: int) -> dict[str, Any]:
+def parameters(trials: int, workers: int, minutes: float) -> dict[str, Any]:
     """Errors and coverage of the 90 % interval over random draws from the grid's ranges."""
-    found = list(pool.map(parameter_trial, range(trials)))
+    found = run(parameter_trial, trials, workers, minutes)
     good = [one for one in found if "failed" not in one]
-    results: dict[str, Any] = {"trials": trials, "failed": [one for one in found if "failed" in one]}
+    results: dict[str, Any] = {"trials": len(found), "failed": [one for one in found if "failed" in one]}
     for name in ("gain", "read_noise", "offset"):
         truth, median, low, high = (
             np.array(column)
             for column in zip(
-                *((one[name], *(one[f"{name}_found"][key] for key in ("median", "q05", "q95"))) for one in good), strict=True
+                *((one[name], *(one[f"{name}_found"][key] for key in ("median", "q05", "q95"))) for one in good),
+                strict=True,
             )
         )
         inside = (low <= truth) & (truth <= high)
         results[name] = {"coverage_90": float(inside.mean())}
         for part, chosen in (("clipped", True), ("unclipped", False)):
             mask = np.array([one["clipped"] for one in good]) == chosen
-            results[name][f"coverage_90_{part}"] = float(inside[mask].mean())
+            results[name][f"coverage_90_{part}"] = float(inside[mask].mean()) if mask.any() else None
         if name != "offset":
             error = np.abs(median / truth - 1)
             identifiable = high / low < 1.5
@@ -150,19 +170,112 @@ def parameters(pool: ProcessPoolExecutor, trials: int) -> dict[str, Any]:
     return results
 
 
+def real(data: Path | None) -> dict[str, Any]:
+    """Real calibrated detectors beside the published maps of the same pixels."""
+    from calibration import Burst, align_burst, align_pair, measure_detector, read_pairs
+    from noiseflow.io import read
+
+    if data is None:
+        raise SystemExit("give --data: the folder that holds exposures_miro/ and detector_zhuang/")
+    results: dict[str, Any] = {}
+    folder = data / "exposures_miro"
+    results["miro_maps"] = published(folder)
+    for channel in (1, 2, 3):
+        shorts = [folder / f"channel{channel}_{time_ms}ms.tif" for time_ms in ("010", "020", "050", "100")]
+        pairs = [align_pair(pair) for pair in read_pairs(shorts, [folder / f"channel{channel}_long.tif"])]
+        results[f"miro_channel{channel}"] = figures(measure_detector(pairs))
+    folder = data / "detector_zhuang"
+    frames = np.asarray(read(folder / "frames.tif").data, float)
+    results["zhuang_maps"] = published(folder)
+    results["zhuang_burst"] = figures(measure_detector(align_burst(Burst(frames))[0]))
+    results["zhuang_predicted"] = predicted_variance(folder, frames)
+    return results
+
+
+def published(folder: Path) -> dict[str, float]:
+    """Medians over the published maps; read noise in electrons rms over all pixels, and of the median pixel."""
+    from noiseflow.io import read
+
+    gain, offset, variance = (
+        read(folder / f"{name}.tif").data for name in ("gain_counts_per_electron", "offset_counts", "variance_counts2")
+    )
+    return {
+        "gain": float(np.median(gain)),
+        "offset": float(np.median(offset)),
+        "read_noise_median_pixel": float(np.median(np.sqrt(variance) / gain)),
+        "read_noise_rms": float(np.sqrt(np.mean(variance / gain**2))),
+    }
+
+
+def predicted_variance(folder: Path, frames: Image) -> dict[str, float]:
+    """Variance of frame differences over what the maps predict, for the dim 60 % of the pixels and for all."""
+    from noiseflow.io import read
+
+    gain, offset, variance = (
+        np.asarray(read(folder / f"{name}.tif").data, float)
+        for name in ("gain_counts_per_electron", "offset_counts", "variance_counts2")
+    )
+    mean = frames.mean(0)
+    measured = np.mean(np.diff(frames, axis=0) ** 2, axis=0) / 2
+    expected = gain * np.maximum(mean - offset, 0) + variance
+    dim = mean <= np.percentile(mean, 60)
+    return {"dim": float(measured[dim].sum() / expected[dim].sum()), "all": float(measured.sum() / expected.sum())}
+
+
+def figures(detector: Any) -> dict[str, Any]:
+    """Medians, 90 % intervals and misfit of a measured detector."""
+    found = {name: vars(getattr(detector.posterior, name)) for name in ("gain", "offset", "read_noise")}
+    return found | {"misfit": detector.misfit}
+
+
+def speed(size: int = 1024) -> dict[str, Any]:
+    """The command end to end on a synthetic pair of `size` squared pixels, from files to model and report."""
+    from noiseflow.io import write
+
+    generator = np.random.default_rng(0)
+    scene = np.exp(0.6 * textured(generator, size)(*np.mgrid[:size, :size][::-1].astype(float)))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for kind, times in (("short", 1.0), ("long", RATIO)):
+            electrons = generator.poisson(20 * times * scene) + generator.standard_normal(scene.shape)
+            write(folder / f"{kind}.tif", np.round(100 + 2 * electrons).clip(0, 65535).astype(np.uint16))
+        files = ["--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/model.safetensors"]
+        started = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", "noiseflow.cli", "calibrate", *files, "--report", f"{folder}/report", "--json"],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        wall = time.perf_counter() - started
+        processor = resource.getrusage(resource.RUSAGE_CHILDREN)
+    found = json.loads(done.stdout)
+    return {
+        "size": size,
+        "wall_seconds": wall,
+        "processor_seconds": processor.ru_utime + processor.ru_stime,
+        "detector": found["detector"],
+        "kind": found["kind"],
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("registration", "parameters", "real", "speed"))
     parser.add_argument("--trials", type=int, default=None, help="default: 200 registrations, 300 parameter sets")
     parser.add_argument("--data", type=Path, default=None, help="folder with exposures_miro/ and detector_zhuang/")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=600.0, help="stop after the trials done by then")
     arguments = parser.parse_args()
     started = time.perf_counter()
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        if arguments.part == "registration":
-            result = registration(pool, arguments.trials or 200)
-        elif arguments.part == "parameters":
-            result = parameters(pool, arguments.trials or 300)
+    if arguments.part == "registration":
+        result = registration(arguments.trials or 200, arguments.workers, arguments.minutes)
+    elif arguments.part == "parameters":
+        result = parameters(arguments.trials or 300, arguments.workers, arguments.minutes)
+    elif arguments.part == "real":
+        result = real(arguments.data)
+    else:
+        result = speed()
     result["seconds"] = time.perf_counter() - started
     RESULTS.parent.mkdir(exist_ok=True)
     stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
