@@ -12,6 +12,7 @@ from .mixture import Mixture as Mixture
 from .model_files import load as load
 from .model_files import save as save
 from .physical import PoissonGaussian as PoissonGaussian
+from .physics_flow import PhysicsFlow as PhysicsFlow
 from .protocols import NoiseModel as NoiseModel
 from .protocols import SignalModel as SignalModel
 from .signal_models import KnownSignal as KnownSignal

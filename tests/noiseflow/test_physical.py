@@ -10,7 +10,7 @@ from torch import Tensor
 
 import noiseflow
 from noiseflow.electrons import log_both_tails, log_density, log_interval
-from tests.contracts import check_noise_model
+from tests.contracts import check_noise_model, integrate_density
 
 SIGNALS = torch.tensor([0.0, 0.03, 0.5, 1.0], dtype=torch.float64)
 READ_NOISES = [0.05, 0.2, 0.6, 1.0, 1.499, 1.501, 4.0, 100.0]
@@ -20,9 +20,20 @@ MODELS = {
     "Poisson-Gaussian, resolved electrons": lambda: noiseflow.PoissonGaussian(gain=0.1, offset=-0.05, read_noise=0.2),
     "Poisson-Gaussian, one electron": lambda: noiseflow.PoissonGaussian(gain=0.1, offset=-0.05, read_noise=1.0),
     "Poisson-Gaussian, default": lambda: noiseflow.PoissonGaussian(),
+    "physics and flow": lambda: moved(noiseflow.PhysicsFlow(detector=noiseflow.PoissonGaussian(0.1, -0.05, 0.4))),
+    "physics and flow, default": lambda: noiseflow.PhysicsFlow(),
     "mixture": lambda: noiseflow.Mixture(),
     "mixture, mean-preserving": lambda: noiseflow.Mixture(5, mean_preserving=True),
 }
+
+
+def moved(model: torch.nn.Module, scale: float = 0.2) -> torch.nn.Module:
+    """The model with normal numbers added to the parameters of its flow."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.correction.parameters():
+            parameter.add_(scale * torch.randn(parameter.shape, generator=generator))
+    return model
 
 
 def scalar(value: float) -> Tensor:
@@ -158,17 +169,72 @@ def test_model_keeps_its_contract(name: str) -> None:
     check_noise_model(MODELS[name]().double(), SIGNALS)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [name for name in MODELS if "flow" not in name])
 def test_density_integrates_to_one(name: str) -> None:
     model = MODELS[name]().double()
     for signal in (0.0, 0.4, 1.0):
-        at = torch.full((), signal, dtype=torch.float64)
-        distribution = model(at)
-        reach = 12 * float(distribution.stddev.detach()) + 0.5
         nodes, weights = gauss_legendre(2000)
-        observation = float(distribution.mean.detach()) + reach * (2 * nodes - 1)
-        mass = (model(at.expand_as(nodes)).log_prob(observation).exp() * weights).sum() * 2 * reach
+        reach = 20 * float(noiseflow.PoissonGaussian()(scalar(signal)).stddev.detach()) + 0.5
+        observation = signal + reach * (2 * nodes - 1)
+        mass = (model(torch.full_like(nodes, signal)).log_prob(observation).exp() * weights).sum() * 2 * reach
         assert float(mass.detach()) == pytest.approx(1, abs=1e-8)
+
+
+@torch.no_grad()
+def test_physics_flow_density_integrates_to_one() -> None:
+    model = MODELS["physics and flow"]().double()
+    for signal in (0.0, 0.4):
+        assert integrate_density(model, signal, tolerance=1e-10) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("read_noise", [0.2, 2.0])
+def test_physics_flow_starts_as_its_detector(read_noise: float) -> None:
+    detector = noiseflow.PoissonGaussian(0.1, -0.05, read_noise).double()
+    model = noiseflow.PhysicsFlow(detector=detector).double()
+    observation = torch.linspace(-3, 9, 2001, dtype=torch.float64)
+    signal = torch.full_like(observation, 0.6)
+    found, expected = model(signal), detector(signal)
+    assert torch.allclose(found.log_prob(observation), expected.log_prob(observation), rtol=1e-12, atol=1e-9)
+    for width in (1e-6, 0.05, 1.0):
+        masses = found.log_interval_prob(observation, observation + width)
+        assert torch.allclose(masses, expected.log_interval_prob(observation, observation + width), rtol=1e-12, atol=1e-9)
+    assert torch.allclose(found.cdf(observation), expected.cdf(observation), atol=1e-9)
+
+
+def test_physics_flow_latent_round_trip() -> None:
+    model = MODELS["physics and flow"]().double()
+    latent = torch.linspace(-7, 7, 301, dtype=torch.float64)
+    for signal in (-0.05, 0.0, 0.5, 20.0):
+        distribution = model(torch.full_like(latent, signal))
+        assert torch.allclose(distribution.to_latent(distribution.from_latent(latent))[0], latent, atol=1e-7)
+
+
+def test_physics_flow_gradients_agree_with_differences() -> None:
+    model = MODELS["physics and flow"]().double()
+    signal = torch.tensor([0.01, 0.2, 0.9], dtype=torch.float64)
+    observation = torch.tensor([0.05, 0.12, 1.3], dtype=torch.float64)
+    names = ["detector.change", "correction.bias"]
+    held = dict(model.named_parameters())
+
+    def functions(signal: Tensor, observation: Tensor, *values: Tensor) -> Tensor:
+        changed = held | dict(zip(names, values, strict=True))
+        return torch.func.functional_call(Caller(model), {f"model.{n}": v for n, v in changed.items()}, (signal, observation))
+
+    inputs = [signal, observation, *(held[name].detach().clone() for name in names)]
+    assert torch.autograd.gradcheck(functions, [each.requires_grad_() for each in inputs], eps=1e-6, atol=1e-4)
+
+
+class Caller(torch.nn.Module):
+    """Log-density and interval mass as one function of a model's parameters."""
+
+    def __init__(self, model: torch.nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, signal: Tensor, observation: Tensor) -> Tensor:
+        distribution = self.model(signal)
+        interval = distribution.log_interval_prob(observation, observation + 0.05)
+        return torch.stack([distribution.log_prob(observation), interval])
 
 
 def test_mixture_preserves_the_mean() -> None:
