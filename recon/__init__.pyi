@@ -5,11 +5,11 @@ from .image_formation import Linear as Linear
 from .image_formation import Transmission as Transmission
 from .joint import JointReconstructor as JointReconstructor
 from .joint import Reconstruction as Reconstruction
-from .joint import TomographySignal as TomographySignal
 from .metrics import compare as compare
 from .metrics import fourier_shell_correlation as fourier_shell_correlation
 from .projector import SliceProjector as SliceProjector
 from .regularisers import total_variation as total_variation
+from .signal_model import TomographySignal as TomographySignal
 from .simulation import add_noise as add_noise
 from .simulation import clean_tilt_series as clean_tilt_series
 from .sirt import sirt as sirt

@@ -117,6 +117,7 @@ def reconstruct(
     fit = outcome.fit_result
     output.result(
         {"volume": out, "report": page, "method": outcome.method, "choices": outcome.choices, "figures": rows}
+        | {"weights_tried": outcome.weights_tried}
         | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
     )
 

@@ -11,6 +11,8 @@ from torch.nn import functional
 
 from recon.projector import from_columns
 
+_LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
+
 
 class Field(nn.Module):
     """A trainable volume of non-negative attenuation.
@@ -37,6 +39,16 @@ class Field(nn.Module):
         """Unconstrained values, (depth, width, height)."""
         raise NotImplementedError
 
+    def start_from(self, volume: Tensor) -> None:
+        """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
+        raise NotImplementedError
+
+    def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
+        """Unconstrained values of a volume (z, y, x) averaged or stretched to `shape`, (depth, width, height)."""
+        lattice = volume.transpose(1, 2)[None, None] / self.scale
+        pooled = functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
+        return torch.log(torch.expm1(pooled.clamp(_LEAST, 20)))
+
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""
         values: Tensor = functional.softplus(self.raw()) * self.scale
@@ -49,15 +61,16 @@ class Field(nn.Module):
 
 
 class VoxelField(Field):
-    """One free number per voxel.
+    """One free number per voxel."""
 
-    Args:
-        start: attenuation of the empty field, in units of `scale`.
-    """
-
-    def __init__(self, shape: Sequence[int], *, scale: float = 1.0, start: float = 0.05) -> None:
+    def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__(shape, scale=scale)
-        self.values = nn.Parameter(torch.full((self.depth, self.width, self.height), _inverse_softplus(start)))
+        empty = math.log(math.expm1(_LEAST))
+        self.values = nn.Parameter(torch.full((self.depth, self.width, self.height), empty))
+
+    def start_from(self, volume: Tensor) -> None:
+        with torch.no_grad():
+            self.values.copy_(self._raw_of(volume, self.values.shape))
 
     def raw(self) -> Tensor:
         return self.values
@@ -70,10 +83,9 @@ class MultiresolutionField(Field):
 
     Args:
         coarsest: voxels along the longest side of the coarsest grid, at least.
-        start: attenuation of the empty field, in units of `scale`.
     """
 
-    def __init__(self, shape: Sequence[int], *, scale: float = 1.0, start: float = 0.05, coarsest: int = 3) -> None:
+    def __init__(self, shape: Sequence[int], *, scale: float = 1.0, coarsest: int = 3) -> None:
         super().__init__(shape, scale=scale)
         if coarsest < 1:
             raise ValueError(f"coarsest {coarsest} must be at least one voxel")
@@ -81,7 +93,15 @@ class MultiresolutionField(Field):
         while max(sizes[0]) >= 2 * coarsest:
             sizes.insert(0, tuple((size + 1) // 2 for size in sizes[0]))  # type: ignore[arg-type]
         self.grids = nn.ParameterList(nn.Parameter(torch.zeros(size)) for size in sizes)
-        nn.init.constant_(self.grids[0], _inverse_softplus(start))
+        nn.init.constant_(self.grids[0], math.log(math.expm1(_LEAST)))
+
+    def start_from(self, volume: Tensor) -> None:
+        """The start lives in a grid four times coarser than the lattice: what is finer is noise."""
+        with torch.no_grad():
+            for grid in self.grids:
+                grid.zero_()
+            grid = self.grids[max(0, len(self.grids) - 3)]
+            grid.copy_(self._raw_of(volume, grid.shape))
 
     def raw(self) -> Tensor:
         total: Tensor = self.grids[0]
@@ -105,7 +125,3 @@ def _upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:
         return torch.eye(fine, dtype=like.dtype, device=like.device)
     position = ((torch.arange(fine, dtype=like.dtype, device=like.device) - 0.5) / 2).clamp(0, coarse - 1)
     return (1 - (position[:, None] - torch.arange(coarse, dtype=like.dtype, device=like.device)).abs()).clamp_min(0)
-
-
-def _inverse_softplus(value: float) -> float:
-    return math.log(math.expm1(value))

@@ -2,96 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import Digitised, FitResult, Gaussian, RadialFlow, fit
+from noiseflow import Digitised, FitResult, Gaussian, RadialFlow, SplineFlow, fit
 from recon.fields import Field, MultiresolutionField
-from recon.image_formation import Linear, Transmission
+from recon.first_guess import (
+    attenuation_scale,
+    contrast_slab,
+    estimate_response,
+    find_rails,
+    find_step,
+    rough_volume,
+)
 from recon.projector import SliceProjector, from_rays
-from recon.regularisers import total_variation
-from recon.sirt import sirt
+from recon.signal_model import TomographySignal
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.weight import WeightChoice, choose_weight
 
 Progress = Callable[[int, str], None]
-
-
-class TomographySignal(nn.Module):
-    """A volume, its projections and the detector's response as one signal model, for `noiseflow.fit`.
-
-    Pixels are numbered in the projector's native order: ``images.transpose(0, 2, 1)``, that is (tilt, u, y), made flat.
-
-    Args:
-        field: the volume.
-        projector: line integrals along all rays.
-        image_formation: line integrals to signals, such as `Transmission` or `Linear`.
-        weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
-            voxel face.
-        smoothing: jumps below this, in units of the field's scale, count quadratically.
-        learning_rate: of the field; the detector's response learns at a twentieth of it.
-    """
-
-    def __init__(
-        self,
-        field: Field,
-        projector: SliceProjector,
-        image_formation: nn.Module,
-        *,
-        weight: float = 1.0,
-        smoothing: float = 0.05,
-        learning_rate: float = 0.2,
-    ) -> None:
-        super().__init__()
-        self.field, self.projector, self.image_formation = field, projector, image_formation
-        self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
-        self._columns: Tensor | None = None
-        self._seen: tuple[tuple[int, ...], Tensor] | None = None
-
-    @property
-    def num_pixels(self) -> int:
-        """How many pixels the tilt series has."""
-        return self.projector.num_tilts * self.projector.detector_width * self.field.height
-
-    def signal(self) -> Tensor:
-        """The signal of all pixels, flat."""
-        self._columns, self._seen = self.field(), None
-        rays = self.projector.project(self._columns)
-        shape = (self.projector.num_tilts, self.projector.detector_width, self.field.height)
-        signal: Tensor = self.image_formation(rays.view(shape))
-        return signal.reshape(-1)
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        """The signal of some pixels; without gradients, all are projected once for each state of the parameters."""
-        if torch.is_grad_enabled():
-            return self.signal()[pixels]
-        # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
-        version = tuple(parameter._version for parameter in self.parameters())
-        if self._seen is None or self._seen[0] != version:
-            signal = self.signal()
-            self._seen = version, signal
-        return self._seen[1][pixels]
-
-    def penalty(self) -> Tensor:
-        """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""
-        columns = self.field() if self._columns is None else self._columns
-        self._columns = None
-        scale = float(self.field.scale)
-        lattice = columns.view(self.field.depth, self.field.width, self.field.height)
-        variation = total_variation(lattice, smoothing=self.smoothing * scale)
-        return variation * (self.weight / (scale * self.num_pixels))
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """Parameters with their learning rates, for Adam."""
-        response = [parameter for parameter in self.image_formation.parameters() if parameter.requires_grad]
-        groups: list[dict[str, Any]] = [
-            {"params": list(self.field.parameters()), "lr": self.learning_rate, "eps": 1e-15}
-        ]
-        return groups + ([{"params": response, "lr": self.learning_rate / 20}] if response else [])
+_FIRST_WEIGHT = 0.4
+_CLIPPED = 0.02
 
 
 @dataclass(frozen=True)
@@ -104,39 +42,42 @@ class Reconstruction:
         noise_model: the noise model it was fitted with.
         signal_model: field, projector and image formation, as fitted.
         fit_result: held-out likelihood and its history.
+        weight_choice: the weights tried and their held-out likelihoods, where the weight was chosen.
     """
 
     volume: Volume
-    projections: np.ndarray[Any, np.dtype[np.float32]]
+    projections: NDArray[np.float32]
     noise_model: nn.Module
     signal_model: TomographySignal
     fit_result: FitResult
+    weight_choice: WeightChoice | None = None
 
 
 @dataclass(frozen=True)
 class JointReconstructor:
     """Reconstruct a volume together with the noise model of its images; with a `Gaussian`, plain least squares.
 
+    Everything that needs choosing is chosen by the likelihood of held-out pixels, on a slab of a few slices, before the whole
+    volume is fitted once.
+
     Attributes:
-        weight: of the total variation; see `TomographySignal`.
-        noise_model: makes the noise model for given images; a mean-preserving flow behind the detector's rounding and
-            rails by default. One without trainable parameters is used as it is.
+        weight: of the total variation, see `TomographySignal`; None has it chosen.
+        noise_model: a noise model to use, learning or not; None chooses a mean-preserving flow behind the detector's
+            rounding and rails.
         make_field: makes the field from shape and scale.
-        num_steps: steps of the joint fit.
-        warm_up: steps of least squares before it.
-        noise_warm_up: steps of the noise model alone, after those.
+        num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
+        slab: slices used to choose.
         seed: of every random choice.
         device: where to compute.
     """
 
-    weight: float = 0.25
-    noise_model: Callable[[NDArrayAny], nn.Module] = field(default_factory=lambda: automatic_noise_model)
+    weight: float | None = None
+    noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
     num_steps: int = 150
-    warm_up: int = 40
-    noise_warm_up: int = 150
     estimate_response: bool = True
+    slab: int = 24
     seed: int = 0
     device: torch.device | str = "cpu"
 
@@ -150,21 +91,14 @@ class JointReconstructor:
         """
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         signal_model = self.prepare(tilt_series, grid)
-        observation = _observation(tilt_series, self.device)
-        generator = torch.Generator().manual_seed(self.seed)
-        held_out = block_mask(observation.shape, generator=generator).to(observation.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            noise_model = self.noise_model(tilt_series.images).to(self.device)
-        options: dict[str, Any] = {"held_out": held_out, "generator": generator}
-        if not isinstance(noise_model, Gaussian):
-            fit(Gaussian().to(self.device), signal_model, observation, num_steps=self.warm_up, **options)
-            with torch.no_grad():
-                signal = signal_model.signal().view_as(observation)
-            fit(noise_model, signal, observation, num_steps=self.noise_warm_up, **options)
-            options["standardise"] = False
-        result = fit(noise_model, signal_model, observation, num_steps=self.num_steps, progress=progress, **options)
-        return _finished(signal_model, noise_model, result, grid)
+            noise_model, choice = self._choose(tilt_series, signal_model)
+        if choice is not None:
+            signal_model.weight = choice.weight
+        task = _Task(signal_model, _observation(tilt_series, self.device), self.seed)
+        result = task.fit(noise_model, num_steps=self.num_steps, standardise=False, progress=progress)
+        return _finished(signal_model, noise_model, result, grid, choice)
 
     def prepare(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The signal model before any fit: an almost empty field on the scale of the data."""
@@ -181,50 +115,97 @@ class JointReconstructor:
             device=self.device,
         )
         response = estimate_response(tilt_series, estimate=self.estimate_response).to(self.device)
-        scale = _attenuation_scale(tilt_series, response, projector)
-        volume = self.make_field(grid.shape, scale=scale).to(self.device)
-        return TomographySignal(volume, projector, response, weight=self.weight)
+        rough = rough_volume(tilt_series, response, projector)
+        field = self.make_field(grid.shape, scale=attenuation_scale(rough)).to(self.device)
+        field.start_from(rough)
+        weight = _FIRST_WEIGHT if self.weight is None else self.weight
+        return TomographySignal(field, projector, response, weight=weight)
 
-
-NDArrayAny = np.ndarray[Any, np.dtype[Any]]
-
-
-def automatic_noise_model(images: NDArrayAny) -> nn.Module:
-    """A mean-preserving radial flow behind the rounding and the rails that the images show."""
-    step = 1.0 if np.issubdtype(images.dtype, np.integer) else 0.0
-    low, high = find_rails(images)
-    flow = RadialFlow(mean_preserving=True)
-    return flow if step == 0 and not np.isfinite([low, high]).any() else Digitised(flow, step=step, low=low, high=high)
-
-
-def find_rails(images: NDArrayAny, *, least: int = 10) -> tuple[float, float]:
-    """The readings (low, high) at which a detector saturates, or infinity where it does not.
-
-    A rail is an extreme reading that at least `least` pixels share, and twice as many as share the reading next to it.
-    """
-    rails = []
-    for extreme, none in ((images.min(), -np.inf), (images.max(), np.inf)):
-        rest = images[images != extreme]
-        neighbour = (rest.min() if none < 0 else rest.max()) if rest.size else extreme
-        count, beside = images.size - rest.size, int((rest == neighbour).sum())
-        rails.append(float(extreme) if count >= least and count > 2 * beside else none)
-    return rails[0], rails[1]
-
-
-def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
-    """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF."""
-    images = tilt_series.images.astype(np.float32)
-    block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
-    tilts, height, width = (images.shape[0], *(size // block * block for size in images.shape[1:]))
-    means = images[:, :height, :width].reshape(tilts, height // block, block, width // block, block).mean((2, 4))
-    if tilt_series.mode == "linear":
-        return Linear(offset=float(np.quantile(means, 0.02)), estimate=estimate)
-    intensity = float(np.quantile(means, 0.95))
-    if intensity <= 0:
-        raise ValueError(
-            "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
+    def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None]:
+        """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
+        rows = contrast_slab(tilt_series, self.slab)
+        given = None if self.noise_model is None else self.noise_model().to(self.device)
+        shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
+        field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
+        field.start_from(whole.field.volume()[:, rows])
+        part = whole.with_field(field)
+        task = _Task(part, _observation(tilt_series, self.device, rows), self.seed)
+        task.fit(Gaussian().to(self.device), num_steps=40)
+        noise_model = (
+            _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
         )
-    return Transmission(intensity, estimate=estimate)
+        task.fit(noise_model, num_steps=80, standardise=given is not None)
+        whole.image_formation.load_state_dict(part.image_formation.state_dict())
+        if self.weight is not None:
+            return noise_model, None
+        with _frozen(noise_model):
+            return noise_model, choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
+
+
+def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
+    """Noise models worth trying for these images: mean-preserving flows, behind the rounding and rails that they show.
+
+    One lets only location and scale depend on the signal, the other lets the whole shape. Where clipping hides a tail of many
+    pixels, the second could put anything there, and with it any mean; only the first is offered then, because the shape seen
+    at other signals stands in for what is hidden.
+    """
+    (low, high), step = find_rails(images), find_step(images)
+    flows: list[nn.Module] = [RadialFlow(6, num_conditional=0, mean_preserving=True)]
+    if float(((images <= low) | (images >= high)).mean()) < _CLIPPED:
+        flows.append(SplineFlow(mean_preserving=True))
+    if step == 0 and not np.isfinite([low, high]).any():
+        return flows
+    return [Digitised(flow, step=step, low=low, high=high) for flow in flows]
+
+
+class _Task:
+    """A signal model with its observations and the pixels that judge it."""
+
+    def __init__(self, signal_model: TomographySignal, observation: Tensor, seed: int) -> None:
+        self.signal_model, self.observation = signal_model, observation
+        self.generator = torch.Generator().manual_seed(seed)
+        self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
+
+    def fit(self, noise_model: nn.Module, *, known: bool = False, **options: Any) -> FitResult:
+        """Fit volume and noise model; with `known`, the noise model alone on the signal as it is."""
+        signal: Tensor | nn.Module = self.signal_model
+        if known:
+            with torch.no_grad():
+                signal = self.signal_model.signal().view_as(self.observation)
+        options |= {"held_out": self.held_out, "generator": self.generator, "batch_size": 4096}
+        options["learning_rate"] = _learning_rate(noise_model)
+        return fit(noise_model, signal, self.observation, **options)
+
+
+def _learning_rate(noise_model: nn.Module) -> float:
+    """Splines have many parameters and overshoot at rates that the others need to keep up with the volume."""
+    return 0.01 if any(isinstance(module, SplineFlow) for module in noise_model.modules()) else 0.03
+
+
+def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
+    fitted = [
+        (task.fit(model.to(task.observation.device), known=True, num_steps=100).held_out_nll, index)
+        for index, model in enumerate(candidates)
+    ]
+    return candidates[min(fitted)[1]]
+
+
+def _held_out_nll(task: _Task, noise_model: nn.Module, weight: float) -> float:
+    task.signal_model.weight = weight
+    history = task.fit(noise_model, num_steps=40, standardise=False).history
+    return list(history.values())[-1]
+
+
+@contextmanager
+def _frozen(model: nn.Module) -> Iterator[None]:
+    learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
 
 
 def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
@@ -234,25 +215,16 @@ def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, ge
     return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]
 
 
-def _observation(tilt_series: TiltSeries, device: torch.device | str) -> Tensor:
-    images = np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32)
+def _observation(tilt_series: TiltSeries, device: torch.device | str, rows: slice = slice(None)) -> Tensor:
+    images = np.ascontiguousarray(tilt_series.images[:, rows].transpose(0, 2, 1), dtype=np.float32)
     return torch.from_numpy(images).to(device)
 
 
-def _attenuation_scale(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> float:
-    """Attenuation of what is not vacuum, from a few iterations of SIRT on a thin sample of smoothed slices."""
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    bands = torch.nn.functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0]
-    bands = bands[:, :: max(1, bands.shape[1] // 16)].to(projector.matrix.device)
-    with torch.no_grad():
-        volume = sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
-        power = (volume**2).sum()
-        return float((volume**3).sum() / power) if power > 0 else 1.0
-
-
-def _finished(model: TomographySignal, noise_model: nn.Module, result: FitResult, grid: VolumeGrid) -> Reconstruction:
+def _finished(
+    model: TomographySignal, noise_model: nn.Module, result: FitResult, grid: VolumeGrid, choice: WeightChoice | None
+) -> Reconstruction:
     with torch.no_grad():
         volume = Volume(model.field.volume().cpu().numpy(), grid.voxel_size)
         shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
         projections = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-    return Reconstruction(volume, projections, noise_model, model, result)
+    return Reconstruction(volume, projections, noise_model, model, result, choice)

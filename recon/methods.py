@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import nn
 
-from noiseflow import FitResult, Gaussian
+from noiseflow import Digitised, FitResult, Gaussian
 from recon.fields import VoxelField
-from recon.joint import JointReconstructor, Reconstruction, estimate_response
+from recon.first_guess import estimate_response
+from recon.joint import JointReconstructor, Reconstruction
 from recon.projector import SliceProjector
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -34,6 +35,7 @@ class Outcome:
         fit_result: of fitted methods.
         noise_model: of the joint fit.
         choices: what was chosen or estimated, by name.
+        weights_tried: weight → held-out negative log-likelihood, where the weight was chosen by it.
     """
 
     volume: Volume
@@ -42,6 +44,7 @@ class Outcome:
     fit_result: FitResult | None
     noise_model: nn.Module | None
     choices: dict[str, float | str]
+    weights_tried: dict[float, float] = field(default_factory=dict)
 
 
 def reconstruct(
@@ -86,10 +89,10 @@ def reconstruct(
     if num_steps is not None:
         options["num_steps"] = num_steps
     if method in ("l2", "tv"):
-        options["noise_model"] = lambda images: Gaussian()
+        options["noise_model"] = Gaussian
     elif noise_model is not None:
         fixed = noise_model.requires_grad_(False)
-        options["noise_model"] = lambda images: fixed
+        options["noise_model"] = lambda: fixed
     if method == "tv":
         options["make_field"] = VoxelField
     return _fitted(JointReconstructor(**options), tilt_series, grid, method, progress)
@@ -102,11 +105,19 @@ def _fitted(
     response = result.signal_model.image_formation
     learnt = "intensity" if tilt_series.mode == "transmission" else "offset"
     choices: dict[str, float | str] = {
-        "weight": reconstructor.weight,
-        "noise model": str(result.noise_model).splitlines()[0].rstrip("("),
+        "weight": result.signal_model.weight,
+        "noise model": _describe(result.noise_model),
         learnt: float(getattr(response, learnt).mean()),
     }
-    return Outcome(result.volume, result.projections, method, result.fit_result, result.noise_model, choices)
+    tried = result.weight_choice.tried if result.weight_choice is not None else {}
+    return Outcome(result.volume, result.projections, method, result.fit_result, result.noise_model, choices, tried)
+
+
+def _describe(noise_model: nn.Module) -> str:
+    if not isinstance(noise_model, Digitised):
+        return type(noise_model).__name__
+    rounding = f"rounded to {noise_model.step:g}, " if noise_model.step else ""
+    return f"{type(noise_model.model).__name__}, {rounding}clipped to [{noise_model.low:g}, {noise_model.high:g}]"
 
 
 def _classical(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -88,7 +89,13 @@ def slab(size: int, *, generator: np.random.Generator, count: int = 120) -> Arra
     return np.asarray(volume * inside)
 
 
-PHANTOMS = {"shells": shells, "virions": virions, "filaments": filaments, "particles": particles, "slab": slab}
+PHANTOMS: dict[str, Callable[..., Array]] = {
+    "shells": shells,
+    "virions": virions,
+    "filaments": filaments,
+    "particles": particles,
+    "slab": slab,
+}
 
 
 def make_phantom(name: str, size: int, *, generator: np.random.Generator) -> Array:
@@ -106,12 +113,14 @@ def make_phantom(name: str, size: int, *, generator: np.random.Generator) -> Arr
 
 def _direction(generator: np.random.Generator) -> NDArray[Any]:
     vector = generator.normal(size=3)
-    return np.asarray(vector / np.linalg.norm(vector))
+    unit: NDArray[Any] = vector / np.linalg.norm(vector)
+    return unit
 
 
 def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:
     """A centre at which a ball of this radius stays inside the sphere that touches the faces."""
-    return _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
+    place: NDArray[Any] = _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
+    return place
 
 
 def _rotation(generator: np.random.Generator) -> NDArray[Any]:

@@ -69,3 +69,8 @@ def _add_history(report: Report, outcome: Outcome) -> None:
     axes[0][0].set_ylabel("held-out NLL (nats per pixel)")
     report.heading("Course of the fit")
     report.figure(figure, caption="Negative log-likelihood of pixels that the fit never saw.")
+    if outcome.weights_tried:
+        rows = [(f"{weight:.4g}", f"{nll:.5f}") for weight, nll in sorted(outcome.weights_tried.items())]
+        report.heading("Choice of the weight")
+        caption = "Held-out likelihood of a slab of slices; the weight is where the parabola through the best three is lowest."
+        report.table(("weight of the total variation", "held-out NLL"), rows, caption=caption)

@@ -69,7 +69,7 @@ def score(reconstructor: JointReconstructor, scene: Scene) -> Score:
     result = reconstructor(scene.noisy)
     seconds = time.perf_counter() - started
     volume = compare(result.volume.attenuation, scene.truth).psnr
-    return Score(reconstructor.weight, volume, compare(result.projections, scene.clean.images).psnr, seconds)
+    return Score(result.signal_model.weight, volume, compare(result.projections, scene.clean.images).psnr, seconds)
 
 
 def best_weight(reconstructor: JointReconstructor, scene: Scene) -> Score:
@@ -89,8 +89,8 @@ def best_weight(reconstructor: JointReconstructor, scene: Scene) -> Score:
 
 
 def rivals(noise: str) -> dict[str, Callable[[Scene], Score]]:
-    least_squares = JointReconstructor(noise_model=lambda images: Gaussian())
-    oracle = JointReconstructor(noise_model=lambda images: true_noise(noise))
+    least_squares = JointReconstructor(noise_model=Gaussian)
+    oracle = JointReconstructor(noise_model=lambda: true_noise(noise))
 
     def of_two(reconstructor: JointReconstructor) -> Callable[[Scene], Score]:
         def run(scene: Scene) -> Score:

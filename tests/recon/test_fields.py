@@ -12,11 +12,22 @@ from recon.regularisers import total_variation
 @pytest.mark.parametrize("make", [VoxelField, MultiresolutionField])
 @pytest.mark.parametrize("shape", [(8, 8, 8), (5, 12, 9), (1, 3, 2)])
 def test_field_is_positive_and_starts_constant(make, shape):
-    field = make(shape, scale=2.0, start=0.05)
+    field = make(shape, scale=2.0)
     depth, height, width = shape
     assert field().shape == (depth * width, height)
-    torch.testing.assert_close(field().detach(), torch.full((depth * width, height), 0.1))
+    torch.testing.assert_close(field().detach(), torch.full((depth * width, height), 0.006))
     assert field.volume().shape == shape
+
+
+@pytest.mark.parametrize("make", [VoxelField, MultiresolutionField])
+def test_field_starts_from_a_rough_volume(make):
+    field = make((16, 24, 20), scale=0.1)
+    rough = torch.zeros(16, 6, 20)
+    rough[8:, :3, 10:] = 0.2
+    field.start_from(rough)
+    start = field.volume()
+    assert float(start[12:, :8, 15:].mean()) == pytest.approx(0.2, rel=0.05)
+    assert 0 < float(start[:4, 16:, :5].mean()) < 0.001
 
 
 def test_every_grid_of_a_field_learns():

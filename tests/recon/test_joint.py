@@ -6,18 +6,13 @@ import torch
 
 import noiseflow
 from recon.fields import VoxelField
+from recon.first_guess import estimate_response, find_rails, find_step
 from recon.image_formation import Linear, Transmission
-from recon.joint import (
-    JointReconstructor,
-    TomographySignal,
-    automatic_noise_model,
-    block_mask,
-    estimate_response,
-    find_rails,
-)
+from recon.joint import JointReconstructor, block_mask, noise_candidates
 from recon.metrics import compare
 from recon.phantoms import shells
 from recon.projector import SliceProjector
+from recon.signal_model import TomographySignal
 from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.tilt_series import TiltSeries, VolumeGrid
 
@@ -85,11 +80,20 @@ def test_rails_are_found_only_where_readings_pile_up():
     assert find_rails(np.round(unclipped.clip(0, 1) * 255).astype(np.uint8)) == (0.0, 255.0)
 
 
-def test_automatic_noise_model_fits_the_detector():
+def test_steps_are_found_only_where_readings_are_rounded():
+    generator = np.random.default_rng(0)
+    readings = generator.normal(0.5, 0.3, (4, 30, 30))
+    assert find_step(readings) == 0
+    assert find_step(np.round(readings * 20)) == 1
+    assert find_step(np.round(readings * 20).astype(np.float32) / 16) == pytest.approx(1 / 16)
+    assert find_step(np.round(readings * 1e5).astype(np.int32)) == 0
+
+
+def test_candidate_noise_models_fit_the_detector():
     images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
-    assert isinstance(automatic_noise_model(images), noiseflow.RadialFlow)
-    assert automatic_noise_model(images.clip(0, 1)).high == 1.0
-    assert automatic_noise_model((images * 100).astype(np.int16)).step == 1.0
+    assert not any(isinstance(model, noiseflow.Digitised) for model in noise_candidates(images))
+    assert all(model.high == 1.0 and model.step == 0.0 for model in noise_candidates(images.clip(0, 1)))
+    assert all(model.step == 1.0 for model in noise_candidates((images * 100).astype(np.int16)))
 
 
 def test_held_out_pixels_come_in_blocks():
@@ -113,12 +117,12 @@ def test_first_guess_of_the_response(scene):
 def test_joint_fit_beats_least_squares_at_its_best_weight(scene):
     truth, clean, noisy = scene
     least_squares = [
-        JointReconstructor(weight=weight, noise_model=lambda images: noiseflow.Gaussian(), num_steps=100)(noisy)
-        for weight in (0.05, 0.1, 0.2, 0.4)
+        JointReconstructor(weight=weight, noise_model=noiseflow.Gaussian, num_steps=80, slab=8)(noisy)
+        for weight in (0.2, 0.4, 0.8)
     ]
     best = max(compare(result.volume.attenuation, truth).psnr for result in least_squares)
     best_projections = max(compare(result.projections, clean.images).psnr for result in least_squares)
-    joint = JointReconstructor(weight=0.3, num_steps=100)(noisy)
+    joint = JointReconstructor(weight=0.5, num_steps=80, slab=16)(noisy)
     assert compare(joint.volume.attenuation, truth).psnr > best + 0.1
     assert compare(joint.projections, clean.images).psnr > best_projections + 1
 
@@ -126,3 +130,14 @@ def test_joint_fit_beats_least_squares_at_its_best_weight(scene):
 def test_grid_of_another_height_is_refused(scene):
     with pytest.raises(ValueError, match="voxels high"):
         JointReconstructor()(scene[2], VolumeGrid(32, 31, 32))
+
+
+@pytest.mark.slow
+def test_chosen_weight_is_nearly_the_best(scene):
+    truth, _, noisy = scene
+    chosen = JointReconstructor()(noisy)
+    assert chosen.weight_choice is not None
+    assert chosen.signal_model.weight == chosen.weight_choice.weight
+    ladder = [JointReconstructor(weight=weight)(noisy) for weight in (0.1, 0.2, 0.4, 0.8, 1.6)]
+    best = max(compare(result.volume.attenuation, truth).psnr for result in ladder)
+    assert compare(chosen.volume.attenuation, truth).psnr > best - 0.4

@@ -18,7 +18,7 @@ SIGNALS = torch.tensor([0.2, 1.0, 3.0], dtype=torch.float64)
 @pytest.mark.parametrize("noise", NOISES, ids=lambda noise: type(noise).__name__)
 def test_density_has_unit_mass_and_the_moments_claimed(noise):
     distribution = noise(SIGNALS[:, None])
-    value = torch.linspace(-40, 60, 400_001, dtype=torch.float64)
+    value = torch.linspace(-40, 60, 50_001, dtype=torch.float64)
     density = distribution.log_prob(value.expand(3, -1)).exp()
     step = value[1] - value[0]
     torch.testing.assert_close(density.sum(1) * step, torch.ones(3).double(), rtol=1e-6, atol=0)
@@ -44,7 +44,7 @@ def test_phantoms_keep_their_shape_at_every_size(name):
     coarse, fine = (make_phantom(name, size, generator=np.random.default_rng(1)) for size in (48, 96))
     assert 0 <= fine.min() < fine.max() <= 1
     binned = fine.reshape(48, 2, 48, 2, 48, 2).mean((1, 3, 5))
-    assert np.abs(binned - coarse).mean() < 0.1 * coarse.mean()
+    assert np.abs(binned - coarse).mean() < 0.15 * coarse.mean()
 
 
 @pytest.mark.parametrize("name", [name for name in ACQUISITIONS if name != "none"])

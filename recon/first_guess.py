@@ -1,0 +1,91 @@
+"""What a look at a tilt series tells before any fit: the detector's response, its rails and steps, the scale of attenuation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from recon.image_formation import Linear, Transmission
+from recon.projector import SliceProjector
+from recon.sirt import sirt
+from recon.tilt_series import TiltSeries
+
+_MOST_LEVELS = 1024
+
+
+def find_rails(images: NDArray[Any], *, least: int = 10) -> tuple[float, float]:
+    """The readings (low, high) at which a detector saturates, or infinity where it does not.
+
+    A rail is an extreme reading that at least `least` pixels share, and twice as many as share the reading next to it.
+    """
+    rails = []
+    for extreme, none in ((images.min(), -np.inf), (images.max(), np.inf)):
+        rest = images[images != extreme]
+        neighbour = (rest.min() if none < 0 else rest.max()) if rest.size else extreme
+        count, beside = images.size - rest.size, int((rest == neighbour).sum())
+        rails.append(float(extreme) if count >= least and count > 2 * beside else none)
+    return rails[0], rails[1]
+
+
+def find_step(images: NDArray[Any]) -> float:
+    """The rounding step of readings that take few equally spaced values; 0 where rounding is fine enough to forget."""
+    levels = np.unique(images[:: max(1, len(images) // 8)])
+    if not 2 < levels.size <= _MOST_LEVELS:
+        return 0.0
+    gaps = np.diff(levels.astype(np.float64))
+    step = float(gaps.min())
+    return step if np.abs(gaps / step - np.round(gaps / step)).max() < 1e-3 else 0.0
+
+
+def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
+    """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF.
+
+    Args:
+        tilt_series: the data.
+        estimate: whether a fit shall refine the guess.
+
+    Raises:
+        ValueError: bright-field images that are nowhere positive.
+    """
+    images = tilt_series.images.astype(np.float32)
+    block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
+    tilts, height, width = (images.shape[0], *(size // block * block for size in images.shape[1:]))
+    means = images[:, :height, :width].reshape(tilts, height // block, block, width // block, block).mean((2, 4))
+    if tilt_series.mode == "linear":
+        return Linear(offset=float(np.quantile(means, 0.02)), estimate=estimate)
+    intensity = float(np.quantile(means, 0.95))
+    if intensity <= 0:
+        raise ValueError(
+            "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
+        )
+    return Transmission(intensity, estimate=estimate)
+
+
+def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
+    """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
+    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.matrix.device)
+    with torch.no_grad():
+        return sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
+
+
+def attenuation_scale(volume: Tensor) -> float:
+    """Attenuation per voxel of what is not vacuum: the mean that weighs each voxel by its square."""
+    power = (volume**2).sum()
+    return float((volume**3).sum() / power) if power > 0 else 1.0
+
+
+def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
+    """The run of `num_slices` neighbouring slices in which the images vary most."""
+    height = tilt_series.images.shape[1]
+    if num_slices >= height:
+        return slice(0, height)
+    energy = np.asarray(tilt_series.images, dtype=np.float32).mean(0).var(1)
+    total = np.convolve(energy, np.ones(num_slices), mode="valid")
+    start = int(total.argmax())
+    return slice(start, start + num_slices)
