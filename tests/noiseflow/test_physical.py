@@ -173,8 +173,8 @@ def test_model_keeps_its_contract(name: str) -> None:
 def test_density_integrates_to_one(name: str) -> None:
     model = MODELS[name]().double()
     for signal in (0.0, 0.4, 1.0):
-        nodes, weights = gauss_legendre(2000)
-        reach = 20 * float(noiseflow.PoissonGaussian()(scalar(signal)).stddev.detach()) + 0.5
+        nodes, weights = gauss_legendre(3000)
+        reach = 30 * float(noiseflow.PoissonGaussian()(scalar(signal)).stddev.detach()) + 0.5
         observation = signal + reach * (2 * nodes - 1)
         mass = (model(torch.full_like(nodes, signal)).log_prob(observation).exp() * weights).sum() * 2 * reach
         assert float(mass.detach()) == pytest.approx(1, abs=1e-8)
