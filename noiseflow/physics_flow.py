@@ -185,8 +185,7 @@ def ndtri_exp(log_probability: Tensor) -> Tensor:
         far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
         start = torch.special.ndtri(torch.exp(torch.where(deep, -1.0, log_probability)))
         z = torch.where(deep, -torch.sqrt(far - torch.log(2 * math.pi * far)), start)
-        for _ in range(2):
-            z = z - (log_ndtr(z) - log_probability) / _hazard(z)
+        z = z - (log_ndtr(z) - log_probability) / _hazard(z)
         hazard = _hazard(z)
     return z - (log_ndtr(z) - log_probability) / hazard
 
