@@ -27,7 +27,9 @@ def calibrate(
         list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")
     ] = None,
     flat: Annotated[list[Path] | None, typer.Option(help="Two or more equal frames of even illumination.")] = None,
-    kind: Annotated[str, typer.Option(help="auto, or the model to save: gaussian, poisson, …, flow, spline.")] = "auto",
+    kind: Annotated[
+        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, signal-gaussian, mixture, flow, spline.")
+    ] = "auto",
     exposure_ratio: Annotated[
         float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
     ] = None,

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
     "poisson": "Poisson",
+    "poisson-gaussian": "PoissonGaussian",
     "signal-gaussian": "SignalDependentGaussian",
+    "mixture": "Mixture",
     "flow": "RadialFlow",
     "spline": "SplineFlow",
 }
@@ -151,7 +153,7 @@ def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progres
     import noiseflow
 
     torch.manual_seed(seed)
-    options = {"mean_preserving": True} if name in ("flow", "spline") else {}
+    options = {"mean_preserving": True} if name in ("mixture", "flow", "spline") else {}
     model: nn.Module = getattr(noiseflow, KINDS[name])(**options).to(device)
     signal, observation = (values.to(device) for values in _tensors(pixels, ~pixels.held_out))
     stopping = torch.from_numpy(pixels.block[~pixels.held_out] % 10 == 0).to(device)

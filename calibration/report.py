@@ -28,7 +28,9 @@ LARGEST_MISFIT = 1.3
 LABELS = {
     "gaussian": "Gaussian, one width",
     "poisson": "Poisson",
+    "poisson-gaussian": "Poisson-Gaussian",
     "signal-gaussian": "Gaussian, width by signal",
+    "mixture": "mixture of Gaussians",
     "flow": "radial flow",
     "spline": "spline flow",
 }

@@ -1,4 +1,4 @@
-"""Accuracy and speed of the calibration: `python docs/benchmarks/calibration.py registration|parameters|real|speed`.
+"""Accuracy and speed of the calibration: `python docs/benchmarks/calibration.py [registration|parameters|real|speed]`.
 
 Each part prints its figures and stores them in ``results/calibration.json`` beside this file.
 """
@@ -261,27 +261,29 @@ def speed(size: int = 1024) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("registration", "parameters", "real", "speed"))
+    parts = ("registration", "parameters", "real", "speed")
+    parser.add_argument("part", nargs="?", choices=parts, help="default: all, the real data where --data is given")
     parser.add_argument("--trials", type=int, default=None, help="default: 200 registrations, 300 parameter sets")
     parser.add_argument("--data", type=Path, default=None, help="folder with exposures_miro/ and detector_zhuang/")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=600.0, help="stop after the trials done by then")
     arguments = parser.parse_args()
-    started = time.perf_counter()
-    if arguments.part == "registration":
-        result = registration(arguments.trials or 200, arguments.workers, arguments.minutes)
-    elif arguments.part == "parameters":
-        result = parameters(arguments.trials or 300, arguments.workers, arguments.minutes)
-    elif arguments.part == "real":
-        result = real(arguments.data)
-    else:
-        result = speed()
-    result["seconds"] = time.perf_counter() - started
-    RESULTS.parent.mkdir(exist_ok=True)
-    stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    stored[arguments.part] = result
-    RESULTS.write_text(json.dumps(stored, indent=1) + "\n")
-    print(json.dumps({key: value for key, value in result.items() if key != "draws"}, indent=1))
+    for part in [arguments.part] if arguments.part else [part for part in parts if part != "real" or arguments.data]:
+        started = time.perf_counter()
+        result = measure(part, arguments) | {"seconds": time.perf_counter() - started}
+        RESULTS.parent.mkdir(exist_ok=True)
+        stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.write_text(json.dumps(stored | {part: result}, indent=1) + "\n")
+        print(part, json.dumps({key: value for key, value in result.items() if key != "draws"}, indent=1))
+
+
+def measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The figures of one part."""
+    if part == "registration":
+        return registration(arguments.trials or 200, arguments.workers, arguments.minutes)
+    if part == "parameters":
+        return parameters(arguments.trials or 300, arguments.workers, arguments.minutes)
+    return real(arguments.data) if part == "real" else speed()
 
 
 if __name__ == "__main__":

@@ -16,7 +16,9 @@ def burst(shifts, doses, *, seed=0, electrons=60.0):
     generator = np.random.default_rng(seed)
     scene = textured_scene(generator, SIZE)
     y, x = np.mgrid[:SIZE, :SIZE].astype(float)
-    clean = [dose * electrons * (0.1 + scene(x + dx, y + dy).clip(0)) for (dx, dy), dose in zip(shifts, doses, strict=True)]
+    clean = [
+        dose * electrons * (0.1 + scene(x + dx, y + dy).clip(0)) for (dx, dy), dose in zip(shifts, doses, strict=True)
+    ]
     frames = [np.round(100 + 2 * (generator.poisson(rate) + generator.standard_normal(rate.shape))) for rate in clean]
     return Burst(np.stack(frames)), 100 + 2 * np.stack(clean)
 

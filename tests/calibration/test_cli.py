@@ -89,7 +89,8 @@ def test_bad_options_are_refused_before_any_work(folder, capsys, extra, message)
     assert list((folder / "out").iterdir()) == []
 
 
-def test_pair_in_model_and_report_out(folder, capsys):
+def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
+    monkeypatch.setattr("calibration.models.NUM_STEPS", 100)
     model, report = folder / "out" / "m.safetensors", folder / "out" / "report"
     files = (
         "--short",
@@ -106,11 +107,14 @@ def test_pair_in_model_and_report_out(folder, capsys):
     assert set(result["models"]) == set(KINDS)
     assert {"nll", "jsd", "jsd_floor", "bc", "bd"} <= set(result["models"]["flow"])
     assert {"rms_px", "inliers", "matrix"} <= set(result["registration"][0])
+    for name in ("gain", "offset", "read_noise"):
+        assert result["detector"][name]["q05"] <= result["detector"][name]["median"] <= result["detector"][name]["q95"]
+    assert result["detector"]["gain"]["median"] == pytest.approx(2.0, rel=0.1)
     assert result["models"][result["kind"]]["excess"] <= result["models"][result["kind"]]["excess_error"]
     assert result["models"]["gaussian"]["excess"] > 4 * result["models"]["gaussian"]["excess_error"]
     assert type(noiseflow.load(model)).__name__ == KINDS[result["kind"]]
     page = (report / "report.html").read_text()
-    assert page.count("data:image/png") >= 2
+    assert page.count("data:image/png") == 6
     assert "suffices" in page
 
 
@@ -121,6 +125,27 @@ def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
     assert run(*files, "--kind", "signal-gaussian") == 0
     assert type(noiseflow.load(model)).__name__ == "SignalDependentGaussian"
     assert "held-out NLL" in capsys.readouterr().out
+
+
+def test_burst_with_dark_frames(folder, capsys, monkeypatch, exposures):
+    monkeypatch.setattr("calibration.models.NUM_STEPS", 20)
+    electrons = (exposures.signal - 100) / 2
+    noise = RANDOM.standard_normal
+    frames = [100 + 2 * (RANDOM.poisson(electrons) + noise(electrons.shape)) for _ in range(3)]
+    write(folder / "burst.tif", np.round(frames).astype(np.uint16))
+    write(folder / "dark.tif", np.round(100 + 2 * noise((3, *electrons.shape))).astype(np.uint16))
+    files = ("--short", f"{folder}/burst.tif", "--dark", f"{folder}/dark.tif", "-o", f"{folder}/out/m.safetensors")
+    assert run(*files, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["burst"]["drifting"] is False
+    assert result["detector"]["read_noise"]["median"] == pytest.approx(1.0, rel=0.1)
+    assert result["detector"]["gain"]["median"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_one_frame_alone_is_refused(folder, capsys):
+    assert run("--short", f"{folder}/short.tif", "-o", f"{folder}/out/m.safetensors") == 1
+    assert "one frame only" in capsys.readouterr().err
+    assert list((folder / "out").iterdir()) == []
 
 
 def test_help_needs_no_torch():

@@ -31,7 +31,9 @@ def readings(generator, electrons, *, share=0.0, step=0.0, gain=GAIN, read_noise
 
 
 def single_level(rate: float, *, share: float = 0.0, step: float = 0.0):
-    return collect_levels([readings(np.random.default_rng(0), np.full(2000, rate), share=share, step=step)], num_levels=1)
+    return collect_levels(
+        [readings(np.random.default_rng(0), np.full(2000, rate), share=share, step=step)], num_levels=1
+    )
 
 
 @pytest.mark.parametrize("rate", [0.3, 4.0, 60.0, 3000.0])
