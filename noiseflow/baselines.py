@@ -134,9 +134,10 @@ class PoissonDistribution(NoiseDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         count = torch.round(self._count(value).detach())
-        possible = count >= 0
+        possible = (count == 0) | ((count > 0) & (self.rate > 0))
         count = torch.where(possible, count, torch.zeros_like(count))
-        log_mass = torch.special.xlogy(count, self.rate) - self.rate - torch.lgamma(count + 1)
+        log_rate = torch.log(torch.where(self.rate > 0, self.rate, torch.ones_like(self.rate)))
+        log_mass = count * log_rate - self.rate - torch.lgamma(count + 1)
         return torch.where(possible, log_mass, torch.full_like(log_mass, -math.inf)) - torch.log(self.gain)
 
     def cdf(self, value: Tensor) -> Tensor:
@@ -169,7 +170,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return self._value(torch.poisson(self.rate.expand(*sample_shape, *self.batch_shape), generator=generator))
+            return self._value(torch.poisson(self.rate.expand((*sample_shape, *self.batch_shape)), generator=generator))
 
     @property
     def mean(self) -> Tensor:

@@ -137,12 +137,64 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     w, m = torch.where(narrow, width, zero + 1), torch.where(narrow, middle, zero)
     log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - _LOG_SQRT_2PI
     log_narrow = log_narrow + torch.log1p(w * w * (m * m - 1) / 24)
-    a, b = torch.where(narrow, zero - 1, low), torch.where(narrow, zero, high)
-    log_high = torch.special.log_ndtr(b)
-    unbounded = torch.isneginf(a)
-    ratio = torch.special.log_ndtr(torch.where(unbounded, zero - 1, a)) - log_high
-    log_wide = log_high + torch.where(unbounded, zero, torch.log1p(-torch.exp(torch.where(unbounded, zero - 1, ratio))))
-    return torch.where(narrow, log_narrow, log_wide)
+    return torch.where(
+        narrow,
+        log_narrow,
+        _log_wide_interval(*(torch.where(narrow, zero - k, end) for k, end in ((1, low), (0, high)))),
+    )
+
+
+def _log_wide_interval(low: Tensor, high: Tensor) -> Tensor:
+    """log[Φ(high) − Φ(low)] for low < high ≤ −low: log Φ(high) + log[1 − Φ(low)/Φ(high)]."""
+    unbounded = torch.isneginf(low)
+    low = torch.where(unbounded, -torch.ones_like(low) - high.detach().abs(), low)
+    ratio: Tensor = _LogRatio.apply(low, high)  # type: ignore[no-untyped-call]
+    ratio = torch.where(unbounded | (ratio >= 0), -torch.ones_like(ratio), ratio)
+    rest = torch.log(-torch.expm1(ratio))
+    whole: Tensor = log_normal_cdf(high)
+    return whole + torch.where(unbounded, torch.zeros_like(rest), rest)
+
+
+def log_normal_cdf(x: Tensor) -> Tensor:
+    """log Φ(x), with a gradient that holds far into both tails; torch's own fails beyond about −10⁸."""
+    found: Tensor = _LogCdf.apply(x)  # type: ignore[no-untyped-call]
+    return found
+
+
+def _hazard(x: Tensor) -> Tensor:
+    """φ(x)/Φ(x), the derivative of log Φ(x)."""
+    left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
+    right = torch.exp(-0.5 * x * x - _LOG_SQRT_2PI) / torch.special.ndtr(x.clamp(min=0))
+    return torch.where(x <= 0, left, right)
+
+
+class _LogCdf(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return torch.special.log_ndtr(x)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        return gradient * _hazard(x)
+
+
+class _LogRatio(torch.autograd.Function):
+    """log Φ(low) − log Φ(high) for low < high ≤ −low, without the cancellation of two large numbers."""
+
+    @staticmethod
+    def forward(ctx: Any, low: Tensor, high: Tensor) -> Tensor:
+        ctx.save_for_backward(low, high)
+        # left of zero Φ(x) = exp(−x²/2)·erfcx(−x/√2)/2, and the difference of the squares is a product
+        a, b = (-end.clamp(max=0) / math.sqrt(2) for end in (low, high))
+        left = (b - a) * (a + b) + torch.log(torch.special.erfcx(a) / torch.special.erfcx(b))
+        return torch.where(high <= 0, left, torch.special.log_ndtr(low) - torch.special.log_ndtr(high))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        low, high = ctx.saved_tensors
+        return gradient * _hazard(low), -gradient * _hazard(high)
 
 
 def bisect_quantile(

@@ -66,7 +66,7 @@ def tail_layer(*, conditional: bool = False) -> Layer:
     """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
 
     def build(raw: Tensor) -> Transform:
-        weight = 0.4 * torch.sigmoid(raw)
+        weight = 0.4 * torch.sigmoid(_bounded(raw, 10))
         return StudentTail(weight[..., 0], weight[..., 1])
 
     return Layer((-4.0, -4.0), build, conditional)
@@ -137,26 +137,26 @@ class ConditionalFlow(nn.Module):
 
     def parameters_at(self, signal: Tensor) -> tuple[Tensor, Tensor, list[Transform]]:
         """Location and log-scale of the noise, detector units, and the maps, at each signal."""
-        coordinate = self.standardisation.coordinate(signal)
-        location, log_scale = self.standardisation(coordinate)
-        if self.mean_preserving:
-            location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
-        return signal + location, log_scale, self.transforms(coordinate)
+        with torch.autocast(signal.device.type, enabled=False):
+            coordinate = self.standardisation.coordinate(signal)
+            location, log_scale = self.standardisation(coordinate)
+            if self.mean_preserving:
+                location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
+            return signal + location, log_scale, self.transforms(coordinate)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
         """The maps at each signal coordinate."""
-        with torch.autocast(coordinate.device.type, enabled=False):
-            conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
-            built, bias_at, conditional_at = [], 0, 0
-            for layer in self.layers:
-                size = len(layer.initial)
-                raw = self.bias[bias_at : bias_at + size]
-                if layer.conditional:
-                    raw = raw + conditional[..., conditional_at : conditional_at + size]
-                    conditional_at += size
-                built.append(layer.build(raw))
-                bias_at += size
-            return built
+        conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
+        built, bias_at, conditional_at = [], 0, 0
+        for layer in self.layers:
+            size = len(layer.initial)
+            raw = self.bias[bias_at : bias_at + size]
+            if layer.conditional:
+                raw = raw + conditional[..., conditional_at : conditional_at + size]
+                conditional_at += size
+            built.append(layer.build(raw))
+            bias_at += size
+        return built
 
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual on a grid of signal coordinates, by quadrature."""
@@ -216,7 +216,7 @@ class FlowDistribution(LatentDistribution):
         return super().log_prob(value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        signal = self._signal.expand(*sample_shape, *self.batch_shape)
+        signal = self._signal.expand((*sample_shape, *self.batch_shape))
         if self._flow.tabulate and signal.numel() >= tabulated.LARGE:
             found = tabulated.sample(self._flow, signal, generator)
             if found is not None:

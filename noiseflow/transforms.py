@@ -104,15 +104,15 @@ class StudentTail:
 def _log1p_ratio(t: Tensor) -> Tensor:
     """log(1 + t)/t for t ≥ 0, continued to 1 at 0."""
     small = t < 1e-3
-    safe = torch.where(small, torch.ones_like(t), t)
-    return torch.where(small, 1 - t / 2 + t * t / 3 - t * t * t / 4, torch.log1p(safe) / safe)
+    near, far = torch.where(small, t, torch.zeros_like(t)), torch.where(small, torch.ones_like(t), t)
+    return torch.where(small, 1 - near / 2 + near**2 / 3 - near**3 / 4, torch.log1p(far) / far)
 
 
 def _expm1_ratio(t: Tensor) -> Tensor:
     """(exp(t) − 1)/t for t ≥ 0, continued to 1 at 0."""
     small = t < 1e-3
-    safe = torch.where(small, torch.ones_like(t), t)
-    return torch.where(small, 1 + t / 2 + t * t / 6 + t * t * t / 24, torch.expm1(safe) / safe)
+    near, far = torch.where(small, t, torch.zeros_like(t)), torch.where(small, torch.ones_like(t), t)
+    return torch.where(small, 1 + near / 2 + near**2 / 6 + near**3 / 24, torch.expm1(far) / far)
 
 
 @dataclass(frozen=True)

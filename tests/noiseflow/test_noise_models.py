@@ -7,7 +7,7 @@ import torch
 from scipy import stats
 
 import noiseflow
-from noiseflow.distributions import log_normal_interval
+from noiseflow.distributions import log_normal_cdf, log_normal_interval
 from tests.contracts import check_noise_model, integrate_density
 
 FLOWS = {
@@ -142,3 +142,14 @@ def test_poisson_finds_gain_and_offset_and_allows_every_reading() -> None:
     with_read_noise = observation + 30 * torch.randn(observation.shape, generator=generator)
     model.standardise(signal, with_read_noise)
     assert torch.isfinite(model(signal).log_prob(with_read_noise)).all()
+
+
+@pytest.mark.parametrize("x", [-1e15, -1e8, -100.0, -3.0, 0.0, 4.0, 30.0])
+def test_log_normal_cdf_has_the_right_gradient(x: float) -> None:
+    import mpmath
+
+    mpmath.mp.dps = 60
+    at = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+    log_normal_cdf(at).backward()
+    exact = mpmath.npdf(x) / mpmath.ncdf(x) if x > -1e3 else -mpmath.mpf(x) - 1 / mpmath.mpf(x)
+    assert float(at.grad) == pytest.approx(float(exact), rel=1e-10)

@@ -25,7 +25,7 @@ def test_rounding_and_rails_are_detected() -> None:
     step, low, high = detect_digitisation(((observation * 255).round() / 255).clamp(0, 1))
     assert step == pytest.approx(1 / 255, rel=1e-3)
     assert (low, high) == (0.0, 1.0)
-    assert detect_digitisation((3 * observation).round().clamp(min=1)) == (1.0, 1.0, math.inf)
+    assert detect_digitisation((3 * observation).round().clamp(min=2)) == (1.0, 2.0, math.inf)
 
 
 def test_simplest_sufficient_model_is_chosen() -> None:
