@@ -219,7 +219,7 @@ def _write_tiff(path: Path, data: NDArray[Any], voxel_size: tuple[float, float, 
     import tifffile
 
     if voxel_size is None:
-        tifffile.imwrite(path, data)
+        tifffile.imwrite(path, data, photometric="minisblack")  # or a stack of three would be stored as colour
         return
     if data.dtype == np.float64:
         data = data.astype(np.float32)
