@@ -129,7 +129,7 @@ def _log_poisson(count: Tensor, rate: Tensor) -> Tensor:
     positive, safe = positive_rate(rate)
     shifted = count + 0.5
     u = (shifted - safe) / safe
-    at = count.clamp(max=1e5)  # beyond, the remainder is below 1e-6 and constant over any window
+    at = count.clamp(max=1e7)  # beyond, the remainder changes by less than 1e-8
     remainder = torch.lgamma(at + 1) - (at + 0.5) * (torch.log(at + 0.5) - 1)
     deviance = safe * ((1 + u) * torch.log1p(u) - u)
     none = torch.where(count > 0, torch.full_like(rate, -1e300), -rate)
