@@ -192,7 +192,7 @@ def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module
 
 def _held_out_nll(task: _Task, noise_model: nn.Module, weight: float) -> float:
     task.signal_model.weight = weight
-    history = task.fit(noise_model, num_steps=40, standardise=False).history
+    history = task.fit(noise_model, num_steps=100, standardise=False).history
     return list(history.values())[-1]
 
 
