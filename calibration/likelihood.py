@@ -18,7 +18,8 @@ class DetectorLikelihood:
     An observation is rounded gain·Poisson((signal − offset)/gain) + offset + gain·read_noise·normal. Its residual from a
     signal estimate that is noisy itself has the characteristic function of both noises together; the Fourier transform
     of that gives the mass of every bin exactly, for Poisson counts of any size. The signals within a level spread as a
-    gamma distribution of the measured variance.
+    gamma distribution of the measured variance. Rounding counts as independent uniform noise, which it is while
+    gain·read noise exceeds half a step; below that, intervals are too narrow.
 
     Args:
         levels: from `collect_levels`.
