@@ -161,7 +161,7 @@ def log_normal_cdf(x: Tensor) -> Tensor:
     return found
 
 
-def _hazard(x: Tensor) -> Tensor:
+def normal_hazard(x: Tensor) -> Tensor:
     """φ(x)/Φ(x), the derivative of log Φ(x)."""
     left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
     right = torch.exp(-0.5 * x * x - _LOG_SQRT_2PI) / torch.special.ndtr(x.clamp(min=0))
@@ -172,12 +172,13 @@ class _LogCdf(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
-        return torch.special.log_ndtr(x)
+        value: Tensor = torch.special.log_ndtr(x)
+        return value
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return gradient * _hazard(x)
+        return gradient * normal_hazard(x)
 
 
 class _LogRatio(torch.autograd.Function):
@@ -192,9 +193,9 @@ class _LogRatio(torch.autograd.Function):
         return torch.where(high <= 0, left, torch.special.log_ndtr(low) - torch.special.log_ndtr(high))
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         low, high = ctx.saved_tensors
-        return gradient * _hazard(low), -gradient * _hazard(high)
+        return gradient * normal_hazard(low), -gradient * normal_hazard(high)
 
 
 def bisect_quantile(

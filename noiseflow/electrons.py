@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from noiseflow.distributions import log_normal_interval
+from noiseflow.distributions import log_normal_cdf, log_normal_interval
 from noiseflow.electron_contour import (
     contour_log_interval,
     contour_log_mass,
@@ -110,15 +110,6 @@ def _log_difference_of_tails(low: Tensor, high: Tensor, rate: Tensor, read_noise
     return torch.where(across, torch.log1p(-outside), difference)
 
 
-def log_ndtr(value: Tensor) -> Tensor:
-    """log Φ(value) whose gradient, unlike that of torch's own, stays finite however far the tail."""
-    tail = value < -1
-    x = torch.where(tail, -value, torch.ones_like(value)) / math.sqrt(2)
-    far = torch.log(torch.special.erfcx(x) / 2) - x * x
-    near: Tensor = torch.special.log_ndtr(torch.where(tail, torch.zeros_like(value), value))
-    return torch.where(tail, far, near)
-
-
 def _log1mexp(value: Tensor) -> Tensor:
     """log(1 − exp(value)) for value < 0."""
     return torch.log1p(-torch.exp(value))
@@ -171,7 +162,7 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
     side = torch.where(upper, 1.0, -1.0).to(residual)
 
     def log_part(count: Tensor) -> Tensor:
-        return log_ndtr(side * (count - rate - residual) / read_noise)
+        return log_normal_cdf(side * (count - rate - residual) / read_noise)
 
     inside = _lattice_sum(start, near + far + 1, rate, log_part)
     return torch.logaddexp(inside, _log_full_mass(start, near + far + 1, rate, upper))

@@ -178,6 +178,8 @@ class _Loop:
         table = self._table() if joint and tabulate and self.train.numel() >= _TABLE_COUNT else None
         check_every = max(1, num_steps // 20)
         good = self._models()
+        if self.done == 0:
+            self._judge(0)  # a good start must not be lost to worse steps
         try:
             for step in range(self.done + 1, num_steps + 1):
                 self._set_rates(_LAST_RATE ** ((step - 1) / num_steps) / 2**self.result.recoveries)
@@ -202,8 +204,6 @@ class _Loop:
             if checkpoint is not None:
                 checkpoint(self.state())
             raise
-        if not self.optimisers:
-            self._judge(0)
         if self.best is not None:
             self._load_models(self.best)
             self.result.held_out_nll = self.held_out_nll()

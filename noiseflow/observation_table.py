@@ -98,7 +98,7 @@ class ObservationTable:
 
     def log_prob(self, signal: Tensor) -> Tensor:
         """Log-likelihood of each pixel at (N,) signals, differentiable in the signal."""
-        found: Tensor = _Lookup.apply(signal, self)
+        found: Tensor = _Lookup.apply(signal, self)  # type: ignore[no-untyped-call]
         return found
 
     def lookup(self, signal: Tensor, part: slice = slice(None)) -> tuple[Tensor, Tensor]:
@@ -134,6 +134,6 @@ class _Lookup(torch.autograd.Function):
         return value
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (slope,) = ctx.saved_tensors
         return gradient * slope, None

@@ -9,8 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import NoiseDistribution, log_normal_interval, normal_quadrature
-from noiseflow.electrons import log_density, log_ndtr, log_tail
+from noiseflow.distributions import (
+    NoiseDistribution,
+    log_normal_cdf,
+    log_normal_interval,
+    normal_hazard,
+    normal_quadrature,
+)
+from noiseflow.electrons import log_density, log_tail
 from noiseflow.flow import ConditionalFlow, _inverse, affine_layer, spline_layer
 from noiseflow.physical import PoissonGaussian, PoissonGaussianDistribution
 from noiseflow.transforms import Transform
@@ -185,10 +191,6 @@ def ndtri_exp(log_probability: Tensor) -> Tensor:
         far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
         start = torch.special.ndtri(torch.exp(torch.where(deep, -1.0, log_probability)))
         z = torch.where(deep, -torch.sqrt(far - torch.log(2 * math.pi * far)), start)
-        z = z - (log_ndtr(z) - log_probability) / _hazard(z)
-        hazard = _hazard(z)
-    return z - (log_ndtr(z) - log_probability) / hazard
-
-
-def _hazard(z: Tensor) -> Tensor:
-    return torch.exp(-0.5 * z * z - _LOG_SQRT_2PI - log_ndtr(z))
+        z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
+        hazard = normal_hazard(z)
+    return z - (log_normal_cdf(z) - log_probability) / hazard

@@ -171,10 +171,10 @@ def _make_likelihood(
         rows = Rows(limits[0], max(limits[1], limits[0] + 1e-6 * (1 + abs(limits[0]))), num_rows)
         columns = Columns.of(noise_model, torch.tensor(limits[2:]).to(observation), rows, num_columns)
         signals = rows.signals(observation)
-        table = log_likelihood(noise_model, signals, columns.values(signals), between_rails=True)[
-            None, None
-        ].contiguous()
-        if mean_error(_look_up(rows, columns, table, signal[part], observation[part]), exact) <= tolerance / 2:  # a sample of the pixels measured it
+        values = log_likelihood(noise_model, signals, columns.values(signals), between_rails=True)
+        table = values[None, None].contiguous()
+        error = mean_error(_look_up(rows, columns, table, signal[part], observation[part]), exact)
+        if error <= tolerance / 2:  # half, because a sample of the pixels measured it
             return rows, columns, table
     return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -39,7 +40,10 @@ def integrate_density(model: nn.Module, signal: float, *, tolerance: float = 1e-
         rough &= (middle > left) & (middle < right)
         total += float(simpson[~rough].sum())
         left, right = torch.cat([left[rough], middle[rough]]), torch.cat([middle[rough], right[rough]])
-        at_left, at_right = torch.cat([at_left[rough], at_middle[rough]]), torch.cat([at_middle[rough], at_right[rough]])
+        at_left, at_right = (
+            torch.cat([at_left[rough], at_middle[rough]]),
+            torch.cat([at_middle[rough], at_right[rough]]),
+        )
     return total
 
 
@@ -65,7 +69,9 @@ def check_sampler(model: nn.Module, signals: Tensor, draws: Tensor) -> None:
 
     for column in range(signals.numel()):
         observed = draws[:, column].contiguous()
-        u = probability_integral_transform(model, signals[column].expand(observed.shape), observed, np.random.default_rng(1))
+        u = probability_integral_transform(
+            model, signals[column].expand(observed.shape), observed, np.random.default_rng(1)
+        )
         assert kolmogorov_smirnov(u) < 2.5 / math.sqrt(u.size)
 
 
@@ -92,6 +98,8 @@ def check_intervals(distribution, draws: Tensor) -> None:
     inner = torch.quantile(draws, torch.tensor([0.1, 0.5, 0.9], dtype=draws.dtype), dim=0) + 1e-4 * draws.std(0)
     infinity = torch.full_like(inner[:1], math.inf)
     edges = torch.cat([-infinity, inner, infinity])
-    masses = torch.stack([distribution.log_interval_prob(a, b).exp() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    masses = torch.stack(
+        [distribution.log_interval_prob(a, b).exp() for a, b in itertools.pairwise(edges)]
+    )
     assert torch.allclose(masses.sum(0), torch.ones_like(masses[0]), atol=1e-6)
     assert torch.allclose(masses[0], distribution.cdf(inner[0]), atol=1e-6)
