@@ -86,6 +86,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     level = ring_mean(long, trusted, inner=0, blur=1.5)
     trusted &= clear_of_rails(long, level, trusted)
     _require_pixels(trusted, pair)
+    _require_separate(pair, long, trusted)
     scaling = fit_scaling(pair.short, long, trusted)
     free = trusted & clear_of_rails(pair.short, scaling.slope * level + scaling.intercept, trusted, deviations=3.0)
     if MINIMUM_PIXELS <= free.sum() < trusted.sum():
@@ -134,11 +135,15 @@ def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
         )
 
 
-def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
-    scatter = float(total(signal).mean())
-    if scatter <= 1e-12 * float(np.var(signal)):
+def _require_separate(pair: ExposurePair, long: Image, trusted: Mask) -> None:
+    """Frames that differ by a scale and an offset alone have no noise between them."""
+    correlation = float(np.corrcoef(pair.short[trusted], long[trusted])[0, 1])
+    if 1 - correlation**2 < 1e-9:
         raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
-    share = float(own(signal).mean()) / scatter
+
+
+def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
+    share = float(own(signal).mean()) / float(total(signal).mean())
     if share > LARGEST_SHARE:
         raise ValueError(
             f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); swap "
