@@ -66,7 +66,8 @@ def evaluate(
 
     out = Output(json)
     where = choose_device(device)
-    clean, noisy = (tensor.to(where) for tensor in _read_pairs(signal, observation))
+    pairs = _read_pairs(signal, observation)
+    clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
     models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
     if baselines:
         # NumPy's stream, not torch's: noise that `sample` drew with the same seed must not decide which pixels judge
@@ -79,12 +80,19 @@ def evaluate(
             models[type(baseline).__name__] = baseline
     results = {name: metrics.evaluate(item, clean, noisy, seed=seed) for name, item in models.items()}
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
-    out.result({"models": {name: asdict(result) for name, result in results.items()}, "num_pixels": clean.numel()})
+    structures = [metrics.spatial_structure(models["model"], *(image.to(where) for image in pair)) for pair in pairs]
+    for path, structure in zip(observation, structures, strict=True):
+        out.line(f"{path}: {structure.in_words()}")
+    out.result(
+        {
+            "models": {name: asdict(result) for name, result in results.items()},
+            "num_pixels": clean.numel(),
+            "spatial": [asdict(structure) for structure in structures],
+        }
+    )
 
 
-def _read_pairs(signals: list[Path], observations: list[Path]) -> tuple[Tensor, Tensor]:
-    import torch
-
+def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Tensor, Tensor]]:
     from noiseflow import io
 
     if len(signals) != len(observations):
@@ -100,8 +108,8 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> tuple[Tensor, 
             raise ValueError(
                 f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes"
             )
-        pairs.append((_tensor(clean).reshape(-1), _tensor(noisy).reshape(-1)))
-    return torch.cat([clean for clean, _ in pairs]), torch.cat([noisy for _, noisy in pairs])
+        pairs.append((_tensor(clean), _tensor(noisy)))
+    return pairs
 
 
 def _sample(noise_model: nn.Module, signal: Tensor, seed: int) -> Tensor:

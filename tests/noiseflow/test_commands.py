@@ -39,6 +39,7 @@ def test_evaluate_with_baselines(run, model: Path, clean: Path, tmp_path: Path) 
     result = run("evaluate", model, "--signal", clean, "--observation", noisy, "--baselines")
     assert result["models"]["model"]["nll"] == pytest.approx(0.5 * np.log(2 * np.pi * np.e * 0.01), abs=0.1)
     assert set(result["models"]) == {"model", "Gaussian", "Poisson"}
+    assert result["spatial"][0]["suffices"]
 
 
 @pytest.mark.parametrize("bad", ["missing", "empty", "nan", "truncated", "not a model", "folder", "wrong suffix"])
