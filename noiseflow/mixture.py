@@ -89,8 +89,13 @@ class MixtureDistribution(NoiseDistribution):
         probability: Tensor = (self.log_weight.exp() * torch.special.ndtr(self._standard(value))).sum(-1)
         return probability
 
+    def _standard_bound(self, bound: Tensor) -> Tensor:
+        finite = torch.isfinite(bound)  # infinity times a derivative would be NaN
+        inside = self._standard(torch.where(finite, bound, torch.zeros_like(bound)))
+        return torch.where(finite[..., None], inside, bound[..., None])
+
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        masses = log_normal_interval(self._standard(low), self._standard(high))
+        masses = log_normal_interval(self._standard_bound(low), self._standard_bound(high))
         return torch.logsumexp(self.log_weight + masses, -1)
 
     def icdf(self, value: Tensor) -> Tensor:

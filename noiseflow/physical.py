@@ -124,8 +124,15 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return self._as(value, self.log_both_tails(value)[0].exp())
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        (bottom, rate), (top, _) = self.electrons(low), self.electrons(high)
-        return self._as(low, log_interval(bottom, top, rate, self.read_noise))
+        bottom, top = self._bound(low), self._bound(high)
+        return self._as(low, log_interval(bottom, top, self.rate.expand_as(bottom), self.read_noise))
+
+    def _bound(self, value: Tensor) -> Tensor:
+        """Residual of a bound, electrons; an infinite one moves to where nothing is left beyond it, without a gradient."""
+        finite = torch.isfinite(value)
+        residual, rate = self.electrons(torch.where(finite, value, torch.zeros_like(value)))
+        end = (40 * torch.sqrt(rate + self.read_noise**2) + 100).detach()
+        return torch.where(finite, residual, torch.where(value > 0, end, -end))
 
     def icdf(self, value: Tensor) -> Tensor:
         reach = 40 * self.variance.sqrt().double() + 40 * self.gain

@@ -99,10 +99,8 @@ class Analytic(nn.Module):
         return noiseflow.baselines.GaussianDistribution(signal, torch.log(self.scale(signal)))
 
 
-def candidates() -> dict[str, nn.Module]:
-    """All noise models, simplest first."""
-    names = ("Gaussian", "SignalDependentGaussian", "PoissonGaussian", "Mixture", "RadialFlow", "SplineFlow", "PhysicsFlow")
-    return {name: getattr(noiseflow, name)() for name in names if name in dir(noiseflow)}
+MODELS = ("Gaussian", "SignalDependentGaussian", "PoissonGaussian", "Mixture", "RadialFlow", "SplineFlow", "PhysicsFlow")
+"""All noise models, simplest first."""
 
 
 def clean_image(low: float, high: float) -> Tensor:
@@ -112,7 +110,7 @@ def clean_image(low: float, high: float) -> Tensor:
     return low + (high - low) * field
 
 
-def accuracy(output: Output, only: list[str], seed: int, size: int) -> list[dict[str, object]]:
+def accuracy(output: Output, only: list[str], models: list[str], seed: int, size: int) -> list[dict[str, object]]:
     """Fit every model to every noise; print and return one row per model and noise."""
     rows: list[dict[str, object]] = []
     for name, (truth, signals) in truths().items():
@@ -122,7 +120,7 @@ def accuracy(output: Output, only: list[str], seed: int, size: int) -> list[dict
         with torch.no_grad():
             noisy = truth(clean).sample(generator=torch.Generator().manual_seed(seed))
             fresh = truth(clean).sample(generator=torch.Generator().manual_seed(seed + 1000)).reshape(-1)
-        found = select(clean, noisy, candidates=candidates(), seed=seed)
+        found = select(clean, noisy, candidates={model: getattr(noiseflow, model)() for model in models}, seed=seed)
         for candidate in found.candidates:
             kl, error = metrics.kl_divergence(truth, candidate.model, clean.reshape(-1), seed=seed + 1000)
             divergence = metrics.divergence(candidate.model, clean.reshape(-1), fresh)
@@ -196,16 +194,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", default="all", choices=("all", "accuracy", "speed"))
     parser.add_argument("--noise", action="append", default=[], help="only this noise; may be repeated")
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=SIDE, choices=(64, 128, 256, 512), help="side of the image")
     parser.add_argument("--out", type=Path, default=None, help="JSON file; by default the results folder for a full run")
     options = parser.parse_args()
-    output, results = Output(False), {"machine": {"torch": torch.__version__, "threads": torch.get_num_threads()}}
-    results["machine"] |= {"processor": platform.machine(), "python": platform.python_version()}
+    output = Output(False)
+    machine = {"processor": platform.machine(), "python": platform.python_version(), "torch": torch.__version__}
+    results: dict[str, object] = {"machine": machine | {"threads": torch.get_num_threads()}}
     if options.what in ("all", "speed"):
         results["speed"] = speed(output)
     if options.what in ("all", "accuracy"):
-        results["accuracy"] = accuracy(output, options.noise, options.seed, options.size)
+        results["accuracy_size"] = options.size
+        results["accuracy"] = accuracy(output, options.noise, options.models, options.seed, options.size)
     target = options.out or (RESULTS if options.what == "all" and not options.noise else None)
     if target is not None:
         target.parent.mkdir(parents=True, exist_ok=True)

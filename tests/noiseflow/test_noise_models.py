@@ -153,3 +153,17 @@ def test_log_normal_cdf_has_the_right_gradient(x: float) -> None:
     log_normal_cdf(at).backward()
     exact = mpmath.npdf(x) / mpmath.ncdf(x) if x > -1e3 else -mpmath.mpf(x) - 1 / mpmath.mpf(x)
     assert float(at.grad) == pytest.approx(float(exact), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", ["PoissonGaussian", "Mixture", "PhysicsFlow", *(n for n in FLOWS), "Gaussian"])
+@pytest.mark.parametrize("step", [0.0, 1 / 32])
+def test_every_model_can_be_fitted_behind_rails(name: str, step: float) -> None:
+    inner = getattr(noiseflow, name)() if hasattr(noiseflow, name) else FLOWS[name]()
+    model = noiseflow.Digitised(inner, step=step, low=0.0, high=1.0)
+    signal = torch.linspace(0, 1, 500)
+    reading = signal + 0.2 * torch.randn(500, generator=torch.Generator().manual_seed(0))
+    observation = ((reading / step).round() * step if step else reading).clamp(0, 1)
+    model.standardise(signal, observation)
+    model(signal).log_prob(observation).mean().backward()
+    for parameter in model.parameters():
+        assert parameter.grad is None or bool(torch.isfinite(parameter.grad).all())
