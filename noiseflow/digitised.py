@@ -13,6 +13,7 @@ from noiseflow import tabulated
 from noiseflow.distributions import NoiseDistribution
 
 _MOMENT_NODES = 257
+_LEAST_CLEAR, _RAILED = 256, 0.02
 _MOST_LEVELS = 4096
 
 
@@ -47,8 +48,21 @@ class Digitised(nn.Module):
         return Digitised(self.model, step=self.step)
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Standardise the model inside; see its own method."""
-        self.model.standardise(signal, observation)  # type: ignore[operator]
+        """Standardise the model inside, on the (N,) pixels whose signal lies clear of the rails where there are enough."""
+        clear = self._clear_of_rails(signal, observation)
+        if int(clear.sum()) < max(_LEAST_CLEAR, 0.1 * clear.numel()):
+            clear = torch.ones_like(clear)
+        span = {"span": (float(signal.min()), float(signal.max()))} if hasattr(self.model, "standardisation") else {}
+        self.model.standardise(signal[clear], observation[clear], **span)  # type: ignore[operator]
+
+    def _clear_of_rails(self, signal: Tensor, observation: Tensor) -> Tensor:
+        """Pixels among whose 64 equally populated groups by signal hardly any reading is clipped."""
+        railed = (observation <= self.low) | (observation >= self.high)
+        clear = torch.ones_like(railed)
+        for group in torch.tensor_split(torch.argsort(signal), 64):
+            if group.numel() and float(railed[group].float().mean()) > _RAILED:
+                clear[group] = False
+        return clear
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""

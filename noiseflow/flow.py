@@ -131,9 +131,9 @@ class ConditionalFlow(nn.Module):
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
         return FlowDistribution(self, signal)
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Measure and store the scaling of the data; both (N,), detector units."""
-        self.standardisation.set_from(signal, observation)
+    def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
+        """Measure and store the scaling of the data; see `Standardisation.set_from`."""
+        self.standardisation.set_from(signal, observation, span)
 
     def parameters_at(self, signal: Tensor) -> tuple[Tensor, Tensor, list[Transform]]:
         """Location and log-scale of the noise, detector units, and the maps, at each signal."""

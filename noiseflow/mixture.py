@@ -54,9 +54,9 @@ class Mixture(nn.Module):
         means = (signal + location)[..., None] + torch.exp(log_scale)[..., None] * centre
         return MixtureDistribution(signal, log_weight, means, log_width + log_scale[..., None])
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Measure and store the scaling of the data; both (N,), detector units."""
-        self.standardisation.set_from(signal, observation)
+    def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
+        """Measure and store the scaling of the data; see `Standardisation.set_from`."""
+        self.standardisation.set_from(signal, observation, span)
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -86,7 +87,8 @@ def select(
     """
     step, low, high = digitisation = detect_digitisation(observation)
     signal, observation = signal.reshape(-1).float(), observation.reshape(-1).float()
-    apart = torch.rand(signal.shape, generator=torch.Generator().manual_seed(seed + 2**40)) < held_out
+    # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge
+    apart = torch.from_numpy(np.random.default_rng(seed).random(signal.shape[0]) < held_out)
     models = dict(default_candidates() if candidates is None else candidates)
     if step > 0 or math.isfinite(low) or math.isfinite(high):
         models = {name: Digitised(model, step, low, high) for name, model in models.items()}

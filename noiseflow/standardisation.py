@@ -43,8 +43,12 @@ class Standardisation(nn.Module):
         return interpolate_linear(self.location, coordinate), interpolate_linear(self.log_scale, coordinate)
 
     @torch.no_grad()
-    def set_from(self, signal: Tensor, observation: Tensor) -> None:
+    def set_from(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
         """Measure range, location and scale on (N,) signals and observations; robust to outliers and empty levels.
+
+        Args:
+            signal, observation: (N,), detector units.
+            span: range of signals to cover; that of `signal` by default.
 
         Raises:
             ValueError: the observations equal the signals, so that there is no noise to learn.
@@ -55,7 +59,7 @@ class Standardisation(nn.Module):
             raise ValueError(
                 "observation − signal is constant: there is no noise to learn; check that the two images differ"
             )
-        low, high = signal.min(), signal.max()
+        low, high = (signal.min(), signal.max()) if span is None else (signal.new_tensor(end) for end in span)
         if high <= low:  # one signal level: give the coordinate a width of its own
             low, high = low - spread, high + spread
         self.signal_low.copy_(low)
