@@ -63,6 +63,7 @@ def evaluate(
 
     import noiseflow
     from noiseflow import metrics
+    from noiseflow.spatial import spatial_structure
 
     out = Output(json)
     where = choose_device(device)
@@ -80,7 +81,7 @@ def evaluate(
             models[type(baseline).__name__] = baseline
     results = {name: metrics.evaluate(item, clean, noisy, seed=seed) for name, item in models.items()}
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
-    structures = [metrics.spatial_structure(models["model"], *(image.to(where) for image in pair)) for pair in pairs]
+    structures = [spatial_structure(models["model"], *(image.to(where) for image in pair)) for pair in pairs]
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
     out.result(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def simulate(
     folder: Annotated[Path, typer.Argument(help="New folder for tilts.mrc, tilts.rawtlt, clean.mrc and truth.mrc.")],
     size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
-    tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees.")] = "-59.5:59:1.5",
+    tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees, both ends included.")] = "-59.5:57.5:1.5",
     phantom: Annotated[str, typer.Option(help="shells, virions, filaments, particles or slab.")] = "shells",
     noise: Annotated[
         str, typer.Option(help="clipped, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file.")

@@ -23,7 +23,7 @@ def draw(path: Path, *, size: int = 64) -> None:
     """Simulate, reconstruct and draw."""
     acquisition = ACQUISITIONS["clipped"]
     truth = make_phantom("shells", size, generator=np.random.default_rng(3))
-    clean, unit = clean_tilt_series(truth, tilt_range("-59.5:59:1.5"), acquisition=acquisition)
+    clean, unit = clean_tilt_series(truth, tilt_range("-59.5:57.5:1.5"), acquisition=acquisition)
     noisy = add_noise(clean, acquisition.noise(), seed=1)
     grid = VolumeGrid.of(noisy, size)
     joint = JointReconstructor()(noisy, grid)

@@ -9,6 +9,7 @@ import noiseflow
 from noiseflow import metrics
 from noiseflow.digitised import detect_digitisation
 from noiseflow.selection import select
+from noiseflow.spatial import spatial_structure
 
 
 def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -63,7 +64,7 @@ def test_spatial_structure_is_seen(kind: str) -> None:
         noise = noise + 0.3 * torch.randn((200, 1), generator=generator)
     elif kind == "neighbours":
         noise = noise + 0.2 * torch.roll(noise, 1, dims=1)
-    found = metrics.spatial_structure(noiseflow.Gaussian(float(noise.std()) * 0.1), signal, signal + 0.1 * noise)
+    found = spatial_structure(noiseflow.Gaussian(float(noise.std()) * 0.1), signal, signal + 0.1 * noise)
     assert found.suffices == (kind == "none")
     if kind == "rows":
         assert found.rows == pytest.approx(1 + 0.09 * 300, rel=0.3)
