@@ -17,6 +17,7 @@ test-slow: .venv/test-ready
 
 check: .venv/test-ready
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 .venv/bin/python:

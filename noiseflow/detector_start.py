@@ -37,7 +37,9 @@ def find_detector(signal: Tensor, observation: Tensor) -> Detector:
     signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
     variance = float((observation - signal).square().mean())
     if not variance > 0:
-        raise ValueError("observation − signal is 0 everywhere: there is no noise to learn; check that the two images differ")
+        raise ValueError(
+            "observation − signal is 0 everywhere: there is no noise to learn; check that the two images differ"
+        )
     gain = _slope(signal, observation)
     starts = [*_smooth_starts(signal, variance, gain), *_comb_starts(signal, observation, variance, gain)]
     few = _part(signal, _SCORED)
@@ -146,7 +148,8 @@ def _distinct(ranked: list[Detector]) -> list[Detector]:
     kept: list[Detector] = []
     for start in ranked:
         near = any(
-            abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain for one in kept
+            abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain
+            for one in kept
         )
         if not near:
             kept.append(start)

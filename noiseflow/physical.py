@@ -143,7 +143,9 @@ class PoissonGaussianDistribution(NoiseDistribution):
         with torch.no_grad():
             rate = self._as(self.signal, self.rate).expand(*sample_shape, *self.batch_shape)
             normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
-            gain, offset, read_noise = (self._as(self.signal, each) for each in (self.gain, self.offset, self.read_noise))
+            gain, offset, read_noise = (
+                self._as(self.signal, each) for each in (self.gain, self.offset, self.read_noise)
+            )
             return torch.poisson(rate, generator=generator).add_(normal.mul_(read_noise)).mul_(gain).add_(offset)
 
     def _as(self, like: Tensor, result: Tensor) -> Tensor:

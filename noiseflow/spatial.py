@@ -42,7 +42,9 @@ class SpatialStructure:
 @torch.no_grad()
 def spatial_structure(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> SpatialStructure:
     """Residual row, column and neighbour correlation of (y, x) images, or stacks of them, under a noise model."""
-    u = probability_integral_transform(noise_model, signal.reshape(-1), observation.reshape(-1), np.random.default_rng(0))
+    u = probability_integral_transform(
+        noise_model, signal.reshape(-1), observation.reshape(-1), np.random.default_rng(0)
+    )
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).reshape(signal.shape).numpy()
     z = (z - z.mean()) / z.std()
     height, width = z.shape[-2:]

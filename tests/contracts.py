@@ -98,8 +98,6 @@ def check_intervals(distribution, draws: Tensor) -> None:
     inner = torch.quantile(draws, torch.tensor([0.1, 0.5, 0.9], dtype=draws.dtype), dim=0) + 1e-4 * draws.std(0)
     infinity = torch.full_like(inner[:1], math.inf)
     edges = torch.cat([-infinity, inner, infinity])
-    masses = torch.stack(
-        [distribution.log_interval_prob(a, b).exp() for a, b in itertools.pairwise(edges)]
-    )
+    masses = torch.stack([distribution.log_interval_prob(a, b).exp() for a, b in itertools.pairwise(edges)])
     assert torch.allclose(masses.sum(0), torch.ones_like(masses[0]), atol=1e-6)
     assert torch.allclose(masses[0], distribution.cdf(inner[0]), atol=1e-6)

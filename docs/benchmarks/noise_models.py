@@ -35,7 +35,9 @@ SIDE = 512
 class Truth(nn.Module):
     """Known noise: `shape` is a torch distribution of standardised noise, scaled by `scale(signal)` around the signal."""
 
-    def __init__(self, shape: torch.distributions.Distribution, scale: Callable[[Tensor], Tensor], mean: float = 0.0) -> None:
+    def __init__(
+        self, shape: torch.distributions.Distribution, scale: Callable[[Tensor], Tensor], mean: float = 0.0
+    ) -> None:
         super().__init__()
         self.shape, self.scale, self.mean = shape, scale, mean
 
@@ -99,7 +101,15 @@ class Analytic(nn.Module):
         return noiseflow.baselines.GaussianDistribution(signal, torch.log(self.scale(signal)))
 
 
-MODELS = ("Gaussian", "SignalDependentGaussian", "PoissonGaussian", "Mixture", "RadialFlow", "SplineFlow", "PhysicsFlow")
+MODELS = (
+    "Gaussian",
+    "SignalDependentGaussian",
+    "PoissonGaussian",
+    "Mixture",
+    "RadialFlow",
+    "SplineFlow",
+    "PhysicsFlow",
+)
 """All noise models, simplest first."""
 
 
@@ -197,7 +207,9 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=list(MODELS), choices=MODELS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=SIDE, choices=(64, 128, 256, 512), help="side of the image")
-    parser.add_argument("--out", type=Path, default=None, help="JSON file; by default the results folder for a full run")
+    parser.add_argument(
+        "--out", type=Path, default=None, help="JSON file; by default the results folder for a full run"
+    )
     options = parser.parse_args()
     output = Output(False)
     machine = {"processor": platform.machine(), "python": platform.python_version(), "torch": torch.__version__}

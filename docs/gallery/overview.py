@@ -1,6 +1,6 @@
 """Draws the README's picture: a noisy tilt series, two reconstructions of it, and the noise that was learnt on the way.
 
-    python docs/gallery/overview.py docs/images/overview.png
+python docs/gallery/overview.py docs/images/overview.png
 """
 
 from __future__ import annotations

@@ -28,8 +28,12 @@ def noisy(seed: int, scale: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_true_model_sits_on_its_floors() -> None:
     found = [metrics.evaluate(noiseflow.Gaussian(0.1), *noisy(seed)) for seed in range(6)]
-    assert np.mean([e.overall.jsd for e in found]) == pytest.approx(np.mean([e.overall.jsd_floor for e in found]), rel=0.2)
-    assert np.mean([1 - e.overall.bc for e in found]) == pytest.approx(np.mean([1 - e.overall.bc_floor for e in found]), rel=0.2)
+    assert np.mean([e.overall.jsd for e in found]) == pytest.approx(
+        np.mean([e.overall.jsd_floor for e in found]), rel=0.2
+    )
+    assert np.mean([1 - e.overall.bc for e in found]) == pytest.approx(
+        np.mean([1 - e.overall.bc_floor for e in found]), rel=0.2
+    )
     assert np.mean([e.mean_jsd for e in found]) == pytest.approx(np.mean([e.mean_jsd_floor for e in found]), rel=0.1)
     entropy = 0.5 * math.log(2 * math.pi * math.e * 0.01)
     assert all(abs(e.nll - entropy) < 4 * e.nll_error for e in found)

@@ -14,7 +14,9 @@ SIGNAL = torch.linspace(0, 1, 7)
 
 
 def make(kind: str) -> torch.nn.Module:
-    model = noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0) if kind == "Digitised" else kinds()[kind]()
+    model = (
+        noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0) if kind == "Digitised" else kinds()[kind]()
+    )
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():

@@ -95,7 +95,14 @@ def mpmath_density(rate: float, read_noise: float, observation: float) -> float:
 
 @pytest.mark.parametrize(
     ("rate", "read_noise", "observation"),
-    [(3.0, 0.2, 5.4), (1e-3, 1.499, -6.0), (1e-3, 1.501, 9.0), (22.0, 50.0, 200.0), (1e4, 0.05, 10321.37), (40.0, 2.0, 3.0)],
+    [
+        (3.0, 0.2, 5.4),
+        (1e-3, 1.499, -6.0),
+        (1e-3, 1.501, 9.0),
+        (22.0, 50.0, 200.0),
+        (1e4, 0.05, 10321.37),
+        (40.0, 2.0, 3.0),
+    ],
 )
 def test_density_agrees_with_mpmath(rate: float, read_noise: float, observation: float) -> None:
     found = log_density(scalar(observation - rate).reshape(1), scalar(rate).reshape(1), scalar(read_noise))
@@ -132,10 +139,15 @@ def gauss_legendre(num_panels: int) -> tuple[Tensor, Tensor]:
 def test_value_and_gradient_are_finite_everywhere(read_noise: float, dtype: torch.dtype) -> None:
     model = noiseflow.PoissonGaussian(gain=1.0, offset=0.0, read_noise=read_noise).to(dtype)
     levels = torch.tensor([-1e6, -3.0, 0.0, 1e-38, 1e-12, 0.4, 7.0, 300.0, 1e6, 1e9], dtype=dtype)
-    signal, observation = (each.flatten().clone().requires_grad_() for each in torch.meshgrid(levels, levels, indexing="ij"))
+    signal, observation = (
+        each.flatten().clone().requires_grad_() for each in torch.meshgrid(levels, levels, indexing="ij")
+    )
     distribution = model(signal)
     half = 0.5 + 1e-6 * observation.detach().abs()
-    for value in (distribution.log_prob(observation), distribution.log_interval_prob(observation - half, observation + half)):
+    for value in (
+        distribution.log_prob(observation),
+        distribution.log_interval_prob(observation - half, observation + half),
+    ):
         assert value.dtype == dtype
         assert torch.isfinite(value).all()
         for gradient in torch.autograd.grad(value.sum(), [signal, observation, model.change], retain_graph=True):
@@ -199,7 +211,9 @@ def test_physics_flow_starts_as_its_detector(read_noise: float) -> None:
     assert torch.allclose(found.log_prob(observation), expected.log_prob(observation), rtol=1e-12, atol=1e-9)
     for width in (1e-6, 0.05, 1.0):
         masses = found.log_interval_prob(observation, observation + width)
-        assert torch.allclose(masses, expected.log_interval_prob(observation, observation + width), rtol=1e-12, atol=1e-9)
+        assert torch.allclose(
+            masses, expected.log_interval_prob(observation, observation + width), rtol=1e-12, atol=1e-9
+        )
     assert torch.allclose(found.cdf(observation), expected.cdf(observation), atol=1e-9)
 
 
@@ -225,7 +239,9 @@ def test_physics_flow_gradients_agree_with_differences() -> None:
 
     def functions(signal: Tensor, observation: Tensor, *values: Tensor) -> Tensor:
         changed = held | dict(zip(names, values, strict=True))
-        return torch.func.functional_call(Caller(model), {f"model.{n}": v for n, v in changed.items()}, (signal, observation))
+        return torch.func.functional_call(
+            Caller(model), {f"model.{n}": v for n, v in changed.items()}, (signal, observation)
+        )
 
     inputs = [signal, observation, *(held[name].detach().clone() for name in names)]
     assert torch.autograd.gradcheck(functions, [each.requires_grad_() for each in inputs], eps=1e-6, atol=1e-4)

@@ -34,7 +34,9 @@ def test_likelihood_of_large_inputs(name: str) -> None:
     model, signal, observation = fitted(name)
     with torch.no_grad():
         table = tabulated.log_prob(model, signal, observation)
-        exact = torch.cat([model(s).log_prob(o) for s, o in zip(signal.split(50_000), observation.split(50_000), strict=True)])
+        exact = torch.cat(
+            [model(s).log_prob(o) for s, o in zip(signal.split(50_000), observation.split(50_000), strict=True)]
+        )
         automatic = model(signal).log_prob(observation)
     assert table is not None
     assert torch.equal(automatic, table)

@@ -15,7 +15,9 @@ MODELS = {
     "Gaussian": lambda: noiseflow.Gaussian(),
     "Poisson": lambda: noiseflow.Poisson(),
     "8-bit radial": lambda: noiseflow.Digitised(noiseflow.RadialFlow(), step=1 / 255, low=0.0, high=1.0),
-    "clipped spline": lambda: noiseflow.Digitised(noiseflow.SplineFlow(mean_preserving=True), step=0.0, low=0.0, high=1.0),
+    "clipped spline": lambda: noiseflow.Digitised(
+        noiseflow.SplineFlow(mean_preserving=True), step=0.0, low=0.0, high=1.0
+    ),
 }
 DTYPES = [torch.float32, torch.float64]
 
