@@ -1,4 +1,4 @@
-"""The commands `noiseflow simulate`, `reconstruct` and `compare`. Nothing heavy is imported before a command runs."""
+"""The command `noiseflow reconstruct`, and the door to the others. Nothing heavy is imported before a command runs."""
 
 from __future__ import annotations
 
@@ -9,48 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, progress_bar
+from recon.commands.compare import compare as compare
+from recon.commands.options import load_noise_model, parse_mode
+from recon.commands.simulate import simulate as simulate
 
 if TYPE_CHECKING:
-    from torch import nn
-
     from recon.methods import Outcome
-    from recon.simulation import Acquisition
-    from recon.tilt_series import Mode, TiltSeries
-
-
-def simulate(
-    folder: Annotated[Path, typer.Argument(help="New folder for tilts.mrc, tilts.rawtlt, clean.mrc and truth.mrc.")],
-    size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
-    tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees, both ends included.")] = "-59.5:57.5:1.5",
-    phantom: Annotated[str, typer.Option(help="shells, virions, filaments, particles or slab.")] = "shells",
-    noise: Annotated[
-        str, typer.Option(help="clipped, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file.")
-    ] = "clipped",
-    mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-) -> None:
-    """Simulate a tilt series of a known volume, with known noise."""
-    import numpy as np
-
-    from recon.phantoms import make_phantom
-    from recon.simulation import add_noise, clean_tilt_series, tilt_range
-    from recon.tilt_series import Volume, write_tilt_series
-
-    output = Output(json)
-    angles = tilt_range(tilts)
-    acquisition, noise_model = _acquisition(noise, mode)
-    volume = make_phantom(phantom, size, generator=np.random.default_rng(seed))
-    clean, unit = clean_tilt_series(volume, angles, acquisition=acquisition)
-    noisy = clean if noise_model is None else add_noise(clean, noise_model, seed=seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tilt_series(folder / "tilts.mrc", noisy)
-    write_tilt_series(folder / "clean.mrc", clean)
-    Volume(volume * np.float32(unit)).write(folder / "truth.mrc")
-    output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
-    output.result(
-        {"folder": folder, "tilts": folder / "tilts.mrc", "truth": folder / "truth.mrc", "num_tilts": len(angles)}
-    )
+    from recon.tilt_series import TiltSeries
 
 
 def reconstruct(
@@ -86,10 +51,10 @@ def reconstruct(
     io.check_output(out)
     if report is not None and report.exists() and not report.is_dir():
         raise ValueError(f"{report} is a file; name a folder for the report")
-    tilt_series = read_tilt_series(tilts, angles=angles, mode=_mode(mode))
+    tilt_series = read_tilt_series(tilts, angles=angles, mode=parse_mode(mode))
     if invert_tilt:
         tilt_series = TiltSeries(tilt_series.images, -tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
-    fixed = _load_noise_model(noise_model)
+    fixed = load_noise_model(noise_model)
     started = time.perf_counter()
     with progress_bar(f"reconstruct ({method})", steps or 150, json_mode=json) as progress:
         outcome = run(
@@ -120,56 +85,6 @@ def reconstruct(
         | {"weights_tried": outcome.weights_tried}
         | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
     )
-
-
-def compare(
-    volume: Annotated[Path, typer.Argument(help="Volume to judge.")],
-    reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
-    json: JsonOption = False,
-) -> None:
-    """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
-    import numpy as np
-
-    from noiseflow import io
-    from recon.metrics import SCALINGS, fourier_shell_correlation
-    from recon.metrics import compare as errors_of
-
-    output = Output(json)
-    first, second = io.read(volume).data, io.read(reference).data
-    errors = {scaling: errors_of(first, second, scaling=scaling) for scaling in SCALINGS}
-    rows = [(scaling, f"{e.mse:.3e}", f"{e.psnr:.2f}", f"{e.dssim:.4f}") for scaling, e in errors.items()]
-    output.table(("scaling", "MSE", "PSNR (dB)", "DSSIM"), rows)
-    frequency, correlation = fourier_shell_correlation(first, second)
-    below = np.flatnonzero(correlation[1:] < 0.5)
-    crossing = float(frequency[below[0] + 1]) if below.size else 0.5
-    output.line(f"Fourier shell correlation stays above 0.5 up to {crossing:.3f} cycles per voxel")
-    output.result({"errors": {name: vars(e) for name, e in errors.items()}, "fsc_0.5": crossing, "fsc": correlation})
-
-
-def _mode(text: str) -> Mode:
-    if text not in ("transmission", "linear"):
-        raise ValueError(f"--mode {text}: choose transmission (bright field) or linear (HAADF, EDX)")
-    return "linear" if text == "linear" else "transmission"
-
-
-def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module | None]:
-    from dataclasses import replace
-
-    from recon.simulation import ACQUISITIONS
-
-    acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
-    noise_model = acquisition.noise() if acquisition.noise is not None else None
-    if noise not in ACQUISITIONS:
-        noise_model = _load_noise_model(Path(noise))
-    return acquisition if mode is None else replace(acquisition, mode=_mode(mode)), noise_model
-
-
-def _load_noise_model(path: Path | None) -> nn.Module | None:
-    if path is None:
-        return None
-    import noiseflow
-
-    return noiseflow.load(path)
 
 
 def _save_noise_model(outcome: Outcome, path: Path, source: Path) -> None:

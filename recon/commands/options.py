@@ -1,0 +1,31 @@
+"""What the commands of this package read from their options alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from recon.tilt_series import Mode
+
+
+def parse_mode(text: str) -> Mode:
+    """The mode of image formation that `--mode` names.
+
+    Raises:
+        ValueError: another word.
+    """
+    if text not in ("transmission", "linear"):
+        raise ValueError(f"--mode {text}: choose transmission (bright field) or linear (HAADF, EDX)")
+    return "linear" if text == "linear" else "transmission"
+
+
+def load_noise_model(path: Path | None) -> nn.Module | None:
+    """The noise model in a file, or None without a file. Raises as `noiseflow.load`."""
+    if path is None:
+        return None
+    import noiseflow
+
+    return noiseflow.load(path)
