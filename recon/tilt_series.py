@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from noiseflow import io
 
 Mode = Literal["transmission", "linear"]
-ANGLE_SUFFIXES = (".rawtlt", ".tlt")
 
 
 @dataclass(frozen=True)
@@ -112,13 +111,13 @@ def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode
     """Read a stack and its tilt angles.
 
     Args:
-        path: the stack: MRC, TIFF or ``.npy``.
-        angles: text file with one angle in degrees per line; by default the ``.rawtlt`` or ``.tlt`` file beside the
-            stack.
+        path: the stack, in any format that `noiseflow.io.read` knows.
+        angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
+            ``.mdoc`` beside the stack, or else the angles inside the stack's own file.
         mode: how the images were formed.
 
     Raises:
-        FileNotFoundError: no such file, or no angle file beside the stack.
+        FileNotFoundError: no such file, or no angles beside or inside the stack.
         ValueError: a file cannot be read, or `TiltSeries` refuses what it holds.
     """
     image_file = io.read(path)
@@ -126,33 +125,11 @@ def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed"
         )
-    tilt_angles = read_angles(_angle_file(Path(path)) if angles is None else angles)
+    tilt_angles = io.tilt_angles_of(path, image_file) if angles is None else io.read_angles(angles)
     io.require_finite(image_file.data, path)
     io.require_contrast(image_file.data, path)
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
     return TiltSeries(image_file.data, tilt_angles, pixel_size, mode)
-
-
-def read_angles(path: str | Path) -> NDArray[np.float64]:
-    """Read tilt angles, degrees, one per line; blank lines are skipped.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a line is not a number, or there is none.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"angle file {path} does not exist; check the path")
-    values = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        if line.strip():
-            try:
-                values.append(float(line))
-            except ValueError:
-                raise ValueError(f"{path} line {number}: '{line.strip()[:40]}' is not an angle in degrees") from None
-    if not values:
-        raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")
-    return np.array(values)
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
@@ -164,14 +141,6 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
     with io.atomic_path(angle_path) as partial:
         partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_series.tilt_angles), encoding="utf-8")
     return angle_path
-
-
-def _angle_file(stack: Path) -> Path:
-    for suffix in ANGLE_SUFFIXES:
-        if stack.with_suffix(suffix).is_file():
-            return stack.with_suffix(suffix)
-    names = " or ".join(stack.with_suffix(suffix).name for suffix in ANGLE_SUFFIXES)
-    raise FileNotFoundError(f"no tilt angles: there is no {names} beside {stack}; give the file with --angles")
 
 
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:

@@ -1,10 +1,12 @@
 """Tilt series in and out, and every refusal."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from noiseflow import io
-from recon.tilt_series import TiltSeries, Volume, VolumeGrid, read_angles, read_tilt_series, write_tilt_series
+from recon.tilt_series import TiltSeries, Volume, VolumeGrid, read_tilt_series, write_tilt_series
 
 ANGLES = np.array([-40.0, 0.0, 40.0])
 
@@ -72,13 +74,24 @@ def test_missing_and_broken_angle_files(tmp_path):
     broken = tmp_path / "broken.tlt"
     broken.write_text("1.0\nabc\n")
     with pytest.raises(ValueError, match="line 2: 'abc'"):
-        read_angles(broken)
+        io.read_angles(broken)
     broken.write_text("\n")
     with pytest.raises(ValueError, match="no angles"):
-        read_angles(broken)
+        io.read_angles(broken)
 
 
 def test_angles_are_found_beside_the_stack(tmp_path):
     io.write(tmp_path / "tilts.mrc", images())
     (tmp_path / "tilts.tlt").write_text("-40\n0\n\n40\n")
     np.testing.assert_allclose(read_tilt_series(tmp_path / "tilts.mrc").tilt_angles, ANGLES)
+
+
+def test_microscope_file_reads_with_the_angles_of_its_tags():
+    needle = Path(__file__).parents[3] / "shared" / "data" / "tilt_needle" / "needle_raw.dm3"
+    if not needle.exists():
+        pytest.skip("the raw needle series is not here")
+    series = read_tilt_series(needle, mode="linear")
+    assert series.images.shape == (91, 64, 64)
+    assert series.images.dtype == np.uint16
+    np.testing.assert_allclose(series.tilt_angles, np.arange(-90, 91, 2))
+    assert series.pixel_size == pytest.approx(179.949, rel=1e-5)

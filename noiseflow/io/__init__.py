@@ -1,0 +1,13 @@
+"""Images, tilt angles and alignments in and out. Every output is written beside its target and renamed into place."""
+
+from .angles import read_angles as read_angles
+from .angles import tilt_angles_of as tilt_angles_of
+from .checks import require_contrast as require_contrast
+from .checks import require_finite as require_finite
+from .files import atomic_path as atomic_path
+from .files import check_output as check_output
+from .images import SUFFIXES as SUFFIXES
+from .images import ImageFile as ImageFile
+from .images import read as read
+from .images import read_image as read_image
+from .images import write as write

@@ -1,0 +1,106 @@
+"""Tilt angles: from text files, SerialEM's ``.mdoc``, and whatever lies beside a stack."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.images import ImageFile
+
+RAW_FIRST = (".rawtlt", ".tlt")
+REFINED_FIRST = (".tlt", ".rawtlt")
+
+
+def read_angles(path: str | Path) -> NDArray[np.float64]:
+    """Read tilt angles in degrees, in the order of the stack.
+
+    Args:
+        path: a text file with one angle per line (``.rawtlt``, ``.tlt``; blank lines are skipped), or an ``.mdoc`` file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a line is not a number, or there is none.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"angle file {path} does not exist; check the path")
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
+    if not values:
+        raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")
+    return np.array(values)
+
+
+def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
+    """The tilt angles of a stack: from the angle file beside it, or else from the file itself.
+
+    Args:
+        stack: the file the stack was read from. Beside ``name.st`` are looked for ``name.rawtlt``, ``name.tlt``,
+            ``name.st.mdoc`` and ``name.mdoc``; an aligned stack (``.ali``) takes the refined ``.tlt`` first.
+        image: what was read.
+
+    Returns:
+        (section,) degrees.
+
+    Raises:
+        FileNotFoundError: neither is there.
+        ValueError: the angle file cannot be read.
+    """
+    stack = Path(stack)
+    candidates = _beside(stack)
+    for candidate in candidates:
+        if candidate.is_file():
+            angles = read_angles(candidate)
+            _compare(angles, image.tilt_angles, candidate, stack)
+            return angles
+    if image.tilt_angles is not None:
+        return image.tilt_angles
+    names = ", ".join(candidate.name for candidate in candidates[:2])
+    raise FileNotFoundError(
+        f"no tilt angles: {stack} holds none and there is no {names} or .mdoc beside it; give the file with --angles"
+    )
+
+
+def _beside(stack: Path) -> list[Path]:
+    refined = stack.suffix.lower() == ".ali" or stack.stem.endswith("_ali")
+    stem = stack.with_name(stack.name.removesuffix(stack.suffix).removesuffix("_ali") + ".x")
+    texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
+    return [*texts, stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
+
+
+def _compare(angles: NDArray[np.float64], inside: NDArray[np.float64] | None, angle_file: Path, stack: Path) -> None:
+    if inside is None or len(inside) != len(angles) or np.abs(inside - angles).max() <= 2:
+        return
+    worst = int(np.abs(inside - angles).argmax())
+    warnings.warn(
+        f"{angle_file} says {angles[worst]:g}° for section {worst}, {stack} itself {inside[worst]:g}°; "
+        "the angle file is used",
+        stacklevel=3,
+    )
+
+
+def _angle_lines(lines: list[str], path: Path) -> list[float]:
+    values = []
+    for number, line in enumerate(lines, 1):
+        if line.strip():
+            try:
+                values.append(float(line))
+            except ValueError:
+                raise ValueError(f"{path} line {number}: '{line.strip()[:40]}' is not an angle in degrees") from None
+    return values
+
+
+def _mdoc_angles(lines: list[str], path: Path) -> list[float]:
+    """``TiltAngle`` of every ``[ZValue = n]``, sorted by n: the order of the stack, not of acquisition."""
+    found: dict[int, float] = {}
+    section = None
+    for line in lines:
+        if header := re.fullmatch(r"\s*\[\s*ZValue\s*=\s*(\d+)\s*\]\s*", line):
+            section = int(header[1])
+        elif section is not None and (entry := re.fullmatch(r"\s*TiltAngle\s*=\s*(\S+)\s*", line)):
+            found[section] = _angle_lines([entry[1]], path)[0]
+    return [found[index] for index in sorted(found)]

@@ -1,0 +1,55 @@
+"""Output files: checked before the work, written beside their target, renamed into place when whole."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) -> Path:
+    """Fail now, before long work, where a result could not be written; returns the path.
+
+    Args:
+        path: the file to write.
+        suffixes: allowed ones; by default those of the image formats that `write` knows.
+
+    Raises:
+        ValueError: another suffix, or a folder of that name.
+        FileNotFoundError: the folder does not exist.
+        PermissionError: the folder is not writable.
+    """
+    from noiseflow.io.images import WRITE_SUFFIXES
+
+    suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(
+            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
+        )
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        raise ValueError(f"{path} is a folder; name an output file")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} does not exist; create the folder first")
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(f"{path.parent} is not writable; choose another output folder")
+    return path
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path`, renamed onto it when the block succeeds and removed when it fails."""
+    path = Path(path)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    partial = Path(name)
+    try:
+        yield partial
+        umask = os.umask(0)
+        os.umask(umask)
+        partial.chmod(0o666 & ~umask)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

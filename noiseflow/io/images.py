@@ -1,0 +1,140 @@
+"""Any image, stack or volume in and out: finds the format by the file's suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.files import atomic_path, check_output
+
+MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".rec", ".map"})
+TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy", ".nxs", ".h5", ".hdf5"})
+WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy"}
+SUFFIXES = WRITE_SUFFIXES | MICROSCOPE_SUFFIXES
+
+VoxelSize = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """What an image file holds.
+
+    Attributes:
+        data: the pixels in the file's own number type, (y, x) or (section, y, x).
+        voxel_size: Å along each axis of ``data``'s (z, y, x), or None where the file does not say.
+        tilt_angles: (section,) degrees, or None where the file does not say.
+    """
+
+    data: NDArray[Any]
+    voxel_size: VoxelSize | None = None
+    tilt_angles: NDArray[np.float64] | None = None
+
+    def __repr__(self) -> str:
+        size = "unknown" if self.voxel_size is None else " x ".join(f"{edge:.5g}" for edge in self.voxel_size) + " Å"
+        angles = self.tilt_angles
+        tilts = "" if angles is None else f", tilts {angles.min():g}° to {angles.max():g}°"
+        shape = " x ".join(map(str, self.data.shape))
+        return f"ImageFile({shape} {self.data.dtype}, voxel size {size}{tilts})"
+
+
+def read(path: str | Path) -> ImageFile:
+    """Read an image, stack or volume.
+
+    Args:
+        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF or ``.npy`` file; with the extra ``[formats]`` also
+            ``.dm3 .dm4 .emd .ser .hspy`` and HDF5.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is empty, truncated, of an unknown kind, or holds something that is not a real image.
+        ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give the image file inside it")
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; check the path")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
+    reader = _reader(path)
+    try:
+        image = reader(path)
+    except (PermissionError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # each library raises its own types on damaged bytes
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
+    return _checked(image, path)
+
+
+def read_image(path: str | Path) -> NDArray[Any]:
+    """Read one 2D image, (y, x); a stack of one section counts as one image. Raises as `read`."""
+    data = read(path).data
+    if data.ndim == 3 and data.shape[0] == 1:
+        return np.asarray(data[0])
+    if data.ndim != 2:
+        raise ValueError(f"{path} holds an array of shape {data.shape}; a single 2D image is needed here")
+    return data
+
+
+def write(path: str | Path, data: NDArray[Any], *, voxel_size: VoxelSize | None = None) -> None:
+    """Write an image, stack or volume in the format of the path's suffix.
+
+    Args:
+        path: target; ``.mrc``-like, ``.tif`` or ``.npy``. An existing file is replaced only once the new one is whole.
+        data: (y, x) or (z, y, x).
+        voxel_size: Å along (z, y, x).
+
+    Raises:
+        ValueError: unknown suffix, or a number type the format cannot hold.
+    """
+    from noiseflow.io import mrc, tiff
+
+    path = check_output(path)
+    suffix = path.suffix.lower()
+    with atomic_path(path) as partial:
+        if suffix in MRC_SUFFIXES:
+            mrc.write(partial, data, voxel_size)
+        elif suffix in TIFF_SUFFIXES:
+            tiff.write(partial, data, voxel_size)
+        else:
+            with partial.open("wb") as stream:
+                np.save(stream, data, allow_pickle=False)
+
+
+def _reader(path: Path) -> Callable[[Path], ImageFile]:
+    from noiseflow.io import microscope, mrc, tiff
+
+    suffix = path.suffix.lower()
+    if suffix in MRC_SUFFIXES:
+        return mrc.read
+    if suffix in TIFF_SUFFIXES:
+        return tiff.read
+    if suffix in MICROSCOPE_SUFFIXES:
+        return microscope.read
+    if suffix == ".npy":
+        return _read_npy
+    raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
+
+
+def _read_npy(path: Path) -> ImageFile:
+    return ImageFile(np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
+
+
+def _checked(image: ImageFile, path: Path) -> ImageFile:
+    data = image.data
+    if data.size == 0:
+        raise ValueError(f"{path} holds no pixels (shape {data.shape})")
+    if data.dtype.kind not in "iuf":
+        raise ValueError(f"{path} holds {data.dtype} values; real integers or floats are needed")
+    if data.ndim == 3 and data.shape[-1] in (3, 4) and data.dtype == np.uint8 and data.shape[0] > 4:
+        raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+    if data.ndim not in (2, 3):
+        raise ValueError(f"{path} has {data.ndim} dimensions (shape {data.shape}); 2 or 3 are needed")
+    return image
