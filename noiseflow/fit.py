@@ -62,6 +62,7 @@ def fit(
     generator: torch.Generator | None = None,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
+    checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
@@ -84,7 +85,8 @@ def fit(
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
         progress: called with the steps done and a note.
-        checkpoint: called now and then, and on Ctrl-C, with all that `resume` needs.
+        checkpoint: called at every look at the held-out pixels, and on Ctrl-C, with all that `resume` needs.
+        checkpoint_interval: call it after a step every so many seconds instead.
         resume: a state that `checkpoint` was given; the fit goes on from there.
 
     Returns:
@@ -97,7 +99,7 @@ def fit(
     loop.prepare(num_steps, learning_rate, standardise and resume is None)
     if resume is not None:
         loop.load_state(resume)
-    return loop.run(num_steps, batch_size, noise_interval, noise_steps, tabulate, progress, checkpoint)
+    return loop.run(num_steps, batch_size, noise_interval, noise_steps, tabulate, progress, checkpoint, checkpoint_interval)
 
 
 class _Loop:
@@ -134,6 +136,8 @@ class _Loop:
         self.result = FitResult()
         self.best: dict[str, Any] | None = None
         self.done = 0
+        self.table: ObservationTable | None = None
+        self.resumed_table: dict[str, Any] | None = None
 
     def _check(self, use: Tensor) -> None:
         bad = ~torch.isfinite(self.observation)
@@ -172,10 +176,11 @@ class _Loop:
         tabulate: bool,
         progress: Progress | None,
         checkpoint: Checkpoint | None,
+        checkpoint_interval: float | None,
     ) -> FitResult:
-        started = time.perf_counter()
+        started = saved = time.perf_counter()
         joint = self.signal_optimiser is not None
-        table = self._table() if joint and tabulate and self.train.numel() >= _TABLE_COUNT else None
+        table = self.table = self._table() if joint and tabulate and self.train.numel() >= _TABLE_COUNT else None
         check_every = max(1, num_steps // 20)
         good = self._models()
         if self.done == 0:
@@ -192,12 +197,15 @@ class _Loop:
                 if not finite:
                     self._recover(good)
                 self.done = step
-                if step % check_every == 0 or step == num_steps:
+                look = step % check_every == 0 or step == num_steps
+                if look:
                     good = self._judge(step) or good
                     if table is not None:
                         self._check_table(table, rarely=step < num_steps)
-                    if checkpoint is not None:
-                        checkpoint(self.state())
+                due = look if checkpoint_interval is None else time.perf_counter() - saved >= checkpoint_interval
+                if checkpoint is not None and due:
+                    checkpoint(self.state())
+                    saved = time.perf_counter()
                 if progress is not None:
                     progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
         except KeyboardInterrupt:
@@ -232,7 +240,7 @@ class _Loop:
         observed = self.observation[self.train]
         low = float(torch.minimum(signal.min(), observed.min()))
         high = float(torch.maximum(signal.max(), observed.max()))
-        return ObservationTable(self.noise_model, self.observation, low, high)
+        return ObservationTable(self.noise_model, self.observation, low, high, resume=self.resumed_table)
 
     def _signal_step(self, table: ObservationTable | None, batch_size: int) -> bool:
         def loss() -> Tensor:
@@ -309,6 +317,7 @@ class _Loop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
+            "table": None if self.table is None else self.table.state(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -319,7 +328,7 @@ class _Loop:
         self.generator.set_state(state["generator"])
         self.best, self.done = state["best"], state["done"]
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
-        self.result.recoveries = state["recoveries"]
+        self.result.recoveries, self.resumed_table = state["recoveries"], state["table"]
 
 
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:

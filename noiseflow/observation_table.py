@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -25,6 +26,7 @@ class ObservationTable:
         observation: (N,) readings.
         signal_low, signal_high: range of the signals to expect.
         tolerance: accepted mean absolute interpolation error, nats per pixel.
+        resume: what `state` returned; the table takes the same rows and columns again.
 
     Attributes:
         error: the error last measured, nats per pixel.
@@ -38,7 +40,10 @@ class ObservationTable:
         signal_high: float,
         *,
         tolerance: float = 1e-3,
+        resume: dict[str, Any] | None = None,
     ) -> None:
+        if resume is not None:
+            signal_low, signal_high = resume["low"], resume["high"]
         self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
         self._observation, self._tolerance, self._size = observation, tolerance, 0
         self._grid = torch.empty(observation.numel(), 2, dtype=observation.dtype, device=observation.device)
@@ -48,7 +53,22 @@ class ObservationTable:
             levels = torch.unique(observation)
             self._choices += [(rows, 0, levels) for rows, _ in SIZES]
         self.error = math.inf
-        self._refine(noise_model)
+        if resume is None:
+            self._refine(noise_model)
+        else:
+            self._build_again(noise_model, resume)
+
+    def state(self) -> dict[str, Any]:
+        """What makes the same rows and columns again: their number, the range of signals, the model they were laid out for."""
+        return {"low": self.low, "high": self.high, "size": self._size, "laid_out_for": self._laid_out_for}
+
+    def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
+        present, self._size = copy.deepcopy(noise_model.state_dict()), state["size"]
+        noise_model.load_state_dict(state["laid_out_for"])
+        self._build(noise_model, *self._choices[self._size])
+        noise_model.load_state_dict(present)
+        self.rebuild(noise_model)
+        self.error = self.measure_error(noise_model)
 
     def _refine(self, noise_model: nn.Module) -> None:
         """Take the first size from the present one on that is accurate enough, or else the most accurate one."""
@@ -69,6 +89,7 @@ class ObservationTable:
         return self.error
 
     def _build(self, noise_model: nn.Module, num_rows: int, num_columns: int, levels: Tensor | None) -> float:
+        self._laid_out_for = copy.deepcopy(noise_model.state_dict())
         self._rows = Rows(self.low, self.high, num_rows)
         self._signals = self._rows.signals(self._observation)
         self._columns = None
