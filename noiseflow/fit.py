@@ -99,7 +99,9 @@ def fit(
     loop.prepare(num_steps, learning_rate, standardise and resume is None)
     if resume is not None:
         loop.load_state(resume)
-    return loop.run(num_steps, batch_size, noise_interval, noise_steps, tabulate, progress, checkpoint, checkpoint_interval)
+    return loop.run(
+        num_steps, batch_size, noise_interval, noise_steps, tabulate, progress, checkpoint, checkpoint_interval
+    )
 
 
 class _Loop:

@@ -70,6 +70,7 @@ class JointReconstructor:
         slab: slices used to choose.
         seed: of every random choice.
         device: where to compute.
+        run_fit: runs every fit; `Journal.fit` keeps what each has reached.
     """
 
     weight: float | None = None
@@ -80,6 +81,7 @@ class JointReconstructor:
     slab: int = 24
     seed: int = 0
     device: torch.device | str = "cpu"
+    run_fit: Callable[..., FitResult] = fit
 
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
@@ -96,7 +98,7 @@ class JointReconstructor:
             noise_model, choice = self._choose(tilt_series, signal_model)
         if choice is not None:
             signal_model.weight = choice.weight
-        task = _Task(signal_model, _observation(tilt_series, self.device), self.seed)
+        task = self._task(signal_model, tilt_series)
         result = task.fit(noise_model, num_steps=self.num_steps, standardise=False, progress=progress)
         return _finished(signal_model, noise_model, result, grid, choice)
 
@@ -121,6 +123,11 @@ class JointReconstructor:
         weight = _FIRST_WEIGHT if self.weight is None else self.weight
         return TomographySignal(field, projector, response, weight=weight)
 
+    def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> _Task:
+        observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
+        use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
+        return _Task(signal_model, observation, use, self.seed, self.run_fit)
+
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None]:
         """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
         rows = contrast_slab(tilt_series, self.slab)
@@ -129,7 +136,7 @@ class JointReconstructor:
         field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
         field.start_from(whole.field.volume()[:, rows])
         part = whole.with_field(field)
-        task = _Task(part, _observation(tilt_series, self.device, rows), self.seed)
+        task = self._task(part, tilt_series, rows)
         task.fit(Gaussian().to(self.device), num_steps=40)
         noise_model = (
             _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
@@ -159,10 +166,17 @@ def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
 
 
 class _Task:
-    """A signal model with its observations and the pixels that judge it."""
+    """A signal model with its observations, those of them to use, and the pixels that judge it."""
 
-    def __init__(self, signal_model: TomographySignal, observation: Tensor, seed: int) -> None:
-        self.signal_model, self.observation = signal_model, observation
+    def __init__(
+        self,
+        signal_model: TomographySignal,
+        observation: Tensor,
+        use: Tensor | None,
+        seed: int,
+        run_fit: Callable[..., FitResult],
+    ) -> None:
+        self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
         self.generator = torch.Generator().manual_seed(seed)
         self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
 
@@ -172,9 +186,9 @@ class _Task:
         if known:
             with torch.no_grad():
                 signal = self.signal_model.signal().view_as(self.observation)
-        options |= {"held_out": self.held_out, "generator": self.generator, "batch_size": 4096}
+        options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "batch_size": 4096}
         options["learning_rate"] = _learning_rate(noise_model)
-        return fit(noise_model, signal, self.observation, **options)
+        return self.run_fit(noise_model, signal, self.observation, **options)
 
 
 def _learning_rate(noise_model: nn.Module) -> float:
@@ -215,9 +229,9 @@ def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, ge
     return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]
 
 
-def _observation(tilt_series: TiltSeries, device: torch.device | str, rows: slice = slice(None)) -> Tensor:
-    images = np.ascontiguousarray(tilt_series.images[:, rows].transpose(0, 2, 1), dtype=np.float32)
-    return torch.from_numpy(images).to(device)
+def _native(images: NDArray[Any], dtype: Any) -> Tensor:
+    """(tilt, y, u) to the projector's order (tilt, u, y)."""
+    return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1), dtype=dtype))
 
 
 def _finished(

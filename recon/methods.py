@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from noiseflow import Digitised, FitResult, Gaussian
+from noiseflow import Digitised, FitResult, Gaussian, fit
 from recon.fields import VoxelField
 from recon.first_guess import estimate_response
 from recon.joint import JointReconstructor, Reconstruction
@@ -58,6 +58,7 @@ def reconstruct(
     seed: int = 0,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    run_fit: Callable[..., FitResult] = fit,
 ) -> Outcome:
     """Reconstruct a volume from a tilt series.
 
@@ -72,6 +73,7 @@ def reconstruct(
         seed: of every random choice.
         device: where to compute.
         progress: called with the steps done and a note.
+        run_fit: runs every fit; `Journal.fit` keeps what each has reached.
 
     Raises:
         ValueError: unknown method, a negative weight, or a grid that does not match the images.
@@ -83,7 +85,7 @@ def reconstruct(
     method = "joint" if method == "auto" else method
     if method in ("sirt", "wbp"):
         return _classical(tilt_series, grid, method, num_steps or 100, device)
-    options: dict[str, Any] = {"seed": seed, "device": device}
+    options: dict[str, Any] = {"seed": seed, "device": device, "run_fit": run_fit}
     if weight is not None:
         options["weight"] = weight
     if num_steps is not None:

@@ -25,15 +25,18 @@ class TiltSeries:
         tilt_angles: (tilt,) degrees.
         pixel_size: Å, or None where unknown.
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
+        mask: (tilt, y, u), True for the pixels to use; None for all. Fits leave the others out; the classical methods take
+            them as they stand in `images`, so they should hold something plausible.
 
     Raises:
-        ValueError: not a stack, angles that do not match it, pixels or angles that are not finite, or a flat stack.
+        ValueError: not a stack, angles or a mask that do not match it, pixels or angles that are not finite, or a flat stack.
     """
 
     images: NDArray[Any]
     tilt_angles: NDArray[np.float64]
     pixel_size: float | None = None
     mode: Mode = "transmission"
+    mask: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tilt_angles", np.asarray(self.tilt_angles, dtype=np.float64).reshape(-1))
@@ -48,6 +51,10 @@ class TiltSeries:
             )
         if len(self.images) < 2:
             raise ValueError("a tilt series needs at least two tilts")
+        if self.mask is not None and (self.mask.shape != self.images.shape or self.mask.dtype != np.bool_):
+            raise ValueError(
+                f"the mask is {self.mask.dtype} of shape {self.mask.shape}; it must be boolean, shaped {self.images.shape}"
+            )
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
