@@ -26,13 +26,25 @@ def reconstruct(
     angles: Annotated[
         Path | None, typer.Option(help="Angle file; by default the .rawtlt or .tlt beside the stack.")
     ] = None,
-    method: Annotated[str, typer.Option(help="auto, joint, l2, tv, sirt or wbp.")] = "auto",
+    method: Annotated[
+        str,
+        typer.Option(
+            help="auto, joint, joint-supervised, l2, l1, tv, explicit, l2-denoised, wbp-denoised, sirt or wbp."
+        ),
+    ] = "auto",
     mode: Annotated[str, typer.Option(help="transmission (bright field) or linear (HAADF, EDX).")] = "transmission",
     thickness: Annotated[
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
     ] = None,
     weight: Annotated[float | None, typer.Option(help="Weight of the total variation.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit, or iterations.")] = None,
+    window: Annotated[
+        str | None,
+        typer.Option(help="Of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen by itself if not given."),
+    ] = None,
+    denoiser: Annotated[
+        str, typer.Option(help="Of the denoised methods: nlm, tv, wavelet, wiener, bm3d, or package.module:function.")
+    ] = "nlm",
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
     save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
@@ -63,6 +75,8 @@ def reconstruct(
             method=method,
             weight=weight,
             num_steps=steps,
+            window=window,
+            denoiser=denoiser,
             noise_model=fixed,
             seed=seed,
             device=choose_device(device),

@@ -141,7 +141,8 @@ class JointReconstructor:
         noise_model = (
             _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
         )
-        task.fit(noise_model, num_steps=80, standardise=given is not None)
+        learns = any(parameter.requires_grad for parameter in noise_model.parameters())
+        task.fit(noise_model, num_steps=80, standardise=given is not None and learns)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
         if self.weight is not None:
             return noise_model, None

@@ -1,26 +1,25 @@
-"""One door to every method of reconstruction, by name."""
+"""Every method of reconstruction by name. A method is one function below; its docstring's first line is its description."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
 from noiseflow import Digitised, FitResult, Gaussian, fit
+from recon.classical import LineIntegralProblem, best_num_iterations, best_window
+from recon.denoise import find_denoiser
 from recon.fields import VoxelField
-from recon.first_guess import estimate_response
 from recon.joint import JointReconstructor, Reconstruction
-from recon.projector import SliceProjector
+from recon.laplace import Laplace
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.wbp import wbp
+from recon.wbp import WINDOWS, wbp
 
-Method = Literal["auto", "joint", "l2", "tv", "sirt", "wbp"]
-METHODS: tuple[str, ...] = get_args(Method)
 Progress = Callable[[int, str], None]
 
 
@@ -47,63 +46,180 @@ class Outcome:
     weights_tried: dict[float, float] = field(default_factory=dict)
 
 
-def reconstruct(
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    *,
-    method: str = "auto",
-    weight: float | None = None,
-    num_steps: int | None = None,
-    noise_model: nn.Module | None = None,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
-    progress: Progress | None = None,
-    run_fit: Callable[..., FitResult] = fit,
-) -> Outcome:
-    """Reconstruct a volume from a tilt series.
+@dataclass(frozen=True)
+class Settings:
+    """What a user may settle; whatever is None the method chooses by itself.
 
-    Args:
-        tilt_series: the images.
-        grid: the lattice.
-        method: ``joint`` learns volume and noise together (``auto`` takes it); ``l2`` is least squares with total
-            variation in the same field, ``tv`` the same on plain voxels; ``sirt`` and ``wbp`` are the classical ones.
-        weight: of the total variation; see `TomographySignal`.
+    Attributes:
+        weight: of the total variation, see `TomographySignal`.
         num_steps: steps or iterations.
-        noise_model: a fitted noise model to keep as it is, for ``joint``.
+        noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
+        window: of the back-projection, one of `recon.wbp.WINDOWS`.
+        denoiser: see `recon.denoise.find_denoiser`.
         seed: of every random choice.
         device: where to compute.
         progress: called with the steps done and a note.
         run_fit: runs every fit; `Journal.fit` keeps what each has reached.
 
     Raises:
-        ValueError: unknown method, a negative weight, or a grid that does not match the images.
+        ValueError: a negative weight, or an unknown window.
+    """
+
+    weight: float | None = None
+    num_steps: int | None = None
+    noise_model: nn.Module | None = None
+    window: str | None = None
+    denoiser: str = "nlm"
+    seed: int = 0
+    device: torch.device | str = "cpu"
+    progress: Progress | None = None
+    run_fit: Callable[..., FitResult] = fit
+
+    def __post_init__(self) -> None:
+        if self.weight is not None and not 0 <= self.weight < np.inf:
+            raise ValueError(f"--weight {self.weight} must be zero or more")
+        if self.window is not None and self.window not in WINDOWS:
+            raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
+
+
+Method = Callable[[TiltSeries, VolumeGrid, Settings], Outcome]
+METHODS: dict[str, Method] = {}
+"""Methods by name."""
+
+
+def method(name: str) -> Callable[[Method], Method]:
+    """Make a function a method of this name, for `reconstruct` and every command."""
+
+    def register(function: Method) -> Method:
+        METHODS[name] = function
+        return function
+
+    return register
+
+
+def reconstruct(tilt_series: TiltSeries, grid: VolumeGrid, *, method: str = "auto", **settings: Any) -> Outcome:
+    """Reconstruct a volume from a tilt series.
+
+    Args:
+        tilt_series: the images.
+        grid: the lattice.
+        method: one of `METHODS`.
+        **settings: the attributes of `Settings`.
+
+    Raises:
+        ValueError: unknown method, settings that make no sense, or a grid that does not match the images.
     """
     if method not in METHODS:
         raise ValueError(f"--method {method}: choose one of {', '.join(METHODS)}")
-    if weight is not None and not 0 <= weight < np.inf:
-        raise ValueError(f"--weight {weight} must be zero or more")
-    method = "joint" if method == "auto" else method
-    if method in ("sirt", "wbp"):
-        return _classical(tilt_series, grid, method, num_steps or 100, device)
-    options: dict[str, Any] = {"seed": seed, "device": device, "run_fit": run_fit}
-    if weight is not None:
-        options["weight"] = weight
-    if num_steps is not None:
-        options["num_steps"] = num_steps
-    if method in ("l2", "tv"):
-        options["noise_model"] = Gaussian
-    elif noise_model is not None:
-        fixed = noise_model.requires_grad_(False)
-        options["noise_model"] = lambda: fixed
-    if method == "tv":
-        options["make_field"] = VoxelField
-    return _fitted(JointReconstructor(**options), tilt_series, grid, method, progress)
+    return METHODS[method](tilt_series, grid, Settings(**settings))
 
 
-def _fitted(
-    reconstructor: JointReconstructor, tilt_series: TiltSeries, grid: VolumeGrid, method: str, progress: Progress | None
+@method("auto")
+def _auto(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """The joint fit."""
+    return _joint(tilt_series, grid, settings)
+
+
+@method("joint")
+def _joint(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Volume and noise model together, with everything chosen by the likelihood of held-out pixels."""
+    if settings.noise_model is not None:
+        return replace(_joint_supervised(tilt_series, grid, settings), method="joint")
+    return _fitted("joint", tilt_series, grid, settings)
+
+
+@method("joint-supervised")
+def _joint_supervised(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """The same volume under a calibrated noise model that stays as it is."""
+    if settings.noise_model is None:
+        raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
+    fixed = settings.noise_model.requires_grad_(False)
+    return _fitted("joint-supervised", tilt_series, grid, settings, noise_model=lambda: fixed)
+
+
+@method("l2")
+def _l2(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Least squares with total variation in the field of the joint fit."""
+    return _fitted("l2", tilt_series, grid, settings, noise_model=Gaussian)
+
+
+@method("l1")
+def _l1(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Least absolute deviations with total variation in the field of the joint fit."""
+    return _fitted("l1", tilt_series, grid, settings, noise_model=Laplace)
+
+
+@method("tv")
+def _tv(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Least squares with total variation on plain voxels."""
+    return _fitted("tv", tilt_series, grid, settings, noise_model=Gaussian, make_field=VoxelField)
+
+
+@method("explicit")
+def _explicit(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best."""
+    free = replace(settings, weight=0.0)
+    return _fitted("explicit", tilt_series, grid, free, noise_model=Gaussian, make_field=VoxelField)
+
+
+@method("l2-denoised")
+def _l2_denoised(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Images denoised one by one, then least squares with total variation."""
+    return _after_denoising("l2-denoised", _l2, tilt_series, grid, settings)
+
+
+@method("wbp-denoised")
+def _wbp_denoised(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Images denoised one by one, then back-projection."""
+    return _after_denoising("wbp-denoised", _wbp, tilt_series, grid, settings)
+
+
+@method("sirt")
+def _sirt(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """SIRT; the number of iterations is chosen by tilts left out."""
+    count = settings.num_steps or best_num_iterations(tilt_series, grid)
+    problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
+    volume = sirt(problem.line_integrals, problem.projector, num_iterations=count)
+    return _classical("sirt", problem, volume, grid, {"iterations": count})
+
+
+@method("wbp")
+def _wbp(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+    """Weighted back-projection; window and cutoff are chosen by tilts left out."""
+    windows = WINDOWS if settings.window is None else (settings.window,)
+    window, cutoff = best_window(tilt_series, grid, windows)
+    problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
+    volume = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
+    return _classical("wbp", problem, volume, grid, {"window": window, "cutoff": cutoff})
+
+
+def _classical(
+    name: str, problem: LineIntegralProblem, volume: torch.Tensor, grid: VolumeGrid, choices: dict[str, float | str]
 ) -> Outcome:
-    result: Reconstruction = reconstructor(tilt_series, grid, progress=progress)
+    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
+    return Outcome(result, problem.predict(volume), name, None, None, choices)
+
+
+def _after_denoising(
+    name: str, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+) -> Outcome:
+    denoise = find_denoiser(settings.denoiser, tilt_series.images, noise_model=settings.noise_model)
+    clean = replace(tilt_series, images=np.stack([denoise(image) for image in tilt_series.images]))
+    outcome = method(clean, grid, settings)
+    choices: dict[str, float | str] = {"denoiser": settings.denoiser, **outcome.choices}
+    return replace(outcome, method=name, choices=choices)
+
+
+def _fitted(name: str, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings, **options: Any) -> Outcome:
+    options |= {
+        "seed": settings.seed,
+        "device": settings.device,
+        "run_fit": settings.run_fit,
+        "weight": settings.weight,
+    }
+    if settings.num_steps is not None:
+        options["num_steps"] = settings.num_steps
+    result: Reconstruction = JointReconstructor(**options)(tilt_series, grid, progress=settings.progress)
     response = result.signal_model.image_formation
     learnt = "intensity" if tilt_series.mode == "transmission" else "offset"
     choices: dict[str, float | str] = {
@@ -112,7 +228,7 @@ def _fitted(
         learnt: float(getattr(response, learnt).mean()),
     }
     tried = result.weight_choice.tried if result.weight_choice is not None else {}
-    return Outcome(result.volume, result.projections, method, result.fit_result, result.noise_model, choices, tried)
+    return Outcome(result.volume, result.projections, name, result.fit_result, result.noise_model, choices, tried)
 
 
 def _describe(noise_model: nn.Module) -> str:
@@ -120,25 +236,3 @@ def _describe(noise_model: nn.Module) -> str:
         return type(noise_model).__name__
     rounding = f"rounded to {noise_model.step:g}, " if noise_model.step else ""
     return f"{type(noise_model.model).__name__}, {rounding}clipped to [{noise_model.low:g}, {noise_model.high:g}]"
-
-
-def _classical(
-    tilt_series: TiltSeries, grid: VolumeGrid, method: str, num_iterations: int, device: torch.device | str
-) -> Outcome:
-    response = estimate_response(tilt_series).to(device)
-    width = tilt_series.images.shape[2]
-    projector = SliceProjector(
-        tilt_angles=tilt_series.tilt_angles, depth=grid.depth, width=grid.width, detector_width=width, device=device
-    )
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32)).to(device)
-    with torch.no_grad():
-        line_integrals = response.invert(images).contiguous()
-        volume = (
-            sirt(line_integrals, projector, num_iterations=num_iterations)
-            if method == "sirt"
-            else wbp(line_integrals, projector)
-        )
-        predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
-    choices: dict[str, float | str] = {"iterations": num_iterations} if method == "sirt" else {}
-    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
-    return Outcome(result, predicted.contiguous().cpu().numpy(), method, None, None, choices)

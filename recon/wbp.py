@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -10,8 +11,17 @@ from torch import Tensor
 
 from recon.projector import SliceProjector
 
+WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
+    "ramp": torch.ones_like,
+    "shepp-logan": lambda share: torch.sinc(share / 2),
+    "cosine": lambda share: torch.cos(math.pi / 2 * share),
+    "hamming": lambda share: 0.54 + 0.46 * torch.cos(math.pi * share),
+    "hann": lambda share: 0.5 + 0.5 * torch.cos(math.pi * share),
+}
+"""What multiplies the ramp, by name: functions of frequency over cutoff, in [0, 1]."""
 
-def wbp(line_integrals: Tensor, projector: SliceProjector, *, cutoff: float = 1.0) -> Tensor:
+
+def wbp(line_integrals: Tensor, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Tensor:
     """Reconstruct by filtered back-projection.
 
     The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are
@@ -20,19 +30,22 @@ def wbp(line_integrals: Tensor, projector: SliceProjector, *, cutoff: float = 1.
     Args:
         line_integrals: (tilt, y, u).
         projector: the operator whose adjoint back-projects.
-        cutoff: fraction of the Nyquist frequency at which a cosine window ends; 1 or more leaves the ramp alone.
+        window: one of `WINDOWS`; it tames the ramp's gain of fine noise.
+        cutoff: fraction of the Nyquist frequency at which the window ends and beyond which nothing passes.
 
     Returns:
         (z, y, x) attenuation per voxel, not clamped.
 
     Raises:
-        ValueError: a cutoff that is not positive.
+        ValueError: an unknown window, or a cutoff outside (0, 1].
     """
-    if not cutoff > 0:
-        raise ValueError(f"cutoff {cutoff} must be positive")
+    if window not in WINDOWS:
+        raise ValueError(f"window '{window}': choose one of {', '.join(WINDOWS)}")
+    if not 0 < cutoff <= 1:
+        raise ValueError(f"cutoff {cutoff} must be above 0 and at most 1, a fraction of the Nyquist frequency")
     count = line_integrals.shape[-1]
     padded = 2 ** math.ceil(math.log2(2 * count))
-    response = _ramp(padded, cutoff, like=line_integrals)
+    response = _filter(padded, window, cutoff, like=line_integrals)
     filtered = torch.fft.irfft(torch.fft.rfft(line_integrals, n=padded) * response, n=padded)[..., :count]
     shares = torch.as_tensor(angular_shares(projector.tilt_angles), dtype=filtered.dtype, device=filtered.device)
     return projector.T((filtered * shares[:, None, None]).contiguous())
@@ -53,13 +66,12 @@ def angular_shares(
     return np.asarray((shares / counts)[back])
 
 
-def _ramp(padded: int, cutoff: float, *, like: Tensor) -> Tensor:
+def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:
     index = torch.arange(padded, dtype=torch.float64)
     distance = torch.minimum(index, padded - index)
     kernel = torch.where(distance % 2 == 1, -1 / (math.pi * distance.clamp_min(1)) ** 2, torch.zeros(()).double())
     kernel[0] = 0.25
-    response: Tensor = torch.fft.rfft(kernel).real
-    frequency = torch.linspace(0, 1, len(response), dtype=torch.float64)
-    if cutoff < 1:
-        response = response * torch.where(frequency < cutoff, torch.cos(math.pi / 2 * frequency / cutoff) ** 2, 0.0)
+    ramp: Tensor = torch.fft.rfft(kernel).real
+    share = torch.linspace(0, 1, len(ramp), dtype=torch.float64) / cutoff
+    response = ramp * torch.where(share <= 1, WINDOWS[window](share.clamp_max(1)), 0.0)
     return response.to(dtype=like.dtype, device=like.device)

@@ -1,0 +1,119 @@
+"""Back-projection and SIRT on a tilt series as it comes, their settings chosen by tilts left out of the reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.first_guess import contrast_slab, estimate_response
+from recon.image_formation import Linear, Transmission
+from recon.projector import SliceProjector
+from recon.sirt import sirt
+from recon.tilt_series import TiltSeries, VolumeGrid
+from recon.wbp import WINDOWS, wbp
+
+_CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
+_SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
+
+
+@dataclass(frozen=True)
+class LineIntegralProblem:
+    """Measured line integrals and the operator that predicts them.
+
+    Attributes:
+        line_integrals: (tilt, y, u).
+        projector: the operator.
+        response: from line integrals to the detector's readings.
+    """
+
+    line_integrals: Tensor
+    projector: SliceProjector
+    response: Transmission | Linear
+
+    @classmethod
+    def of(cls, tilt_series: TiltSeries, grid: VolumeGrid, device: torch.device | str = "cpu") -> LineIntegralProblem:
+        """The problem of reconstructing `tilt_series` on `grid`."""
+        response = estimate_response(tilt_series).to(device)
+        projector = SliceProjector(
+            tilt_angles=tilt_series.tilt_angles,
+            depth=grid.depth,
+            width=grid.width,
+            detector_width=tilt_series.images.shape[2],
+            device=device,
+        )
+        images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32)).to(device)
+        with torch.no_grad():
+            return cls(response.invert(images).contiguous(), projector, response)
+
+    def predict(self, volume: Tensor) -> NDArray[np.float32]:
+        """The images (tilt, y, u) that a volume (z, y, x) predicts, detector units."""
+        with torch.no_grad():
+            images = self.response(self.projector(volume).transpose(1, 2)).transpose(1, 2)
+            return np.asarray(images.contiguous().cpu().numpy())
+
+
+def best_window(
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
+) -> tuple[str, float]:
+    """Window and cutoff of the back-projection that best predicts tilts left out; with few tilts, the first and 1."""
+    if tilt_series.num_tilts < _FEWEST:
+        return next(iter(windows)), 1.0
+    rest, score = _left_out(tilt_series, grid)
+    tried = {
+        (window, cutoff): score(wbp(rest.line_integrals, rest.projector, window=window, cutoff=cutoff))
+        for window in windows
+        for cutoff in _CUTOFFS
+    }
+    return max(tried, key=lambda setting: tried[setting])
+
+
+def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid) -> int:
+    """The number of SIRT iterations after which tilts left out are predicted best; later ones fit the noise.
+
+    With few tilts, 32.
+    """
+    if tilt_series.num_tilts < _FEWEST:
+        return 32
+    rest, score = _left_out(tilt_series, grid)
+    volume, done, tried = None, 0, dict[int, float]()
+    for count in _ITERATIONS:
+        volume = sirt(rest.line_integrals, rest.projector, num_iterations=count - done, start=volume)
+        done, tried[count] = count, score(volume)
+        best = max(tried, key=lambda number: tried[number])
+        if len([number for number in tried if number > best]) >= _PATIENCE:
+            break
+    return best
+
+
+def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
+    """A slab without every fifth tilt, and a judge: how well a volume's projections correlate with the tilts left out."""
+    rows = contrast_slab(tilt_series, _SLAB)
+    out = np.arange(tilt_series.num_tilts) % _LEAVE_OUT == _LEAVE_OUT // 2
+    slab = replace(grid, height=rows.stop - rows.start)
+    rest = LineIntegralProblem.of(_part(tilt_series, ~out, rows), slab)
+    judge = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles[out],
+        depth=grid.depth,
+        width=grid.width,
+        detector_width=tilt_series.images.shape[2],
+    )
+    measured = np.asarray(tilt_series.images[out][:, rows], dtype=np.float64).ravel()
+
+    def score(volume: Tensor) -> float:
+        predicted = replace(rest, projector=judge).predict(volume).astype(np.float64).ravel()
+        return float(np.corrcoef(predicted, measured)[0, 1]) if np.ptp(predicted) > 0 else -1.0
+
+    return rest, score
+
+
+def _part(tilt_series: TiltSeries, tilts: NDArray[Any], rows: slice) -> TiltSeries:
+    mask = None if tilt_series.mask is None else tilt_series.mask[tilts][:, rows]
+    images = tilt_series.images[tilts][:, rows]
+    return replace(tilt_series, images=images, tilt_angles=tilt_series.tilt_angles[tilts], mask=mask)
