@@ -1,5 +1,7 @@
 """Images, tilt angles and alignments in and out. Every output is written beside its target and renamed into place."""
 
+from .alignment import apply_transforms as apply_transforms
+from .alignment import read_transforms as read_transforms
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of
 from .checks import require_contrast as require_contrast

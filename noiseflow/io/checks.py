@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Unsupported(ValueError):
+    """A sound file with contents that noiseflow cannot use; the message follows the file's name."""
 
 
 def require_finite(data: NDArray[Any], name: str | Path) -> None:
@@ -28,14 +33,30 @@ def require_contrast(data: NDArray[Any], name: str | Path) -> None:
         raise ValueError(f"{name} is flat: every pixel is {data.flat[0]}; check that the right file was given")
 
 
-def require_room(claimed: int, path: Path, *, compressed: bool = False) -> None:
+def require_room(claimed: int, path: Path, *, compressed: bool = False, size: int | None = None) -> None:
     """Refuse pixels that the file cannot hold, before memory is taken for them.
 
     Args:
         claimed: bytes of pixels that the header promises.
         path: the file.
         compressed: allow a thousand times the file's size; no compression of real images comes near.
+        size: bytes stored, where that is not the size of one file.
     """
-    size = path.stat().st_size
-    if claimed > (1000 * size if compressed else size):
-        raise ValueError(f"its header claims {claimed} bytes of pixels; the file has {size}")
+    stored = path.stat().st_size if size is None else size
+    if claimed > (1000 * stored if compressed else stored):
+        raise ValueError(f"its header claims {claimed} bytes of pixels; the file has {stored}")
+
+
+def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_name: str) -> NDArray[Any]:
+    """The same values in the first of a format's number types that holds them all.
+
+    Raises:
+        ValueError: none does.
+    """
+    for kind in kinds:
+        other = data.astype(kind)
+        if np.array_equal(other.astype(data.dtype), data, equal_nan=data.dtype.kind == "f"):
+            return other
+    raise ValueError(
+        f"{format_name} holds no {data.dtype}, and values up to {data.max()} would lose digits; write .npy instead"
+    )

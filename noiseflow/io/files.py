@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +22,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
         ValueError: another suffix, or a folder of that name.
         FileNotFoundError: the folder does not exist.
         PermissionError: the folder is not writable.
+        ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
     from noiseflow.io.images import WRITE_SUFFIXES
 
@@ -29,7 +32,10 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
         raise ValueError(
             f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
         )
-    if path.is_dir() and path.suffix.lower() != ".zarr":
+    is_zarr = path.suffix.lower() == ".zarr"
+    if is_zarr and importlib.util.find_spec("zarr") is None:
+        raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: pip install 'noiseflow[formats]'")
+    if path.is_dir() and not is_zarr:
         raise ValueError(f"{path} is a folder; name an output file")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} does not exist; create the folder first")
@@ -40,16 +46,37 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed onto it when the block succeeds and removed when it fails."""
+    """A temporary file beside `path`, renamed onto it when the block succeeds and removed when it fails."""
     path = Path(path)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)
     partial = Path(name)
     try:
         yield partial
-        umask = os.umask(0)
-        os.umask(umask)
-        partial.chmod(0o666 & ~umask)
+        partial.chmod(0o666 & ~_umask())
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary folder beside `path`, which takes its place when the block succeeds and is removed when it fails."""
+    path = Path(path)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix))
+    old = partial.with_name(partial.name + ".old")
+    try:
+        yield partial
+        partial.chmod(0o777 & ~_umask())
+        if path.exists():
+            path.rename(old)
+        partial.rename(path)
+    finally:
+        for leftover in (partial, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask

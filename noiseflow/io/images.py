@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.files import atomic_path, check_output
+from noiseflow.io.checks import Unsupported
+from noiseflow.io.files import atomic_folder, atomic_path, check_output
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".rec", ".map"})
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
-MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy", ".nxs", ".h5", ".hdf5"})
-WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy"}
-SUFFIXES = WRITE_SUFFIXES | MICROSCOPE_SUFFIXES
+MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
+HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
+WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
+SUFFIXES = WRITE_SUFFIXES | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
 
 VoxelSize = tuple[float, float, float]
 
@@ -47,26 +53,37 @@ def read(path: str | Path) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF or ``.npy`` file; with the extra ``[formats]`` also
-            ``.dm3 .dm4 .emd .ser .hspy`` and HDF5.
+        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF or ``.npy`` file, or a folder of single images; with the
+            extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5. Of a file that holds several images,
+            ``FILE::NAME`` names one.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is empty, truncated, of an unknown kind, or holds something that is not a real image.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; give the image file inside it")
+    from noiseflow.io.folder import read_folder
+
+    name, _, member = str(path).partition("::")
+    path = Path(name)
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        return read_folder(path)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; check the path")
-    if path.stat().st_size == 0:
+    if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
-    reader = _reader(path)
+    reader = _reader(path, member or None)
     try:
         image = reader(path)
-    except (PermissionError, ModuleNotFoundError):
+    except PermissionError:
         raise
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
+            "install it with: pip install 'noiseflow[formats]'"
+        ) from error
+    except Unsupported as error:
+        raise ValueError(f"{path} {error}") from error
     except Exception as error:  # each library raises its own types on damaged bytes
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
@@ -83,44 +100,58 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return data
 
 
-def write(path: str | Path, data: NDArray[Any], *, voxel_size: VoxelSize | None = None) -> None:
+def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None) -> None:
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
-        path: target; ``.mrc``-like, ``.tif`` or ``.npy``. An existing file is replaced only once the new one is whole.
-        data: (y, x) or (z, y, x).
+        path: target; ``.mrc``-like, ``.tif``, ``.npy`` or, with the extra ``[formats]``, ``.zarr`` (OME-Zarr). An existing
+            file is replaced only once the new one is whole.
+        data: (y, x) or (z, y, x); an array or a tensor.
         voxel_size: Å along (z, y, x).
 
     Raises:
-        ValueError: unknown suffix, or a number type the format cannot hold.
+        ValueError: unknown suffix, no image, or a number type the format cannot hold.
     """
-    from noiseflow.io import mrc, tiff
+    from noiseflow.io import mrc, ome_zarr, tiff
 
     path = check_output(path)
+    data = np.asarray(data.detach().cpu() if hasattr(data, "detach") else data)
+    if data.dtype.kind not in "iuf" or data.ndim not in (2, 3):
+        raise ValueError(
+            f"{path}: an array of {data.dtype} and shape {data.shape} is no image; 2D or 3D numbers are needed"
+        )
     suffix = path.suffix.lower()
-    with atomic_path(path) as partial:
+    if suffix == ".zarr":
+        with atomic_folder(path) as folder:
+            ome_zarr.write(folder, data, voxel_size)
+        return
+    with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            mrc.write(partial, data, voxel_size)
+            mrc.write(target, data, voxel_size)
         elif suffix in TIFF_SUFFIXES:
-            tiff.write(partial, data, voxel_size)
+            tiff.write(target, data, voxel_size)
         else:
-            with partial.open("wb") as stream:
+            with target.open("wb") as stream:
                 np.save(stream, data, allow_pickle=False)
 
 
-def _reader(path: Path) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import microscope, mrc, tiff
+def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
+    from noiseflow.io import hdf5, microscope, mrc, ome_zarr, tiff
 
     suffix = path.suffix.lower()
+    if suffix in MICROSCOPE_SUFFIXES:
+        return partial(microscope.read, member=member)
+    if suffix in HDF5_SUFFIXES:
+        return partial(hdf5.read, member=member)
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
+    if member is not None:
+        raise ValueError(f"{path}::{member}: a {suffix} file holds one image; leave ::{member} out")
     if suffix in MRC_SUFFIXES:
         return mrc.read
     if suffix in TIFF_SUFFIXES:
         return tiff.read
-    if suffix in MICROSCOPE_SUFFIXES:
-        return microscope.read
-    if suffix == ".npy":
-        return _read_npy
-    raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
+    return ome_zarr.read if suffix == ".zarr" else _read_npy
 
 
 def _read_npy(path: Path) -> ImageFile:

@@ -1,18 +1,19 @@
-"""The microscopes' own formats, through rosettasciio: DM3, DM4, EMD, SER, hspy, NeXus (extra ``[formats]``)."""
+"""The microscopes' own formats, through rosettasciio: DM3, DM4, EMD, SER, hspy (extra ``[formats]``)."""
 
 from __future__ import annotations
 
 import importlib
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import require_room
+from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
+from noiseflow.io.units import in_angstrom
 
 _PLUGINS = {
     ".dm3": "digitalmicrograph",
@@ -21,73 +22,73 @@ _PLUGINS = {
     ".ser": "tia",
     ".emi": "tia",
     ".hspy": "hspy",
-    ".nxs": "nexus",
-    ".h5": "nexus",
-    ".hdf5": "nexus",
 }
 _UNCOMPRESSED = frozenset({"digitalmicrograph", "tia"})
-_ANGSTROM = {"å": 1.0, "a": 1.0, "angstrom": 1.0, "pm": 0.01, "nm": 10.0, "µm": 1e4, "μm": 1e4, "um": 1e4, "m": 1e10}
-_DEGREES = {"deg": 1.0, "degree": 1.0, "degrees": 1.0, "°": 1.0, "rad": 180 / np.pi, "radian": 180 / np.pi}
-_ANGLE_NAME = re.compile(r"stage angle|tilt|theta|rotation.?angle|(stage.*alpha)", re.IGNORECASE)
+
+Axes = Sequence[dict[str, Any]]
 
 
-def read(path: Path) -> ImageFile:
-    """Read the largest image, stack or volume of a microscope's file, with its pixel size and tilt angles."""
+def read(path: Path, member: str | None = None) -> ImageFile:
+    """Read the largest image, stack or volume of a microscope's file, with its pixel size and tilt angles.
+
+    Args:
+        path: the file.
+        member: the title of the image to read, where the file holds several.
+    """
     plugin = _PLUGINS[path.suffix.lower()]
-    try:
-        reader = importlib.import_module(f"rsciio.{plugin}").file_reader
-        signals = reader(str(path), lazy=True)
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            "install it with: pip install 'noiseflow[formats]'"
-        ) from error
-    images = [signal for signal in signals if signal["data"].ndim in (2, 3)]
-    if not images:
-        raise ValueError("it holds no image or stack")
-    signal = max(images, key=lambda found: (found["data"].ndim, found["data"].size))
+    signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
+    titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
+    signal = signals[choose_member(titles, [signal["data"].shape for signal in signals], member)]
     lazy = signal["data"]
     require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED)
     data = np.asarray(lazy.compute(scheduler="single-threaded") if hasattr(lazy, "compute") else lazy)
     data = data.astype(data.dtype.newbyteorder("="), copy=False)
-    axes = sorted(signal["axes"], key=lambda axis: axis["index_in_array"])
-    return ImageFile(data, _voxel_size(axes), _tilt_angles(signal, axes, len(data)) if data.ndim == 3 else None)
+    axes = [
+        axis for _, axis in sorted(enumerate(signal["axes"]), key=lambda pair: pair[1].get("index_in_array", pair[0]))
+    ]
+    if len(axes) == 3 and in_degrees(axes[2].get("units")) is not None:  # (x, y, tilt)
+        data, axes = np.ascontiguousarray(data.transpose()), axes[::-1]
+    return ImageFile(data, _voxel_size(axes), _tilt_angles(signal, axes, data.shape))
 
 
-def _voxel_size(axes: list[dict[str, Any]]) -> VoxelSize | None:
+def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
+    """Which of a file's arrays to read: the one that is asked for, or else the one that is largest.
+
+    Raises:
+        Unsupported: no such name, no image at all, or several of the largest size.
+    """
+    listed = ", ".join(f"'{name}'" for name in names[:12])
+    if wanted is not None:
+        if wanted not in names:
+            raise Unsupported(f"holds no '{wanted}', but {listed or 'nothing'}")
+        return names.index(wanted)
+    images = [index for index, shape in enumerate(shapes) if len(shape) in (2, 3)]
+    if not images:
+        raise Unsupported("holds no image or stack")
+    sizes = [(len(shapes[index]), int(np.prod(shapes[index], dtype=float))) for index in images]
+    largest = [index for index, size in zip(images, sizes, strict=True) if size == max(sizes)]
+    if len(largest) > 1:
+        listed = ", ".join(f"'{names[index]}'" for index in largest[:12])
+        raise Unsupported(f"holds several images: {listed}; name one as FILE::NAME")
+    return largest[0]
+
+
+def _voxel_size(axes: Axes) -> VoxelSize | None:
     """Å along (z, y, x); a section of a tilt series counts as deep as a pixel is wide."""
-    edges = [_ANGSTROM.get(str(axis.get("units")).lower(), 0.0) * abs(float(axis["scale"])) for axis in axes]
+    edges = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis["scale"])) for axis in axes]
     *depth, y, x = edges
     if not (y > 0 and x > 0):
         return None
     return (depth[0] if depth and depth[0] > 0 else x, y, x)
 
 
-def _tilt_angles(signal: Mapping[str, Any], axes: list[dict[str, Any]], count: int) -> NDArray[np.float64] | None:
+def _tilt_angles(signal: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
     """Degrees: the stage's own readings for every section, or the calibration of the stack's first axis."""
-    recorded: dict[str, list[float]] = {}
-    for tree in (signal.get("original_metadata"), signal.get("metadata")):
-        for name, value in _leaves(tree):
-            if _ANGLE_NAME.search(name):
-                recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(value)
-    for values in recorded.values():
-        if len(values) == count and np.ptp(values) > 1 and max(map(abs, values)) <= 180:
-            return np.array(values)
-    unit = _DEGREES.get(str(axes[0].get("units")).lower())
-    if unit is None:
-        return None
+    count = shape[0] if len(shape) == 3 else 1
+    trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
+    recorded = recorded_angles(leaves_of(trees), count)
+    unit = in_degrees(axes[0].get("units"))
+    if recorded is not None or unit is None or len(shape) != 3:
+        return recorded
     steps = np.arange(count, dtype=np.float64)
     return unit * (float(axes[0]["offset"]) + float(axes[0]["scale"]) * steps)
-
-
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
-    """(name, numbers) of every numeric leaf of a tree of metadata."""
-    if isinstance(tree, Mapping):
-        for name, child in tree.items():
-            yield from _leaves(child, f"{path}/{name}")
-        return
-    values = (
-        np.asarray(tree) if isinstance(tree, (int, float, list, tuple, np.ndarray, np.generic)) else np.zeros(0, str)
-    )
-    if values.dtype.kind in "iuf":
-        yield path, [float(value) for value in values.reshape(-1)]

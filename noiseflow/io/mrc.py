@@ -1,40 +1,157 @@
-"""MRC files."""
+"""MRC files of all makers: byte order, signed bytes and tilt angles in the extended header (MRC2014, IMOD, SerialEM, FEI)."""
 
 from __future__ import annotations
 
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.images import ImageFile, VoxelSize
+
+_HEADER_BYTES = 1024
+_TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
+_REFUSED = {
+    3: "complex numbers (a Fourier transform)",
+    4: "complex numbers (a Fourier transform)",
+    16: "colour pixels",
+    101: "4-bit pixels; unpack them with IMOD: newstack -mode 1 IN OUT",
+}
+_IMOD_STAMP = 1146047817
+_SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
+"""Bytes that each kind of SerialEM's short data takes per section, by its flag."""
 
 
 def read(path: Path) -> ImageFile:
-    import mrcfile
-
-    with mrcfile.open(path, header_only=True) as header_only:
-        header = header_only.header
-        count = int(header.nx) * int(header.ny) * int(header.nz)
-        mode = mrcfile.utils.data_dtype_from_header(header)
-        expected = count * mode.itemsize + 1024 + int(header.nsymbt)
+    """Read an MRC file in its own number type; the header is believed only as far as the file's size bears it out."""
     size = path.stat().st_size
-    if min(header.nx, header.ny, header.nz) < 1 or expected > size:
-        raise ValueError(
-            f"its header claims {header.nx} x {header.ny} x {header.nz} pixels, {expected} bytes; the file has {size}"
-        )
-    with mrcfile.open(path) as mrc:
-        data = np.array(mrc.data)
-        x, y, z = (float(mrc.voxel_size[axis]) for axis in "xyz")
-    return ImageFile(data, (z, y, x) if min(x, y, z) > 0 else None)
+    if size < _HEADER_BYTES:
+        raise ValueError(f"an MRC header has {_HEADER_BYTES} bytes; the file has {size}")
+    with path.open("rb") as stream:
+        header = _header(stream.read(_HEADER_BYTES), path, size)
+        extended = stream.read(int(header["nsymbt"]))
+        shape = tuple(int(header[name]) for name in ("nz", "ny", "nx"))
+        data = np.fromfile(stream, _data_type(header), int(np.prod(shape))).reshape(shape)
+    data = data.astype(data.dtype.newbyteorder("="), copy=False)
+    angles = _tilt_angles(header, extended, len(data))
+    if int(header["ispg"]) == 0 and len(data) == 1:
+        data = data[0]
+    return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
+    """Write 8 and 16-bit integers and floats as they are; float64 is rounded to float32, wide integers must fit exactly."""
     import mrcfile
 
-    if data.dtype in (np.float64, np.int32, np.int64, np.uint32):
-        data = data.astype(np.float32)
-    with mrcfile.new(path, data=np.ascontiguousarray(data), overwrite=True) as mrc:
+    with mrcfile.new(path, data=np.ascontiguousarray(_storable(data)), overwrite=True) as mrc:
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]
+
+
+def _storable(data: NDArray[Any]) -> NDArray[Any]:
+    if data.dtype == np.float64:
+        return data.astype(np.float32)
+    if data.dtype.kind in "iu" and data.dtype.itemsize > 2:
+        return exactly_as(data, (np.int16, np.uint16, np.float32), "MRC")
+    return data
+
+
+def _header(raw: bytes, path: Path, size: int) -> np.void:
+    """The header in the byte order in which it makes sense; where the machine stamp says another, a warning tells."""
+    import mrcfile.dtypes
+
+    stamped = ">" if raw[212:213] == b"\x11" else "<"
+    orders = (stamped, "<" if stamped == ">" else ">")
+    headers: list[np.void] = [
+        np.frombuffer(raw, mrcfile.dtypes.HEADER_DTYPE.newbyteorder(order))[0] for order in orders
+    ]
+    problems = [_problem(header, size) for header in headers]
+    if problems[0] is None:
+        return headers[0]
+    if problems[1] is None:
+        names = {"<": "little", ">": "big"}
+        warnings.warn(
+            f"{path} is stamped as {names[stamped]}-endian but is {names[orders[1]]}-endian; read as such", stacklevel=5
+        )
+        return headers[1]
+    mode = int(headers[0]["mode"])
+    if mode in _REFUSED and _problem(headers[0], size, mode_matters=False) is None:
+        raise Unsupported(f"holds {_REFUSED[mode]} (MRC mode {mode}); real grey images are needed")
+    if mode not in _TYPES:
+        raise ValueError(f"it is no MRC file: its header says mode {mode}")
+    raise ValueError(problems[0])
+
+
+def _problem(header: np.void, size: int, *, mode_matters: bool = True) -> str | None:
+    nx, ny, nz, mode, skipped = (int(header[name]) for name in ("nx", "ny", "nz", "mode", "nsymbt"))
+    if mode_matters and mode not in _TYPES:
+        return f"its header says mode {mode}"
+    expected = nx * ny * nz * np.dtype(_TYPES.get(mode, "i1")).itemsize + _HEADER_BYTES + skipped
+    if min(nx, ny, nz) < 1 or skipped < 0 or expected > size:
+        return f"its header claims {nx} x {ny} x {nz} pixels, {expected} bytes; the file has {size}"
+    return None
+
+
+def _data_type(header: np.void) -> np.dtype[Any]:
+    mode = int(header["mode"])
+    dtype = np.dtype("u1" if mode == 0 and not _bytes_are_signed(header) else _TYPES[mode])
+    return dtype.newbyteorder(">" if _is_big_endian(header) else "<")
+
+
+def _is_big_endian(header: np.void) -> bool:
+    order = header.dtype["nx"].byteorder
+    return order == ">" or (order == "=" and sys.byteorder == "big")
+
+
+def _bytes_are_signed(header: np.void) -> bool:
+    """IMOD says it with a flag; else pixel statistics beyond one type's range tell; MRC2014 bytes are signed."""
+    stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], ">i4" if _is_big_endian(header) else "<i4")
+    if stamp == _IMOD_STAMP:
+        return bool(flags & 1)
+    return not float(header["dmax"]) > 127
+
+
+def _voxel_size(header: np.void) -> VoxelSize | None:
+    edges = [float(header["cella"][axis]) / max(int(header[f"m{axis}"]), 1) for axis in "zyx"]
+    if not all(0 < edge < np.inf for edge in edges):
+        return None
+    return edges[0], edges[1], edges[2]
+
+
+def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
+    """(z, y, x), whatever axes the file's columns, rows and sections are."""
+    axes = [int(header[name]) for name in ("maps", "mapr", "mapc")]
+    if data.ndim == 3 and sorted(axes) == [1, 2, 3] and axes != [3, 2, 1]:
+        return np.ascontiguousarray(data.transpose([axes.index(axis) for axis in (3, 2, 1)]))
+    return data
+
+
+def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.float64] | None:
+    """Degrees, from the extended header of SerialEM (``SERI``), FEI (``FEI1 FEI2``) or Agard's format; else None."""
+    import mrcfile.dtypes
+
+    order = ">" if _is_big_endian(header) else "<"
+    kind = header["exttyp"].item()
+    num_integers, flags = (int(n) for n in np.frombuffer(header["extra2"].tobytes()[16:20], f"{order}i2"))
+    serialem = flags & 1 and num_integers == sum(n for bit, n in _SERIALEM_BYTES.items() if flags & bit)
+    if kind in (b"FEI1", b"FEI2"):
+        record = mrcfile.dtypes.get_ext_header_dtype(kind, order)
+        offset, item, step, unit = record.fields["Alpha tilt"][1], f"{order}f8", 0, 1.0
+        step = int(np.frombuffer(extended[:4].ljust(4, b"\0"), f"{order}i4")[0])
+    elif serialem:
+        offset, item, step, unit = 0, f"{order}i2", num_integers, 0.01
+    elif num_integers >= 0 < flags and kind in (b"AGAR", b"", b"\0\0\0\0"):
+        offset, item, step, unit = 4 * num_integers, f"{order}f4", 4 * (num_integers + flags), 1.0
+    else:
+        return None
+    width = np.dtype(item).itemsize
+    if step < offset + width or (count - 1) * step + offset + width > len(extended):
+        return None
+    records = [extended[i * step + offset : i * step + offset + width] for i in range(count)]
+    angles: NDArray[np.float64] = np.frombuffer(b"".join(records), item).astype(np.float64) * unit
+    told = np.isfinite(angles).all() and np.abs(angles).max() <= 180 and (count == 1 or np.ptp(angles) > 0)
+    return angles if told else None

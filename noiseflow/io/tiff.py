@@ -1,44 +1,84 @@
-"""TIFF files."""
+"""TIFF files: plain, ImageJ and OME, with their voxel sizes; and folders of single images."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.checks import Unsupported, exactly_as, require_room
 from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.units import in_angstrom
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile
+
+_IMAGEJ_TYPES = (np.uint8, np.uint16, np.float32)
+_OUTSIDE_OME = (np.float16, np.int64, np.uint64)
+_IMAGEJ_BYTES = 2**32 - 2**20
 
 
 def read(path: Path) -> ImageFile:
+    """Read the first series of a TIFF file."""
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
-        claimed = sum(page.nbytes for page in tiff.pages)
-        limit = 1000 * path.stat().st_size + 2**20  # no compression of real images comes near
-        if claimed > limit:
-            raise ValueError(f"its header claims {claimed} bytes of pixels")
+        compressed = any(getattr(page, "compression", 1) != 1 for page in tiff.pages)
+        require_room(sum(page.nbytes for page in tiff.pages), path, compressed=compressed)
         series = tiff.series[0]
+        require_room(series.nbytes, path, compressed=compressed)
+        if "S" in series.axes:
+            raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
         data = series.asarray()
-        spacing = (tiff.imagej_metadata or {}).get("spacing")
-        unit = (tiff.imagej_metadata or {}).get("unit")
-        page = tiff.pages[0]
-        tags: Any = page.tags if isinstance(page, tifffile.TiffPage) else {}
-        resolution = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
-    if unit == "angstrom" and spacing and len(resolution) == 2:
-        y, x = (denominator / numerator for numerator, denominator in resolution)
-        return ImageFile(data, (float(spacing), y, x))
-    return ImageFile(data)
+        voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
+    return ImageFile(data, voxel_size)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
+    """Write any real type as it is: as ImageJ's TIFF where that can say the voxel size, else as OME-TIFF."""
     import tifffile
 
     if voxel_size is None:
         tifffile.imwrite(path, data, photometric="minisblack")  # or a stack of three would be stored as colour
         return
-    if data.dtype == np.float64:
-        data = data.astype(np.float32)
     z, y, x = voxel_size
-    tifffile.imwrite(path, data, imagej=True, resolution=(1 / x, 1 / y), metadata={"spacing": z, "unit": "angstrom"})
+    if data.dtype in _OUTSIDE_OME:
+        data = exactly_as(data, (np.float32, np.int32, np.uint32, np.float64), "OME-TIFF")
+    if data.dtype in _IMAGEJ_TYPES and data.nbytes < _IMAGEJ_BYTES:
+        tifffile.imwrite(
+            path, data, imagej=True, resolution=(1 / x, 1 / y), metadata={"spacing": z, "unit": "angstrom"}
+        )
+        return
+    sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
+    units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
+    metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
+    tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata)
+
+
+def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
+    metadata = tiff.imagej_metadata or {}
+    tags: Any = tiff.pages.first.tags
+    unit = in_angstrom(metadata.get("unit"))
+    pixels_per_unit = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
+    if unit is None or len(pixels_per_unit) < 2 or not all(numerator for numerator, _ in pixels_per_unit):
+        return None
+    y, x = (unit * denominator / numerator for numerator, denominator in pixels_per_unit)
+    spacing = float(metadata.get("spacing") or 0)
+    return (unit * spacing if spacing > 0 else x, y, x)
+
+
+def _ome_voxel_size(tiff: TiffFile) -> VoxelSize | None:
+    import tifffile
+
+    if not tiff.ome_metadata:
+        return None
+    image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {})
+    pixels = (image[0] if isinstance(image, list) else image).get("Pixels", {})
+    edges = []
+    for axis in "ZYX":
+        unit = in_angstrom(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
+        edges.append(float(pixels.get(f"PhysicalSize{axis}", 0)) * (unit or 0))
+    z, y, x = edges
+    return (z if z > 0 else x, y, x) if y > 0 and x > 0 else None

@@ -70,11 +70,9 @@ def test_wrong_content_is_refused(tmp_path: Path, name: str, content: bytes, mes
         io.read(path)
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
+def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="does not exist"):
         io.read(tmp_path / "none.mrc")
-    with pytest.raises(ValueError, match="is a folder"):
-        io.read(tmp_path)
 
 
 def test_colour_and_complex_images_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,72 @@
+"""Alignments of a tilt series: IMOD's ``.xf`` files, read and applied on request."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def read_transforms(path: str | Path) -> NDArray[np.float64]:
+    """Read an IMOD ``.xf`` file.
+
+    Args:
+        path: text file, one line ``A11 A12 A21 A22 DX DY`` per section.
+
+    Returns:
+        (section, 2, 3): the matrix A and the shift in pixels, in the order (x, y) of IMOD.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a line is not six numbers, a matrix cannot be inverted, or there is none.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"alignment file {path} does not exist; check the path")
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            a11, a12, a21, a22, dx, dy = map(float, line.split())
+        except ValueError:
+            raise ValueError(f"{path} line {number}: six numbers A11 A12 A21 A22 DX DY are needed") from None
+        row = np.array([[a11, a12, dx], [a21, a22, dy]])
+        if not np.isfinite(row).all() or abs(np.linalg.det(row[:, :2])) < 1e-6:
+            raise ValueError(f"{path} line {number}: this transform cannot be inverted")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path} holds no transforms; it needs one line of six numbers per section")
+    return np.stack(rows)
+
+
+def apply_transforms(images: NDArray[Any], transforms: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Move every image by its transform, as IMOD's ``newstack -xform``: (x', y') = A·(x − c) + (DX, DY) + c.
+
+    Cubic splines interpolate, which correlates the noise of neighbouring pixels; what comes from outside an image
+    takes the image's mean.
+
+    Args:
+        images: (section, y, x).
+        transforms: (section, 2, 3) of `read_transforms`; c is the middle of the image.
+
+    Returns:
+        (section, y, x).
+
+    Raises:
+        ValueError: another number of transforms than of images.
+    """
+    from scipy.ndimage import affine_transform
+
+    if len(images) != len(transforms):
+        raise ValueError(f"there are {len(images)} images and {len(transforms)} transforms; give the .xf of this stack")
+    centre = (np.array(images.shape[1:]) - 1) / 2
+    moved = np.empty(images.shape, np.float32)
+    for image, transform, target in zip(images, transforms, moved, strict=True):
+        back = np.linalg.inv(transform[::-1, 1::-1])  # (y, x), from the output to the input
+        offset = centre - back @ (centre + transform[::-1, 2])
+        source = image.astype(np.float64)
+        affine_transform(source, back, offset, output=target, order=3, mode="constant", cval=float(source.mean()))
+    return moved

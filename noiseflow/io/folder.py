@@ -1,0 +1,73 @@
+"""A folder of single images as one stack, in natural order, with the tilt angles that the names tell."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.images import SUFFIXES, ImageFile, read
+
+_NUMBER = re.compile(r"([-+]*)(\d+(?:\.\d+)?)")
+_ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
+
+
+def read_folder(folder: Path) -> ImageFile:
+    """Stack the images of a folder; files of another type than most are left out.
+
+    Raises:
+        ValueError: no images, or images of different sizes.
+    """
+    from tifffile import natural_sorted
+
+    files = [f for f in folder.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    if not files:
+        raise ValueError(f"{folder} is a folder without images; give an image file, or a folder of images")
+    suffix, _ = Counter(file.suffix.lower() for file in files).most_common(1)[0]
+    names = natural_sorted(file.name for file in files if file.suffix.lower() == suffix)
+    images = [read(folder / name) for name in names]
+    sections: list[NDArray[Any]] = []
+    for name, image in zip(names, images, strict=True):
+        section = image.data[0] if image.data.ndim == 3 and len(image.data) == 1 else image.data
+        if section.ndim != 2:
+            raise ValueError(f"{folder / name} holds a stack of shape {image.data.shape}; a folder needs single images")
+        if sections and section.shape != sections[0].shape:
+            raise ValueError(
+                f"{folder / name} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
+                "the images of a folder must have one size"
+            )
+        sections.append(section)
+    angles = [image.tilt_angles for image in images if image.tilt_angles is not None]
+    inside = np.concatenate(angles) if len(angles) == len(images) else None
+    return ImageFile(np.stack(sections), images[0].voxel_size, inside if inside is not None else angles_in_names(names))
+
+
+def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:
+    """Tilt angles that file names tell, degrees, or None where they tell none, or not without doubt.
+
+    A number of the name counts as the angle if it has decimals or a sign in some names, or follows a word such as
+    ``tilt``, and if it differs from name to name within ±180. A minus in front of all the numbers is a hyphen.
+    """
+    rows = [list(_NUMBER.finditer(name.rsplit(".", 1)[0])) for name in names]
+    if len(names) < 2 or len({len(row) for row in rows}) != 1:
+        return None
+    found = [values for column in zip(*rows, strict=True) if (values := _angle_column(list(column))) is not None]
+    return found[0] if len(found) == 1 else None
+
+
+def _angle_column(numbers: list[re.Match[str]]) -> NDArray[np.float64] | None:
+    signs = [number[1] for number in numbers]
+    hyphen = all(sign.startswith("-") for sign in signs)
+    signs = [sign[1:] if hyphen else sign for sign in signs]
+    named = all(_ANGLE_WORD.search(n.string[: n.start()]) for n in numbers)
+    telling = any(signs) or any("." in number[2] for number in numbers)
+    if not (named or telling) or any(len(sign) > 1 for sign in signs):
+        return None
+    if hyphen and not any(signs):
+        return None
+    values = np.array([(-1.0 if s == "-" else 1.0) * float(n[2]) for s, n in zip(signs, numbers, strict=True)])
+    return values if len(np.unique(values)) == len(values) and np.abs(values).max() <= 180 else None

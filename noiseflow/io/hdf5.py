@@ -1,0 +1,59 @@
+"""HDF5 and NeXus files: the largest array of numbers, or the one that is named (extra ``[formats]``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from noiseflow.io.checks import require_room
+from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.metadata import in_degrees, recorded_angles
+from noiseflow.io.microscope import choose_member
+from noiseflow.io.units import in_angstrom
+
+
+def read(path: Path, member: str | None = None) -> ImageFile:
+    """Read an image, stack or volume; tilt angles come from ``theta``, ``rotation_angle`` and the like.
+
+    Args:
+        path: the file.
+        member: the dataset's full name, such as ``/exchange/data``.
+    """
+    import h5py
+
+    found: dict[str, Any] = {}
+    with h5py.File(path, "r") as file:
+        file.visititems(
+            lambda name, item: found.__setitem__(f"/{name}", item) if isinstance(item, h5py.Dataset) else None
+        )
+        names = [name for name, item in found.items() if item.ndim in (2, 3) and item.dtype.kind in "iufc"]
+        dataset = found[names[choose_member(names, [found[name].shape for name in names], member)]]
+        require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
+        data = np.asarray(dataset)
+        lists = [(name, item) for name, item in found.items() if item.ndim == 1 and item.shape == (len(data),)]
+        angles = recorded_angles(
+            ((name, list(np.asarray(item, float) * _unit(item))) for name, item in lists if item.dtype.kind in "iuf"),
+            len(data),
+        )
+        voxel_size = _voxel_size(dataset)
+    return ImageFile(data.astype(data.dtype.newbyteorder("="), copy=False), voxel_size, angles)
+
+
+def _unit(dataset: Any) -> float:
+    return in_degrees(_text(dataset.attrs.get("units", "deg"))) or 1.0
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _voxel_size(dataset: Any) -> VoxelSize | None:
+    """From ``element_size_um``, (z, y, x) in µm, as ilastik, BigDataViewer and others write it; or ``voxel_size`` in units."""
+    sizes = np.asarray(dataset.attrs.get("element_size_um", ()), dtype=float).reshape(-1)
+    unit = in_angstrom("µm") or 0.0
+    if sizes.size != 3 or not (sizes > 0).all():
+        return None
+    z, y, x = (float(size) * unit for size in sizes)
+    return z, y, x

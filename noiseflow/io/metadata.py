@@ -1,0 +1,50 @@
+"""Tilt angles in the metadata of any file: numbers under a telling name, as many as there are sections."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ANGLE_NAME = re.compile(r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle", re.IGNORECASE)
+_DEGREES = {
+    **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
+    **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
+}
+
+
+def in_degrees(unit: object) -> float | None:
+    """How many degrees one unit is, by its name or symbol; None for what is no unit of angles."""
+    return _DEGREES.get(str(unit).strip(" []").lower())
+
+
+def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> NDArray[np.float64] | None:
+    """The first list of `count` plausible tilt angles, degrees, under a name that speaks of tilts.
+
+    Args:
+        leaves: (name, numbers); names that differ in their digits only, as of a list of sections, count as one list.
+        count: sections of the stack.
+    """
+    recorded: dict[str, list[float]] = {}
+    for name, values in leaves:
+        if _ANGLE_NAME.search(name):
+            recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(values)
+    for values in recorded.values():
+        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= 180
+        if plausible and (count == 1 or np.ptp(values) > np.pi):  # else radians, or a stage that stood still
+            return np.array(values)
+    return None
+
+
+def leaves_of(tree: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
+    """(name, numbers) of every numeric leaf of a tree of metadata."""
+    if isinstance(tree, Mapping):
+        for name, child in tree.items():
+            yield from leaves_of(child, f"{path}/{name}")
+    elif isinstance(tree, (int, float, list, tuple, np.ndarray, np.generic)):
+        values = np.asarray(tree)
+        if values.dtype.kind in "iuf":
+            yield path, [float(value) for value in values.reshape(-1)]

@@ -1,0 +1,83 @@
+"""OME-Zarr: multiscale volumes with physical units, OME-NGFF 0.5 (extra ``[formats]``).
+
+Source: https://ngff.openmicroscopy.org/0.5
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.checks import Unsupported, require_room
+from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.units import in_angstrom
+
+_SMALLEST_EDGE = 64
+_CHUNK = 128
+
+
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
+    """Write an image or volume with coarser copies, each half as fine, down to 64 pixels along its longest edge."""
+    import zarr
+
+    axes = "zyx"[-data.ndim :]
+    scale = np.array((voxel_size or (1.0, 1.0, 1.0))[-data.ndim :])
+    unit = {} if voxel_size is None else {"unit": "angstrom"}
+    group = zarr.open_group(path, mode="w", zarr_format=3)
+    datasets: list[dict[str, Any]] = []
+    level = np.asarray(data)
+    factors = np.ones(data.ndim)
+    while True:
+        name = str(len(datasets))
+        chunks = tuple(min(_CHUNK, edge) for edge in level.shape)
+        group.create_array(name, data=level, chunks=chunks, dimension_names=list(axes))
+        transforms = [
+            {"type": "scale", "scale": list(scale * factors)},
+            {"type": "translation", "translation": list(scale * (factors - 1) / 2)},
+        ]
+        datasets.append({"path": name, "coordinateTransformations": transforms})
+        if max(level.shape) <= _SMALLEST_EDGE:
+            break
+        level, factors = _halved(level), factors * [2 if edge > 1 else 1 for edge in level.shape]
+    multiscale: dict[str, Any] = {"name": path.stem.split(".")[0], "type": "mean", "datasets": datasets}
+    multiscale["axes"] = [{"name": axis, "type": "space", **unit} for axis in axes]
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [multiscale]}
+
+
+def read(path: Path) -> ImageFile:
+    """Read the finest level of an OME-Zarr image or volume, of version 0.4 or 0.5."""
+    import zarr
+
+    node = zarr.open(path, mode="r")
+    attributes: Any = node.attrs.asdict()
+    multiscales = attributes.get("ome", attributes).get("multiscales")
+    if not isinstance(node, zarr.Group) or not multiscales:
+        raise Unsupported("is no OME-Zarr image: it has no multiscales")
+    first = multiscales[0]
+    array = node[first["datasets"][0]["path"]]
+    if not isinstance(array, zarr.Array):
+        raise Unsupported("is no OME-Zarr image: its first dataset is no array")
+    require_room(array.nbytes, path, compressed=True, size=int(array.nbytes_stored()))
+    data = np.asarray(array[:])
+    keep = [index for index, edge in enumerate(data.shape) if edge > 1 or index >= data.ndim - 2]
+    transforms = first["datasets"][0].get("coordinateTransformations", [])
+    scale = next((t["scale"] for t in transforms if t.get("type") == "scale"), [0] * data.ndim)
+    units = [in_angstrom(axis.get("unit")) or 0.0 for axis in first["axes"]]
+    edges = [float(scale[index]) * units[index] for index in keep]
+    data = data.reshape([data.shape[index] for index in keep])
+    if len(edges) not in (2, 3) or min(edges) <= 0:
+        return ImageFile(data)
+    return ImageFile(data, (edges[0], edges[-2], edges[-1]))
+
+
+def _halved(data: NDArray[Any]) -> NDArray[Any]:
+    """Means of 2 × 2 (× 2) pixels; a last odd row is left out, an axis of one pixel stays."""
+    mean = data.astype(np.float64)
+    for axis, edge in enumerate(data.shape):
+        if edge > 1:
+            first, second = (mean.take(range(start, edge - edge % 2, 2), axis=axis) for start in (0, 1))
+            mean = (first + second) / 2
+    return (mean if data.dtype.kind == "f" else np.rint(mean)).astype(data.dtype)

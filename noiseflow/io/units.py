@@ -1,0 +1,18 @@
+"""Units of length, as the formats spell them."""
+
+from __future__ import annotations
+
+_ANGSTROM = {
+    **dict.fromkeys(("å", "a", "angstrom", "angstroms", "ångström", "ångstrom"), 1.0),
+    **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),
+    **dict.fromkeys(("nm", "nanometer", "nanometre"), 10.0),
+    **dict.fromkeys(("µm", "μm", "um", "micron", "microns", "micrometer", "micrometre", r"\u00b5m", "µ", "μ"), 1e4),
+    **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e7),
+    **dict.fromkeys(("cm", "centimeter"), 1e8),
+    **dict.fromkeys(("m", "meter", "metre"), 1e10),
+}
+
+
+def in_angstrom(unit: object) -> float | None:
+    """How many Å one unit is, by its name or symbol; None for what is no unit of length."""
+    return _ANGSTROM.get(str(unit).strip().lower())
