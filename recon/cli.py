@@ -20,12 +20,15 @@ if TYPE_CHECKING:
 
 def reconstruct(
     tilts: Annotated[
-        Path, typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif or .npy; tilt axis along y.")
+        Path,
+        typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Volume to write: .mrc, .rec, .tif or .npy.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")],
     angles: Annotated[
-        Path | None, typer.Option(help="Angle file; by default the .rawtlt or .tlt beside the stack.")
+        Path | None,
+        typer.Option(help="Angle file; by default the .rawtlt, .tlt or .mdoc beside the stack, or its own."),
     ] = None,
+    transforms: Annotated[Path | None, typer.Option(help="IMOD's .xf alignment to apply to the stack.")] = None,
     method: Annotated[
         str,
         typer.Option(
@@ -63,7 +66,7 @@ def reconstruct(
     io.check_output(out)
     if report is not None and report.exists() and not report.is_dir():
         raise ValueError(f"{report} is a file; name a folder for the report")
-    tilt_series = read_tilt_series(tilts, angles=angles, mode=parse_mode(mode))
+    tilt_series = read_tilt_series(tilts, angles=angles, transforms=transforms, mode=parse_mode(mode))
     if invert_tilt:
         tilt_series = TiltSeries(tilt_series.images, -tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
     fixed = load_noise_model(noise_model)

@@ -21,7 +21,7 @@ class TiltSeries:
     """Images of one object at several tilts, in raw detector units.
 
     Attributes:
-        images: (tilt, y, u), any real number type; the tilt axis runs along y through the middle of u.
+        images: (tilt, y, u), any real number type, an array or a tensor; the tilt axis runs along y through the middle of u.
         tilt_angles: (tilt,) degrees.
         pixel_size: Å, or None where unknown.
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
@@ -39,6 +39,7 @@ class TiltSeries:
     mask: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "images", io.as_array(self.images))
         object.__setattr__(self, "tilt_angles", np.asarray(self.tilt_angles, dtype=np.float64).reshape(-1))
         if self.mode not in ("transmission", "linear"):
             raise ValueError(f"mode '{self.mode}': choose transmission (bright field) or linear (HAADF, EDX)")
@@ -59,6 +60,13 @@ class TiltSeries:
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
         _check_angles(self.tilt_angles)
+
+    def __repr__(self) -> str:
+        size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
+        shape = " x ".join(map(str, self.images.shape))
+        low, high = self.tilt_angles.min(), self.tilt_angles.max()
+        masked = "" if self.mask is None else f", {np.mean(~self.mask):.2%} masked"
+        return f"TiltSeries({shape} {self.images.dtype}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
 
     @property
     def num_tilts(self) -> int:
@@ -108,19 +116,30 @@ class Volume:
     attenuation: NDArray[np.float32]
     voxel_size: float | None = None
 
+    def __repr__(self) -> str:
+        size = "unknown voxel size" if self.voxel_size is None else f"{self.voxel_size:.4g} Å per voxel"
+        return f"Volume({' x '.join(map(str, self.attenuation.shape))} {self.attenuation.dtype}, {size})"
+
     def write(self, path: str | Path) -> None:
-        """Write to an MRC, TIFF or ``.npy`` file with the voxel size. Raises as `noiseflow.io.write`."""
+        """Write to an MRC, TIFF, ``.npy`` or OME-Zarr file with the voxel size. Raises as `noiseflow.io.write`."""
         size = self.voxel_size
         io.write(path, self.attenuation, voxel_size=None if size is None else (size, size, size))
 
 
-def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode: Mode = "transmission") -> TiltSeries:
+def read_tilt_series(
+    path: str | Path,
+    *,
+    angles: str | Path | None = None,
+    transforms: str | Path | None = None,
+    mode: Mode = "transmission",
+) -> TiltSeries:
     """Read a stack and its tilt angles.
 
     Args:
         path: the stack, in any format that `noiseflow.io.read` knows.
         angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
             ``.mdoc`` beside the stack, or else the angles inside the stack's own file.
+        transforms: IMOD's ``.xf`` alignment of this stack, to apply to the images (they become float32).
         mode: how the images were formed.
 
     Raises:
@@ -136,7 +155,10 @@ def read_tilt_series(path: str | Path, *, angles: str | Path | None = None, mode
     io.require_finite(image_file.data, path)
     io.require_contrast(image_file.data, path)
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
-    return TiltSeries(image_file.data, tilt_angles, pixel_size, mode)
+    images = image_file.data
+    if transforms is not None:
+        images = io.apply_transforms(images, io.read_transforms(transforms))
+    return TiltSeries(images, tilt_angles, pixel_size, mode)
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:

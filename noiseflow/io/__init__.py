@@ -4,6 +4,7 @@ from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of
+from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite
 from .files import atomic_path as atomic_path

@@ -14,6 +14,11 @@ class Unsupported(ValueError):
     """A sound file with contents that noiseflow cannot use; the message follows the file's name."""
 
 
+def as_array(data: Any) -> NDArray[Any]:
+    """A NumPy array of an array, a list, or a tensor on any device."""
+    return np.asarray(data.detach().cpu() if hasattr(data, "detach") else data)
+
+
 def require_finite(data: NDArray[Any], name: str | Path) -> None:
     """Refuse NaN and infinite pixels, naming how many there are and where the first one is."""
     if not np.issubdtype(data.dtype, np.floating):

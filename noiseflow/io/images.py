@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported
+from noiseflow.io.checks import Unsupported, as_array
 from noiseflow.io.files import atomic_folder, atomic_path, check_output
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
     from noiseflow.io import mrc, ome_zarr, tiff
 
     path = check_output(path)
-    data = np.asarray(data.detach().cpu() if hasattr(data, "detach") else data)
+    data = as_array(data)
     if data.dtype.kind not in "iuf" or data.ndim not in (2, 3):
         raise ValueError(
             f"{path}: an array of {data.dtype} and shape {data.shape} is no image; 2D or 3D numbers are needed"
