@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.digitisation import detect_digitisation
 from noiseflow.io import read, require_contrast, require_finite
 
 Image = NDArray[np.float64]
@@ -123,22 +124,10 @@ def checked_frame(data: NDArray[Any], name: str) -> Image:
 def saturation_level(frame: NDArray[Any]) -> float:
     """The upper rail of the analogue-to-digital converter, or infinity where the frame shows none.
 
-    A rail is the largest reading, held by more pixels than its neighbourhood explains: by over three times as many as
-    the next lower reading, and by at least 0.01 % of the pixels and ten of them; or the type's own largest value.
-
     Args:
         frame: any shape, detector units.
     """
-    data = np.asarray(frame)
-    top = data.max()
-    at_top = int(np.count_nonzero(data == top))
-    if top == _largest_value(data):
-        return float(top)
-    if at_top < max(10, 1e-4 * data.size):
-        return float("inf")
-    below = data[data < top]
-    at_next = int(np.count_nonzero(below == below.max())) if below.size else 0
-    return float(top) if at_top > 3 * at_next else float("inf")
+    return detect_digitisation(frame).high
 
 
 def rounding_step(frame: Image) -> float:
@@ -148,8 +137,8 @@ def rounding_step(frame: Image) -> float:
 
 def rails(frame: Image) -> tuple[float, float]:
     """Lower and upper rail of the converter as the frame shows them; infinite where it shows none."""
-    low = -saturation_level(-frame)
-    return (0.0 if frame.min() == 0 else low), saturation_level(frame)
+    found = detect_digitisation(frame)
+    return (0.0 if frame.min() == 0 else found.low), found.high
 
 
 def _largest_value(data: NDArray[Any]) -> float:

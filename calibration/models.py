@@ -159,7 +159,14 @@ def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progres
     stopping = torch.from_numpy(pixels.block[~pixels.held_out] % 10 == 0).to(device)
     generator = torch.Generator().manual_seed(seed)
     noiseflow.fit(
-        model, signal, observation, held_out=stopping, num_steps=NUM_STEPS, generator=generator, progress=progress
+        model,
+        signal,
+        observation,
+        held_out=stopping,
+        num_steps=NUM_STEPS,
+        digitise=False,
+        generator=generator,
+        progress=progress,
     )
     return model.cpu().eval()
 

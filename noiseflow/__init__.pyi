@@ -2,9 +2,11 @@ from . import io as io
 from . import metrics as metrics
 from .baselines import Gaussian as Gaussian
 from .baselines import Poisson as Poisson
+from .digitisation import Digitisation as Digitisation
+from .digitisation import detect_digitisation as detect_digitisation
 from .digitised import Digitised as Digitised
-from .fit import FitResult as FitResult
 from .fit import fit as fit
+from .fit_loop import FitResult as FitResult
 from .flow import RadialFlow as RadialFlow
 from .flow import SignalDependentGaussian as SignalDependentGaussian
 from .flow import SplineFlow as SplineFlow

@@ -76,6 +76,8 @@ class Poisson(nn.Module):
         offset: counts at zero dose.
     """
 
+    describes_single_readings = True
+
     def __init__(self, gain: float = 1.0, offset: float = 0.0) -> None:
         super().__init__()
         self.log_gain = nn.Parameter(torch.tensor(math.log(gain)))

@@ -75,10 +75,10 @@ def evaluate(
         half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
         for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
-            noiseflow.fit(
+            fitted = noiseflow.fit(
                 baseline.to(where), train_signal, train_observation, generator=torch.Generator().manual_seed(seed)
             )
-            models[type(baseline).__name__] = baseline
+            models[type(baseline).__name__] = fitted.noise_model
     results = {name: metrics.evaluate(item, clean, noisy, seed=seed) for name, item in models.items()}
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
     structures = [spatial_structure(models["model"], *(image.to(where) for image in pair)) for pair in pairs]

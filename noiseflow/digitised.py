@@ -14,7 +14,6 @@ from noiseflow.distributions import NoiseDistribution
 
 _MOMENT_NODES = 257
 _LEAST_CLEAR, _RAILED = 256, 0.02
-_MOST_LEVELS = 4096
 
 
 class Digitised(nn.Module):
@@ -30,6 +29,8 @@ class Digitised(nn.Module):
     Raises:
         ValueError: negative step, or rails in the wrong order.
     """
+
+    describes_single_readings = True
 
     def __init__(self, model: nn.Module, step: float = 1.0, low: float = -math.inf, high: float = math.inf) -> None:
         super().__init__()
@@ -52,6 +53,8 @@ class Digitised(nn.Module):
         clear = self._clear_of_rails(signal, observation)
         if int(clear.sum()) < max(_LEAST_CLEAR, 0.1 * clear.numel()):
             clear = torch.ones_like(clear)
+        if not hasattr(self.model, "standardise"):
+            return
         span = {"span": (float(signal.min()), float(signal.max()))} if hasattr(self.model, "standardisation") else {}
         self.model.standardise(signal[clear], observation[clear], **span)  # type: ignore[operator]
 
@@ -157,31 +160,3 @@ class DigitisedDistribution(NoiseDistribution):
         nodes = (torch.arange(_MOMENT_NODES, dtype=torch.float64) + 0.5) / _MOMENT_NODES
         values = [self.icdf(torch.full(self.batch_shape, float(node))) for node in nodes]
         return torch.stack([(value - about) ** power for value in values]).mean(0)
-
-
-def detect_digitisation(readings: Tensor) -> tuple[float, float, float]:
-    """What rounding and clipping a set of readings shows: (step, low rail, high rail), detector units.
-
-    A step is found where the readings take at most 4096 equally spaced values, or are whole numbers of an integer type. A rail
-    is an extreme reading that at least ten readings share, and over twice as many as share the next one; infinite where none.
-
-    Args:
-        readings: any shape.
-    """
-    values, counts = torch.unique(readings.detach().reshape(-1), return_counts=True)
-    step = 1.0 if not readings.is_floating_point() else _spacing(values)
-    rails = []
-    for end, beside, none in ((0, 1, -math.inf), (-1, -2, math.inf)):
-        piled = values.numel() > 2 and int(counts[end]) >= 10 and int(counts[end]) > 2 * int(counts[beside])
-        rails.append(float(values[end]) if piled else none)
-    return step, rails[0], rails[1]
-
-
-def _spacing(levels: Tensor) -> float:
-    """The common spacing of sorted levels, or 0 where there is none."""
-    if not 2 < levels.numel() <= _MOST_LEVELS:
-        return 0.0
-    gaps = levels.double().diff()
-    step = float(gaps.min())
-    steps = gaps / step
-    return step if float((steps - steps.round()).abs().max()) < 1e-2 else 0.0

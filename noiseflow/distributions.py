@@ -68,14 +68,22 @@ class LatentDistribution(NoiseDistribution):
         return probability
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return log_normal_interval(self._latent_bound(low), self._latent_bound(high))
+        (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)
+        mass = log_normal_interval(bottom, top)
+        # the difference of latents keeps few digits in a narrow cell; there the slopes at its ends tell the width
+        middle, finite = (bottom + top) / 2, torch.isfinite(bottom) & torch.isfinite(top)
+        narrow = finite & (high > low) & (top - bottom < torch.finfo(bottom.dtype).eps ** (1 / 3))
+        zero = torch.zeros_like(middle)
+        width = torch.where(narrow, high - low, zero + 1)
+        middle, slope = torch.where(narrow, middle, zero), torch.where(narrow, (slope_below + slope_above) / 2, zero)
+        return torch.where(narrow, torch.log(width) + slope - 0.5 * middle * middle - _LOG_SQRT_2PI, mass)
 
-    def _latent_bound(self, value: Tensor) -> Tensor:
+    def _latent_bound(self, value: Tensor) -> tuple[Tensor, Tensor]:
         finite = torch.isfinite(value)
         if not bool(finite.any()):
-            return value
-        latent = self.to_latent(torch.where(finite, value, torch.zeros_like(value)))[0]
-        return torch.where(finite, latent, value)
+            return value, torch.zeros_like(value)
+        latent, slope = self.to_latent(torch.where(finite, value, torch.zeros_like(value)))
+        return torch.where(finite, latent, value), torch.where(finite, slope, torch.zeros_like(slope))
 
     def icdf(self, value: Tensor) -> Tensor:
         return self.from_latent(torch.special.ndtri(value))

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import baselines, flow
-from noiseflow.digitised import Digitised, detect_digitisation
+from noiseflow.digitisation import Digitisation, detect_digitisation
+from noiseflow.digitised import Digitised
 from noiseflow.fit import fit
 from noiseflow.metrics import pixel_log_prob
 
@@ -44,12 +45,12 @@ class Selection:
     Attributes:
         candidates: as given, simplest first.
         chosen: the simplest whose held-out likelihood lies within one standard error of the best.
-        digitisation: detected (step, low, high), detector units; step 0 and infinite rails where none.
+        digitisation: rounding and rails detected, and put around every candidate.
     """
 
     candidates: tuple[Candidate, ...]
     chosen: Candidate
-    digitisation: tuple[float, float, float]
+    digitisation: Digitisation
 
 
 def default_candidates() -> dict[str, nn.Module]:
@@ -85,17 +86,19 @@ def select(
     Raises:
         ValueError: as `fit`.
     """
-    step, low, high = digitisation = detect_digitisation(observation)
+    digitisation = detect_digitisation(observation.detach().cpu().numpy())
     signal, observation = signal.reshape(-1).float(), observation.reshape(-1).float()
     # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge
     apart = torch.from_numpy(np.random.default_rng(seed).random(signal.shape[0]) < held_out)
     models = dict(default_candidates() if candidates is None else candidates)
-    if step > 0 or math.isfinite(low) or math.isfinite(high):
-        models = {name: Digitised(model, step, low, high) for name, model in models.items()}
+    if digitisation.found:
+        models = {name: Digitised(model, *digitisation) for name, model in models.items()}
     scores, seconds = [], []
     for model in models.values():
         generator = torch.Generator().manual_seed(seed)
-        result = fit(model, signal[~apart], observation[~apart], num_steps=num_steps, generator=generator)
+        result = fit(
+            model, signal[~apart], observation[~apart], num_steps=num_steps, digitise=False, generator=generator
+        )
         seconds.append(result.seconds)
         scores.append(-pixel_log_prob(model, signal[apart], observation[apart]))
     return Selection(*_choose(list(models.items()), scores, seconds), digitisation)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -14,32 +11,6 @@ from recon.image_formation import Linear, Transmission
 from recon.projector import SliceProjector
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries
-
-_MOST_LEVELS = 1024
-
-
-def find_rails(images: NDArray[Any], *, least: int = 10) -> tuple[float, float]:
-    """The readings (low, high) at which a detector saturates, or infinity where it does not.
-
-    A rail is an extreme reading that at least `least` pixels share, and twice as many as share the reading next to it.
-    """
-    rails = []
-    for extreme, none in ((images.min(), -np.inf), (images.max(), np.inf)):
-        rest = images[images != extreme]
-        neighbour = (rest.min() if none < 0 else rest.max()) if rest.size else extreme
-        count, beside = images.size - rest.size, int((rest == neighbour).sum())
-        rails.append(float(extreme) if count >= least and count > 2 * beside else none)
-    return rails[0], rails[1]
-
-
-def find_step(images: NDArray[Any]) -> float:
-    """The rounding step of readings that take few equally spaced values; 0 where rounding is fine enough to forget."""
-    levels = np.unique(images[:: max(1, len(images) // 8)])
-    if not 2 < levels.size <= _MOST_LEVELS:
-        return 0.0
-    gaps = np.diff(levels.astype(np.float64))
-    step = float(gaps.min())
-    return step if np.abs(gaps / step - np.round(gaps / step)).max() < 1e-3 else 0.0
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:

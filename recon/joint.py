@@ -12,14 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import Digitised, FitResult, Gaussian, RadialFlow, SplineFlow, fit
+from noiseflow import Digitised, FitResult, Gaussian, RadialFlow, SplineFlow, detect_digitisation, fit
 from recon.fields import Field, MultiresolutionField
 from recon.first_guess import (
     attenuation_scale,
     contrast_slab,
     estimate_response,
-    find_rails,
-    find_step,
     rough_volume,
 )
 from recon.projector import SliceProjector, from_rays
@@ -157,13 +155,11 @@ def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
     pixels, the second could put anything there, and with it any mean; only the first is offered then, because the shape seen
     at other signals stands in for what is hidden.
     """
-    (low, high), step = find_rails(images), find_step(images)
+    digitisation = detect_digitisation(images)
     flows: list[nn.Module] = [RadialFlow(6, num_conditional=0, mean_preserving=True)]
-    if float(((images <= low) | (images >= high)).mean()) < _CLIPPED:
+    if float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) < _CLIPPED:
         flows.append(SplineFlow(mean_preserving=True))
-    if step == 0 and not np.isfinite([low, high]).any():
-        return flows
-    return [Digitised(flow, step=step, low=low, high=high) for flow in flows]
+    return [Digitised(flow, *digitisation) for flow in flows] if digitisation.found else flows
 
 
 class _Task:
@@ -188,7 +184,7 @@ class _Task:
             with torch.no_grad():
                 signal = self.signal_model.signal().view_as(self.observation)
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "batch_size": 4096}
-        options["learning_rate"] = _learning_rate(noise_model)
+        options |= {"learning_rate": _learning_rate(noise_model), "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
 

@@ -7,7 +7,6 @@ import torch
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.digitised import detect_digitisation
 from noiseflow.selection import select
 from noiseflow.spatial import spatial_structure
 
@@ -16,17 +15,6 @@ def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tenso
     generator = torch.Generator().manual_seed(seed)
     signal = torch.rand(count, generator=generator)
     return signal, signal + 0.1 * torch.randn(count, generator=generator)
-
-
-def test_rounding_and_rails_are_detected() -> None:
-    _, observation = noisy()
-    assert detect_digitisation(observation) == (0.0, -math.inf, math.inf)
-    assert detect_digitisation(observation.clamp(0, 1)) == (0.0, 0.0, 1.0)
-    assert detect_digitisation((observation * 40).round().int()) == (1.0, -math.inf, math.inf)
-    step, low, high = detect_digitisation(((observation * 255).round() / 255).clamp(0, 1))
-    assert step == pytest.approx(1 / 255, rel=1e-3)
-    assert (low, high) == (0.0, 1.0)
-    assert detect_digitisation((3 * observation).round().clamp(min=2)) == (1.0, 2.0, math.inf)
 
 
 def test_simplest_sufficient_model_is_chosen() -> None:

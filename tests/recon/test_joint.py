@@ -6,7 +6,7 @@ import torch
 
 import noiseflow
 from recon.fields import VoxelField
-from recon.first_guess import estimate_response, find_rails, find_step
+from recon.first_guess import estimate_response
 from recon.image_formation import Linear, Transmission
 from recon.joint import JointReconstructor, block_mask, noise_candidates
 from recon.metrics import compare
@@ -68,25 +68,6 @@ def test_penalty_does_not_depend_on_the_unit_of_attenuation():
         large.field.values.copy_(small.field.values)
     torch.testing.assert_close(small.penalty(), large.penalty())
     torch.testing.assert_close(small_signal_model(weight=0.0).penalty(), torch.tensor(0.0))
-
-
-def test_rails_are_found_only_where_readings_pile_up():
-    generator = np.random.default_rng(0)
-    unclipped = generator.normal(0.5, 0.3, 20000).astype(np.float32)
-    assert find_rails(unclipped) == (-np.inf, np.inf)
-    assert find_rails(unclipped.clip(0, 1)) == (0.0, 1.0)
-    assert find_rails(unclipped.clip(-9, 1)) == (-np.inf, 1.0)
-    assert find_rails(np.round(unclipped * 50)) == (-np.inf, np.inf)
-    assert find_rails(np.round(unclipped.clip(0, 1) * 255).astype(np.uint8)) == (0.0, 255.0)
-
-
-def test_steps_are_found_only_where_readings_are_rounded():
-    generator = np.random.default_rng(0)
-    readings = generator.normal(0.5, 0.3, (4, 30, 30))
-    assert find_step(readings) == 0
-    assert find_step(np.round(readings * 20)) == 1
-    assert find_step(np.round(readings * 20).astype(np.float32) / 16) == pytest.approx(1 / 16)
-    assert find_step(np.round(readings * 1e5).astype(np.int32)) == 0
 
 
 def test_candidate_noise_models_fit_the_detector():

@@ -1,0 +1,116 @@
+"""What a set of readings tells of the converter that made them: its rounding step and the rails at which it clips."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_SAMPLE = 2**18
+_MOST_LEVELS = 2**16
+_LEAST_PILED = 10
+_LEAST_ULPS = 8
+
+
+class Digitisation(NamedTuple):
+    """Rounding and clipping of a detector.
+
+    Attributes:
+        step: rounding step, detector units; 0 where readings are not rounded.
+        low, high: rails, detector units; infinite where there is none.
+    """
+
+    step: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def found(self) -> bool:
+        """Whether there is any rounding or rail."""
+        return self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
+
+    def in_words(self) -> str:
+        """One phrase for people."""
+        parts = [f"rounded to steps of {self.step:g}"] if self.step > 0 else []
+        rails = [f"{rail:g}" for rail in (self.low, self.high) if math.isfinite(rail)]
+        return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
+
+
+def detect_digitisation(readings: ArrayLike) -> Digitisation:
+    """The rounding and the rails that readings show.
+
+    Readings are rounded where all of them are whole multiples of a step, counted from the least one: integers always are, and
+    other numbers where they repeat. What the number format itself rounds does not count.
+
+    A rail is an extreme reading that piles up: at least ten readings share it, and more than the two levels beside it foretell
+    if the histogram is log-concave there, as the tails of noise and the counts of electrons are. The largest value of an integer
+    type is one wherever it is reached. That readings end at 0 makes no rail: counts do so too.
+
+    Args:
+        readings: any shape and real type, detector units; NaN and infinite ones are left out.
+    """
+    values = np.asarray(readings)
+    if values.dtype.kind == "b":
+        values = values.astype(np.uint8)
+    values = values.reshape(-1)
+    if values.dtype.kind == "f":
+        values = values if np.isfinite(values).all() else values[np.isfinite(values)]
+    if not values.size:
+        return Digitisation()
+    step = _step(values)
+    return Digitisation(step, _rail(values, step, high=False), _rail(values, step, high=True))
+
+
+def _step(values: NDArray[Any]) -> float:
+    levels = np.unique(values[:: max(1, values.size // _SAMPLE)])
+    if levels.size <= 2:
+        return 1.0 if levels.dtype.kind in "iu" else 0.0
+    if levels.dtype.kind in "iu" or _are_whole(levels):
+        step = float(np.gcd.reduce((levels - levels[0]).astype(np.uint64)))
+    elif levels.size <= min(_MOST_LEVELS, values.size // 2):
+        step = _spacing(levels.astype(np.float64))
+    else:
+        return 0.0
+    if levels.dtype.kind == "f" and step < _LEAST_ULPS * float(np.spacing(np.abs(levels).max())):
+        return 0.0
+    return step
+
+
+def _are_whole(levels: NDArray[Any]) -> bool:
+    return float(np.abs(levels).max()) < 2**53 and np.array_equal(levels, np.round(levels))
+
+
+def _spacing(levels: NDArray[np.float64]) -> float:
+    """The common spacing of sorted levels, or 0 where there is none."""
+    gaps = np.diff(levels)
+    least = np.median(gaps[gaps < 1.5 * gaps.min()])
+    # a gap carries the rounding error of two readings; the whole span carries it only once
+    step = float((levels[-1] - levels[0]) / np.round(gaps / least).sum())
+    steps = (levels - levels[0]) / step
+    return step if float(np.abs(steps - np.round(steps)).max()) < 0.02 else 0.0
+
+
+def _rail(values: NDArray[Any], step: float, *, high: bool) -> float:
+    none = math.inf if high else -math.inf
+    extreme = values.max() if high else values.min()
+    if high and values.dtype.kind in "iu" and extreme == np.iinfo(values.dtype).max:
+        return float(extreme)
+    at_extreme = values == extreme
+    count, rest = int(np.count_nonzero(at_extreme)), values[~at_extreme]
+    if count < _LEAST_PILED or not rest.size:
+        return none
+    if step > 0:
+        away = np.round(np.abs(rest.astype(np.float64) - float(extreme)) / step)
+        piled = _piles_up(count, int(np.count_nonzero(away == 1)), int(np.count_nonzero(away == 2)))
+    else:
+        piled = count > 2 * int(np.count_nonzero(rest == (rest.max() if high else rest.min())))
+    return float(extreme) if piled and np.ptp(rest) > 0 else none
+
+
+def _piles_up(count: int, beside: int, beyond: int) -> bool:
+    """Whether the outermost of three neighbouring levels holds more readings than a log-concave histogram allows."""
+    log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
+    error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
+    return (count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)

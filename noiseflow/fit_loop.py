@@ -1,0 +1,309 @@
+"""The one optimisation loop: steps of the noise model and of the signal model, looks at the held-out pixels, recovery."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.digitisation import Digitisation
+from noiseflow.observation_table import ObservationTable
+
+Progress = Callable[[int, str], None]
+Checkpoint = Callable[[dict[str, Any]], None]
+_STANDARDISE_COUNT = 1_000_000
+_TABLE_COUNT = 30_000
+_LOOK_COUNT = 20_000
+_MAX_RECOVERIES = 8
+_LAST_RATE = 0.01
+
+
+@dataclass
+class FitResult:
+    """What a fit reached.
+
+    Attributes:
+        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or rails were found.
+        digitisation: the rounding and rails it was put behind; none where it was left as it is.
+        held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
+        num_steps: steps taken.
+        seconds: wall time.
+        recoveries: how often a non-finite step was undone with half the learning rate.
+        history: step → held-out NLL, in the order measured.
+        table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
+    """
+
+    noise_model: nn.Module
+    digitisation: Digitisation = field(default_factory=Digitisation)
+    held_out_nll: float = math.nan
+    num_steps: int = 0
+    seconds: float = 0.0
+    recoveries: int = 0
+    history: dict[int, float] = field(default_factory=dict)
+    table_error: float | None = None
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How a fit goes: see `noiseflow.fit`."""
+
+    num_steps: int
+    batch_size: int
+    noise_interval: int
+    noise_steps: int
+    tabulate: bool
+    checkpoint_interval: float | None
+
+
+@dataclass(frozen=True)
+class FitPixels:
+    """The pixels of a fit.
+
+    Attributes:
+        observation: (N,) readings; unusable ones hold some finite number.
+        train, judge: indices of the pixels that train and of those that judge.
+        weight: (N,) weight of each pixel in a full-batch loss.
+        generator: source of the random choices.
+    """
+
+    observation: Tensor
+    train: Tensor
+    judge: Tensor
+    weight: Tensor
+    generator: torch.Generator
+
+    @staticmethod
+    def choose(observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> FitPixels:
+        """Divide the usable pixels, `use` (N,), of observations of any shape."""
+        observation = observation.reshape(-1)
+        if isinstance(held_out, Tensor):
+            judge = held_out.reshape(-1).bool()
+        else:
+            judge = (torch.rand(use.shape, generator=generator) < held_out).to(use.device)
+        train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
+        if train.numel() < 2 or judging.numel() < 1:
+            raise ValueError(
+                f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image"
+            )
+        bad = ~torch.isfinite(observation)
+        if bool(bad.any()):  # unused pixels get weight 0, and 0·NaN must not reach the sum
+            observation = torch.where(bad, observation[use].mean(), observation)
+        return FitPixels(observation, train, judging, (use & ~judge).to(observation.dtype) / train.numel(), generator)
+
+
+class FitLoop:
+    """A noise model, a signal model and pixels, on their way to the most likely parameters."""
+
+    def __init__(self, noise_model: nn.Module, signal_model: nn.Module, pixels: FitPixels, result: FitResult) -> None:
+        self.noise_model, self.signal_model, self.pixels, self.result = noise_model, signal_model, pixels, result
+        self.best: dict[str, Any] | None = None
+        self.done = 0
+        self.table: ObservationTable | None = None
+        self.resumed_table: dict[str, Any] | None = None
+
+    def prepare(self, num_steps: int, learning_rate: float, standardise: bool) -> None:
+        """Scale the noise model to the data and set up the optimisers."""
+        if standardise and hasattr(self.noise_model, "standardise"):
+            with torch.no_grad():
+                pixels = self.pixels.train[:: max(1, self.pixels.train.numel() // _STANDARDISE_COUNT)]
+                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
+        noise = [p for p in self.noise_model.parameters() if p.requires_grad]
+        self.noise_optimiser = _adam([{"params": noise, "lr": learning_rate}]) if noise else None
+        self.signal_optimiser = None
+        if any(p.requires_grad for p in self.signal_model.parameters()):
+            everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
+            own = getattr(self.signal_model, "parameter_groups", None)
+            self.signal_optimiser = _adam(own() if own is not None else everything)
+        self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
+        self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
+
+    def run(self, schedule: Schedule, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
+        """Take all steps that are left, and end at the best held-out state."""
+        started = saved = time.perf_counter()
+        num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
+        if joint and schedule.tabulate and self.pixels.train.numel() >= _TABLE_COUNT:
+            self.table = self._make_table()
+        check_every = max(1, num_steps // 20)
+        good = self._models()
+        if self.done == 0:
+            self._judge(0)  # a good start must not be lost to worse steps
+        try:
+            for step in range(self.done + 1, num_steps + 1):
+                self._set_rates(_LAST_RATE ** ((step - 1) / num_steps) / 2**self.result.recoveries)
+                if not self._take_step(step, schedule):
+                    self._recover(good)
+                self.done = step
+                look = step % check_every == 0 or step == num_steps
+                if look:
+                    good = self._judge(step) or good
+                    self._check_table(rarely=step < num_steps)
+                interval = schedule.checkpoint_interval
+                due = look if interval is None else time.perf_counter() - saved >= interval
+                if checkpoint is not None and due:
+                    checkpoint(self.state())
+                    saved = time.perf_counter()
+                if progress is not None:
+                    progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                checkpoint(self.state())
+            raise
+        if self.best is not None:
+            self._load_models(self.best)
+            self.result.held_out_nll = self.held_out_nll()
+        self.result.num_steps, self.result.seconds = num_steps, time.perf_counter() - started
+        return self.result
+
+    def _take_step(self, step: int, schedule: Schedule) -> bool:
+        """One step of whatever learns; False where it met a number that is not finite."""
+        joint = self.signal_optimiser is not None
+        finite = self._signal_step(schedule.batch_size)
+        if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
+            for _ in range(schedule.noise_steps if joint else 1):
+                finite &= _step(self.noise_optimiser, lambda: self._noise_loss(schedule.batch_size))
+            if self.table is not None:
+                self.table.rebuild(self.noise_model)
+        return finite
+
+    def _judge(self, step: int) -> dict[str, Any] | None:
+        nll = self.held_out_nll(_LOOK_COUNT)
+        if not math.isfinite(nll):
+            return None
+        state = self._models()
+        if nll <= min(self.result.history.values(), default=math.inf):
+            self.best, self.result.held_out_nll = state, nll
+        self.result.history[step] = nll
+        return state
+
+    def _check_table(self, *, rarely: bool) -> None:
+        """A model that learns may outgrow its table; that is slow, and seen in every fifth look."""
+        table = self.table
+        if table is None:
+            return
+        if self.noise_optimiser is not None and (not rarely or len(self.result.history) % 5 == 0):
+            table.check(self.noise_model)
+        self.result.table_error = table.error
+
+    def _make_table(self) -> ObservationTable:
+        with torch.no_grad():
+            signal = self._signal(self.pixels.train[:: max(1, self.pixels.train.numel() // 100_000)])
+        observed = self.pixels.observation[self.pixels.train]
+        low = float(torch.minimum(signal.min(), observed.min()))
+        high = float(torch.maximum(signal.max(), observed.max()))
+        return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=self.resumed_table)
+
+    def _signal_step(self, batch_size: int) -> bool:
+        table, observation = self.table, self.pixels.observation
+
+        def loss() -> Tensor:
+            if hasattr(self.signal_model, "signal"):
+                signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
+                log_prob = (
+                    table.log_prob(signal) if table is not None else self.noise_model(signal).log_prob(observation)
+                )
+                value = -torch.dot(log_prob, self.pixels.weight.to(log_prob.dtype))
+            else:
+                pixels = self._batch(batch_size)
+                value = -self.noise_model(self._signal(pixels)).log_prob(self.pixels.observation[pixels]).mean()
+            return value + self.signal_model.penalty() if hasattr(self.signal_model, "penalty") else value  # type: ignore[operator]
+
+        return self.signal_optimiser is None or _step(self.signal_optimiser, loss)
+
+    def _noise_loss(self, batch_size: int) -> Tensor:
+        pixels = self._batch(batch_size)
+        with torch.no_grad():
+            signal = self._signal(pixels)
+        return -self.noise_model(signal).log_prob(self.pixels.observation[pixels]).mean()  # type: ignore[no-any-return]
+
+    def _signal(self, pixels: Tensor) -> Tensor:
+        predicted: Tensor = self.signal_model(pixels)
+        return predicted
+
+    def _batch(self, batch_size: int) -> Tensor:
+        draw = torch.randint(
+            self.pixels.train.numel(), (min(batch_size, self.pixels.train.numel()),), generator=self.pixels.generator
+        )
+        return self.pixels.train[draw.to(self.pixels.train.device)]
+
+    @torch.no_grad()
+    def held_out_nll(self, most: int = 100_000) -> float:
+        """Mean negative log-likelihood of at most so many held-out pixels, nats per pixel."""
+        pixels = self.pixels.judge[:: max(1, self.pixels.judge.numel() // most)]
+        total = 0.0
+        for part in torch.split(pixels, 32768):
+            total -= float(self.noise_model(self._signal(part)).log_prob(self.pixels.observation[part]).double().sum())
+        return total / pixels.numel()
+
+    def _models(self) -> dict[str, Any]:
+        models = {"noise_model": self.noise_model.state_dict()}
+        if self.signal_optimiser is not None:
+            models["signal_model"] = self.signal_model.state_dict()
+        return copy.deepcopy(models)
+
+    def _load_models(self, state: dict[str, Any]) -> None:
+        self.noise_model.load_state_dict(state["noise_model"])
+        if "signal_model" in state:
+            self.signal_model.load_state_dict(state["signal_model"])
+
+    def _recover(self, good: dict[str, Any]) -> None:
+        self.result.recoveries += 1
+        if self.result.recoveries > _MAX_RECOVERIES:
+            raise ValueError(
+                "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
+            )
+        self._load_models(good)
+        for optimiser in self.optimisers:
+            optimiser.state.clear()
+
+    def _set_rates(self, factor: float) -> None:
+        for optimiser, rates in zip(self.optimisers, self.base_rates, strict=True):
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on from here."""
+        return {
+            **self._models(),
+            "best": self.best,
+            "optimisers": copy.deepcopy([o.state_dict() for o in self.optimisers]),
+            "generator": self.pixels.generator.get_state(),
+            "history": dict(self.result.history),
+            "held_out_nll": self.result.held_out_nll,
+            "recoveries": self.result.recoveries,
+            "done": self.done,
+            "table": None if self.table is None else self.table.state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go back to a state that `state` returned."""
+        self._load_models(state)
+        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(saved)
+        self.pixels.generator.set_state(state["generator"])
+        self.best, self.done = state["best"], state["done"]
+        self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
+        self.result.recoveries, self.resumed_table = state["recoveries"], state["table"]
+
+
+def _adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
+    return torch.optim.Adam(list(groups), betas=(0.9, 0.99), fused=True)
+
+
+def _step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> bool:
+    """One step of an optimiser; False, and no step, where loss or gradient is not finite."""
+    optimiser.zero_grad(set_to_none=True)
+    value = loss()
+    if not bool(torch.isfinite(value)):
+        return False
+    value.backward()  # type: ignore[no-untyped-call]
+    gradients = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
+    if not all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+        return False
+    optimiser.step()
+    return True

@@ -1,0 +1,118 @@
+"""Rounding and rails are found in readings that show them, and only there; a fit takes them into account."""
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import noiseflow
+from noiseflow import Digitisation, detect_digitisation
+
+READINGS = np.random.default_rng(0).normal(0.5, 0.3, 20_000).astype(np.float32)
+NONE = Digitisation()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
+@pytest.mark.parametrize("offset", [0.0, 100.0])
+def test_continuous_readings_are_not_digitised(scale: float, offset: float) -> None:
+    assert detect_digitisation((READINGS + np.float32(offset)) * np.float32(scale)) == NONE
+    assert detect_digitisation(np.random.default_rng(0).random(10_000, dtype=np.float32)) == NONE
+
+
+def test_rails_are_found_only_where_readings_pile_up() -> None:
+    assert detect_digitisation(READINGS.clip(0, 1)) == (0.0, 0.0, 1.0)
+    assert detect_digitisation(READINGS.clip(-9, 1)) == (0.0, -math.inf, 1.0)
+    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 255).astype(np.uint8)) == (1.0, 0.0, 255.0)
+    assert detect_digitisation(np.round(READINGS * 50)) == (1.0, -math.inf, math.inf)
+    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 20)) == (1.0, 0.0, 20.0)
+    assert detect_digitisation(np.array([3, 255, 7], np.uint8)).high == 255.0
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.3, 1.0, 10.0])
+def test_counts_of_electrons_have_no_rail_at_zero(rate: float) -> None:
+    counts = np.random.default_rng(0).poisson(rate, 100_000)
+    assert detect_digitisation(counts) == (1.0, -math.inf, math.inf)
+
+
+@pytest.mark.parametrize("step", [1.0, 16.0, 1 / 255, 0.1, 1 / 65535])
+@pytest.mark.parametrize("offset", [0.0, 0.37])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rounding_is_found_whatever_its_step(step: float, offset: float, dtype: type) -> None:
+    readings = np.concatenate([READINGS] * 3).astype(np.float64) * (30 * step if step >= 1 else 1)
+    rounded = (np.round(readings / step) * step + offset).astype(dtype)
+    assert detect_digitisation(rounded).step == pytest.approx(step, rel=1e-3)
+
+
+def test_integers_are_rounded_to_their_common_step() -> None:
+    counts = np.round(READINGS * 400).astype(np.int16)
+    assert detect_digitisation(counts).step == 1
+    assert detect_digitisation(counts * np.int16(16)).step == 16
+    assert detect_digitisation(counts.astype(np.float64) * 16).step == 16
+    assert detect_digitisation(np.round(READINGS * 1e6).astype(np.int32)).step == 1
+
+
+def test_readings_that_are_not_finite_do_not_hide_the_rest() -> None:
+    clipped = READINGS.clip(0, 1)
+    clipped[:5] = np.nan, np.inf, -np.inf, np.nan, np.inf
+    assert detect_digitisation(clipped) == (0.0, 0.0, 1.0)
+    assert detect_digitisation(np.full(4, np.nan)) == NONE
+    assert detect_digitisation(np.zeros(0)) == NONE
+    assert detect_digitisation(np.zeros(100)) == NONE
+
+
+def image(step: float, *, integer: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(20_000, generator=generator)
+    observation = signal + 0.1 * torch.randn(20_000, generator=generator)
+    if integer:
+        return signal / step, (observation / step).round().to(torch.int32)
+    return signal, (observation / step).round().clamp(0, 1 / step) * step
+
+
+def test_fit_finds_rounding_and_rails_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    signal, observation = image(1 / 20)
+    with caplog.at_level(logging.WARNING, logger="noiseflow"):
+        result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
+    assert isinstance(result.noise_model, noiseflow.Digitised)
+    assert result.digitisation == pytest.approx((1 / 20, 0.0, 1.0))
+    assert "rounded to steps of 0.05 and clipped at 0 and 1" in caplog.text
+    assert float(result.noise_model.model.log_scale.detach().exp()) == pytest.approx(0.1, rel=0.03)
+
+
+def test_fit_takes_integers_and_leaves_digitised_models_alone() -> None:
+    signal, observation = image(1 / 20, integer=True)
+    result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
+    assert result.digitisation == (1.0, -math.inf, math.inf)
+    assert float(result.noise_model.model.log_scale.detach().exp()) == pytest.approx(2.0, rel=0.03)
+    for given in (noiseflow.Digitised(noiseflow.Gaussian(), step=1.0), noiseflow.Poisson()):
+        result = noiseflow.fit(given, signal, observation, num_steps=2)
+        assert result.noise_model is given
+        assert not result.digitisation.found
+    off = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=2, digitise=False)
+    assert isinstance(off.noise_model, noiseflow.Gaussian)
+
+
+@pytest.mark.parametrize("name", ["SplineFlow", "RadialFlow"])
+def test_fine_rounding_costs_no_accuracy_in_single_precision(name: str) -> None:
+    """Cells of a thousandth of the noise: differences of latents would lose all digits."""
+    signal = torch.linspace(30_000, 40_000, 2000)
+    model = getattr(noiseflow, name)()
+    observation = signal + 300 * torch.randn(2000, generator=torch.Generator().manual_seed(0))
+    model.standardise(signal, observation)
+    rounded = noiseflow.Digitised(model, step=1.0)
+    with torch.no_grad():
+        difference = rounded(signal).log_prob(observation.round()) - model(signal).log_prob(observation.round())
+    assert float(difference.abs().max()) < 2e-3
+
+
+def test_pixels_that_are_not_finite_are_left_out_where_asked() -> None:
+    signal, observation = image(1 / 20)
+    broken = observation.clone()
+    broken[:7] = math.nan
+    with pytest.raises(ValueError, match="7 pixels of signal or observation are NaN"):
+        noiseflow.fit(noiseflow.Gaussian(), signal, broken)
+    result = noiseflow.fit(noiseflow.Gaussian(), signal, broken, skip_non_finite=True, num_steps=20)
+    assert result.digitisation.step == pytest.approx(1 / 20)
+    assert math.isfinite(result.held_out_nll)
