@@ -5,14 +5,17 @@ Nothing here imports torch, so that ``noiseflow -h`` answers at once.
 
 from __future__ import annotations
 
+import errno
+import logging
 import sys
+import warnings
 from importlib.metadata import entry_points, version
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare")
+_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
 
 
 def build_app() -> typer.Typer:
@@ -33,7 +36,8 @@ def build_app() -> typer.Typer:
 
 
 class _ListCommand(TyperCommand):
-    """A command whose list options take several values: ``--short a b c`` for ``--short a --short b --short c``."""
+    """A command whose list options take several values: ``--short a b c`` for ``--short a --short b --short c``; Ctrl-C
+    ends it with one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         lists = {name for option in self.params if getattr(option, "multiple", False) for name in option.opts}
@@ -47,6 +51,13 @@ class _ListCommand(TyperCommand):
             spread.append(argument)
         rest: list[str] = super().parse_args(ctx, spread)
         return rest
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            print(f"noiseflow: {self.name} stopped; no unfinished output was left", file=sys.stderr)
+            raise typer.Exit(130) from None
 
 
 def _show_version(asked: bool) -> None:
@@ -67,22 +78,58 @@ def _options(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage."""
+    """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    if not debug:
+        warnings.showwarning = _show_warning
+        logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
     try:
-        build_app()(args=arguments, prog_name="noiseflow")
-    except KeyboardInterrupt:
-        print("noiseflow: stopped", file=sys.stderr)
-        sys.exit(130)
+        build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
     except BrokenPipeError:
         sys.exit(1)
-    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
+    except Exception as error:
         if debug:
             raise
-        text = " ".join(str(error).split()) or type(error).__name__
-        print(f"noiseflow: {text}", file=sys.stderr)
+        print(f"noiseflow: {_in_one_line(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+def _in_one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if isinstance(error, (ValueError, ModuleNotFoundError)):
+        return text or type(error).__name__
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return (
+            f"out of memory ({text[:200] or 'no more could be had'}); take a smaller or binned input, or fewer voxels"
+        )
+    if isinstance(error, OSError):
+        return _system_error(error)
+    return (
+        f"unexpected {type(error).__name__}: {text[:300]}; this is a fault of noiseflow: please report it with --debug"
+    )
+
+
+def _system_error(error: OSError) -> str:
+    if error.errno is None or (error.filename is None and error.strerror is None):
+        return " ".join(str(error).split())
+    where = "" if error.filename is None else f"{error.filename}: "
+    fix = {
+        errno.ENOSPC: "free some space, or write to another disk",
+        errno.EDQUOT: "free some space, or write to another disk",
+        errno.EFBIG: "the limit on file sizes is reached: write to another disk, or raise it (ulimit -f)",
+        errno.EACCES: "check the permissions, or choose another path",
+        errno.EPERM: "check the permissions, or choose another path",
+        errno.EROFS: "choose a folder that can be written to",
+        errno.ENOENT: "check the path",
+        errno.ENAMETOOLONG: "choose a shorter name",
+    }.get(error.errno, "check the path and the disk")
+    return f"{where}{(error.strerror or 'system error').lower()}; {fix}"
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if category is UserWarning:
+        print(f"noiseflow: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 if __name__ == "__main__":

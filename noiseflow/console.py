@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any
 
@@ -60,20 +61,51 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
-    """A progress bar with ETA on a terminal, and only there."""
-    if json_mode or not sys.stderr.isatty():
+    """A progress bar with rate and time left on a terminal, a plain line every ten seconds in a log, none with ``--json``."""
+    if json_mode:
         yield lambda done, note: None
+        return
+    if not sys.stderr.isatty():
+        yield _LogLines(title, total)
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with RichProgress(
-        *columns, TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=Console(stderr=True)
-    ) as bar:
-        task = bar.add_task(title, total=total, note="")
-        yield lambda done, note: bar.update(task, completed=done, note=note)
+    rate = TextColumn("{task.fields[rate]}")
+    note_column = TextColumn("{task.fields[note]}")
+    with RichProgress(*columns, rate, TimeRemainingColumn(), note_column, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=total, note="", rate="")
+
+        def update(done: int, note: str) -> None:
+            speed = bar.tasks[0].speed
+            bar.update(task, completed=done, note=note, rate="" if speed is None else f"{speed:.3g}/s")
+
+        yield update
+
+
+class _LogLines:
+    """Progress for a log: a line with rate and time left, ten seconds after the last one at the earliest."""
+
+    INTERVAL = 10.0
+
+    def __init__(self, title: str, total: int) -> None:
+        self.title, self.total = title, total
+        self.started = self.last = time.monotonic()
+
+    def __call__(self, done: int, note: str) -> None:
+        now = time.monotonic()
+        if now - self.last < self.INTERVAL or done < 1:
+            return
+        self.last = now
+        rate = done / (now - self.started)
+        left = max(self.total - done, 0) / rate
+        print(
+            f"{self.title}: {done}/{self.total}, {rate:.3g}/s, about {left:.0f} s left{', ' + note if note else ''}",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def choose_device(name: str) -> Any:

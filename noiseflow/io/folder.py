@@ -20,13 +20,14 @@ def read_folder(folder: Path) -> ImageFile:
     """Stack the images of a folder; files of another type than most are left out.
 
     Raises:
-        ValueError: no images, or images of different sizes.
+        ValueError: fewer than two images, or images of different sizes.
     """
     from tifffile import natural_sorted
 
     files = [f for f in folder.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
-    if not files:
-        raise ValueError(f"{folder} is a folder without images; give an image file, or a folder of images")
+    if len(files) < 2:
+        found = f"with one image only, {files[0].name}" if files else "without images"
+        raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
     suffix, _ = Counter(file.suffix.lower() for file in files).most_common(1)[0]
     names = natural_sorted(file.name for file in files if file.suffix.lower() == suffix)
     images = [read(folder / name) for name in names]
