@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from noiseflow import Digitised
 from recon.noises import CountingNoise, OutlierNoise, SkewedNoise
@@ -33,10 +33,24 @@ class Acquisition:
     peak: float = 1.5
     intensity: float = 1.0
 
+    def signal(self, line_integrals: Tensor) -> Tensor:
+        """What the detector reads without noise."""
+        return self.intensity * (line_integrals if self.mode == "linear" else torch.exp(-line_integrals))
+
+    def unit(self, highest: float) -> float:
+        """From density, of largest line integral `highest`, to attenuation (times the gain, in linear mode): the factor."""
+        return self.peak / highest * (self.intensity if self.mode == "linear" else 1.0)
+
+    @property
+    def brightest(self) -> float:
+        """The largest signal there can be."""
+        return self.intensity * (self.peak if self.mode == "linear" else 1.0)
+
 
 ACQUISITIONS = {
     "none": Acquisition(None),
     "clipped": Acquisition(lambda: Digitised(SkewedNoise(0.05, 0.2), step=0.0, low=0.0, high=1.0)),
+    "gaussian": Acquisition(lambda: SkewedNoise(0.1, 0.0)),
     "skewed": Acquisition(lambda: SkewedNoise(0.05, 0.15, skewness=0.7)),
     "outliers": Acquisition(lambda: OutlierNoise(0.05, 0.1, share=0.05, factor=8.0)),
     "low-dose": Acquisition(lambda: CountingNoise(read_noise=0.5), mode="linear", peak=8.0),
@@ -74,21 +88,30 @@ def clean_tilt_series(
     if not highest > 0:
         raise ValueError("the volume is empty: there is nothing to project")
     line_integrals = line_integrals * (acquisition.peak / highest)
-    linear = acquisition.mode == "linear"
-    signal = acquisition.intensity * (line_integrals if linear else torch.exp(-line_integrals))
-    unit = acquisition.peak / highest * (acquisition.intensity if linear else 1.0)
+    signal = acquisition.signal(line_integrals)
+    unit = acquisition.unit(highest)
     return TiltSeries(signal.contiguous().numpy(), np.asarray(tilt_angles), pixel_size, acquisition.mode), unit
 
 
 def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
     """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        images = torch.from_numpy(tilt_series.images)
-        noisy = torch.stack([noise_model(image).sample(generator=generator) for image in images]).numpy()
-    if isinstance(noise_model, Digitised) and noise_model.step == 1:
-        noisy = noisy.astype(np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32)
+    noisy = np.stack(list(draw_noise(tilt_series.images, noise_model, seed=seed))).astype(stored_type(noise_model))
     return TiltSeries(noisy, tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
+
+
+def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> Iterator[NDArray[Any]]:
+    """One noisy reading of each clean image (y, x) after the other."""
+    generator = torch.Generator().manual_seed(seed)
+    for image in images:
+        with torch.no_grad():
+            yield noise_model(torch.from_numpy(np.array(image))).sample(generator=generator).numpy()
+
+
+def stored_type(noise_model: nn.Module | None) -> type[np.generic]:
+    """The number type of a detector's readings: integers where it rounds to whole numbers."""
+    if not isinstance(noise_model, Digitised) or noise_model.step != 1:
+        return np.float32
+    return np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32
 
 
 def tilt_range(text: str) -> NDArray[np.float64]:
@@ -104,3 +127,17 @@ def tilt_range(text: str) -> NDArray[np.float64]:
     if step == 0 or (stop - start) / step < 0:
         raise ValueError(f"tilts '{text}': the step does not lead from start to stop")
     return np.round(start + step * np.arange(int((stop - start) / step + 1e-6) + 1), 6)
+
+
+def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share: float) -> NDArray[np.float64]:
+    """Angles spread evenly over a tilt range that are none of its own: `share` of the way from one tilt to the next.
+
+    Args:
+        tilt_angles: degrees.
+        count: how many; fewer where there are fewer gaps.
+        share: between 0 and 1; different shares give different angles.
+    """
+    ordered = np.unique(tilt_angles)
+    between = ordered[:-1] + share * np.diff(ordered)
+    chosen = np.unique(np.round(np.linspace(0, len(between) - 1, min(count, len(between)))).astype(int))
+    return np.asarray(np.round(between[chosen], 6))

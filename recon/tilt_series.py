@@ -166,10 +166,14 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
     path = Path(path)
     size = tilt_series.pixel_size
     io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
-    angle_path = path.with_suffix(".rawtlt")
-    with io.atomic_path(angle_path) as partial:
-        partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_series.tilt_angles), encoding="utf-8")
-    return angle_path
+    return write_angles(path.with_suffix(".rawtlt"), tilt_series.tilt_angles)
+
+
+def write_angles(path: Path, tilt_angles: NDArray[np.floating[Any]]) -> Path:
+    """Write tilt angles, degrees, one a line; returns the path."""
+    with io.atomic_path(path) as partial:
+        partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_angles), encoding="utf-8")
+    return path
 
 
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.console import JsonOption, Output, SeedOption
+from noiseflow.console import JsonOption, Output, SeedOption, progress_bar
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
@@ -15,39 +15,56 @@ if TYPE_CHECKING:
 
     from recon.simulation import Acquisition
 
+_VALIDATION, _TEST = 14, 20
+
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(help="New folder for tilts.mrc, tilts.rawtlt, clean.mrc and truth.mrc.")],
-    size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
+    folder: Annotated[
+        Path, typer.Argument(help="Folder for tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc.")
+    ],
+    size: Annotated[int, typer.Option(help="Voxels along each edge, up to 1000 and beyond.")] = 64,
     tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees, both ends included.")] = "-59.5:57.5:1.5",
-    phantom: Annotated[str, typer.Option(help="shells, virions, filaments, particles or slab.")] = "shells",
+    phantom: Annotated[str, typer.Option(help="shells, virions, cell, filaments, particles or slab.")] = "shells",
     noise: Annotated[
-        str, typer.Option(help="clipped, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file.")
+        str,
+        typer.Option(
+            help="clipped, gaussian, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file."
+        ),
     ] = "clipped",
+    clip: Annotated[
+        bool, typer.Option("--clip", help="Clip readings to the range from zero to the brightest signal there can be.")
+    ] = False,
     mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Simulate a tilt series of a known volume, with known noise."""
-    import numpy as np
-
-    from recon.phantoms import make_phantom
-    from recon.simulation import add_noise, clean_tilt_series, tilt_range
-    from recon.tilt_series import Volume, write_tilt_series
+    """Simulate a tilt series of a known volume with known noise, and clean projections at other angles to judge by."""
+    from recon.simulation import angles_between, tilt_range
+    from recon.streaming import Simulation
 
     output = Output(json)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file; name a folder for the simulated series")
     angles = tilt_range(tilts)
+    if len(angles) < 2:
+        raise ValueError(f"--tilts {tilts}: a tilt series needs at least two tilts")
     acquisition, noise_model = _acquisition(noise, mode)
-    volume = make_phantom(phantom, size, generator=np.random.default_rng(seed))
-    clean, unit = clean_tilt_series(volume, angles, acquisition=acquisition)
-    noisy = clean if noise_model is None else add_noise(clean, noise_model, seed=seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tilt_series(folder / "tilts.mrc", noisy)
-    write_tilt_series(folder / "clean.mrc", clean)
-    Volume(volume * np.float32(unit)).write(folder / "truth.mrc")
+    if clip:
+        noise_model = _clipped(noise_model, acquisition.brightest)
+    stacks = {
+        "clean": angles,
+        "validation": angles_between(angles, _VALIDATION, share=1 / 3),
+        "test": angles_between(angles, _TEST, share=2 / 3),
+    }
+    simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed)
+    with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
+        simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
+    names = ("tilts", "clean", "validation", "test", "truth")
     output.result(
-        {"folder": folder, "tilts": folder / "tilts.mrc", "truth": folder / "truth.mrc", "num_tilts": len(angles)}
+        {"folder": folder, "num_tilts": len(angles), "mode": acquisition.mode}
+        | {name: folder / f"{name}.mrc" for name in names}
+        | {"validation_angles": stacks["validation"], "test_angles": stacks["test"]}
     )
 
 
@@ -57,7 +74,28 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
     from recon.simulation import ACQUISITIONS
 
     acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
-    noise_model = acquisition.noise() if acquisition.noise is not None else None
-    if noise not in ACQUISITIONS:
-        noise_model = load_noise_model(Path(noise))
-    return acquisition if mode is None else replace(acquisition, mode=parse_mode(mode)), noise_model
+    if mode is not None:
+        acquisition = replace(acquisition, mode=parse_mode(mode))
+    if noise in ACQUISITIONS:
+        return acquisition, acquisition.noise() if acquisition.noise is not None else None
+    if not Path(noise).exists():
+        raise ValueError(f"--noise {noise}: choose {', '.join(ACQUISITIONS)}, or give a noise-model file that exists")
+    noise_model = load_noise_model(Path(noise))
+    return replace(acquisition, intensity=_brightest_known(noise_model) / acquisition.brightest), noise_model
+
+
+def _brightest_known(noise_model: nn.Module | None) -> float:
+    """The highest signal that a model was fitted on: the brightest pixels shall have noise that it knows; 1 if not known."""
+    known = [getattr(module, "signal_high", None) for module in noise_model.modules()] if noise_model else []
+    highest = max((float(value) for value in known if value is not None), default=1.0)
+    return highest if highest > 0 else 1.0
+
+
+def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:
+    from noiseflow import Digitised
+
+    if noise_model is None:
+        raise ValueError("--clip clips noisy readings; choose a --noise, too")
+    if isinstance(noise_model, Digitised):
+        raise ValueError("--clip: this noise model has rails of its own; leave --clip out")
+    return Digitised(noise_model, step=0.0, low=0.0, high=high)
