@@ -8,27 +8,48 @@ from typing import Annotated
 import typer
 
 from noiseflow.console import JsonOption, Output
+from recon.commands.options import parse_mode
 
 
 def compare(
-    volume: Annotated[Path, typer.Argument(help="Volume to judge.")],
+    volume: Annotated[Path, typer.Argument(help="Volume to judge, of whatever program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
+    angles: Annotated[
+        Path | None, typer.Option(help="Angle file; projections at these angles are compared too.")
+    ] = None,
+    mode: Annotated[
+        str, typer.Option(help="Projections are line integrals (linear) or exp(-line integral) (transmission).")
+    ] = "linear",
+    report: Annotated[Path | None, typer.Option("--report", "--plot", help="Folder for a page with pictures.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
-    import numpy as np
-
     from noiseflow import io
-    from recon.metrics import SCALINGS, fourier_shell_correlation
-    from recon.metrics import compare as errors_of
+    from recon.comparison import THRESHOLDS, compare_volumes, comparison_report, error_table
+    from recon.tilt_series import Volume
 
     output = Output(json)
-    first, second = io.read(volume).data, io.read(reference).data
-    errors = {scaling: errors_of(first, second, scaling=scaling) for scaling in SCALINGS}
-    rows = [(scaling, f"{e.mse:.3e}", f"{e.psnr:.2f}", f"{e.dssim:.4f}") for scaling, e in errors.items()]
-    output.table(("scaling", "MSE", "PSNR (dB)", "DSSIM"), rows)
-    frequency, correlation = fourier_shell_correlation(first, second)
-    below = np.flatnonzero(correlation[1:] < 0.5)
-    crossing = float(frequency[below[0] + 1]) if below.size else 0.5
-    output.line(f"Fourier shell correlation stays above 0.5 up to {crossing:.3f} cycles per voxel")
-    output.result({"errors": {name: vars(e) for name, e in errors.items()}, "fsc_0.5": crossing, "fsc": correlation})
+    if report is not None and report.exists() and not report.is_dir():
+        raise ValueError(f"{report} is a file; name a folder for the report")
+    files = [io.read(path) for path in (volume, reference)]
+    first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
+    tilt_angles = None if angles is None else io.read_angles(angles)
+    comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode))
+    header, rows = error_table(comparison)
+    output.table(header, rows)
+    for threshold in THRESHOLDS:
+        crossing, size = comparison.crossings[threshold], second.voxel_size
+        length = f" ({size / crossing:.3g} Å)" if size and crossing else ""
+        output.line(
+            f"Fourier shell correlation stays above {threshold:g} up to {crossing:.3f} cycles per voxel{length}"
+        )
+    page = None
+    if report is not None:
+        report.mkdir(parents=True, exist_ok=True)
+        pictures = comparison_report(
+            first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
+        )
+        page = pictures.save(report / "index.html")
+        output.line(f"report: {page}")
+    found = comparison.as_dict()
+    output.result({"errors": found.pop("volume"), **found, "report": page})

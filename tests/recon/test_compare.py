@@ -1,0 +1,108 @@
+"""`noiseflow compare`: errors in three dimensions and in projections, shell correlation, pictures, and what it refuses."""
+
+import json
+
+import mrcfile
+import numpy as np
+import pytest
+import typer
+from scipy.ndimage import gaussian_filter
+from typer.testing import CliRunner
+
+from recon.commands.compare import compare as command
+from recon.comparison import compare_volumes, project
+from recon.metrics import compare, compare_images, fourier_shell_correlation, resolution
+from recon.phantoms import make_phantom
+from recon.tilt_series import Volume
+
+
+def run(*arguments):
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(command)
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def volumes():
+    truth = make_phantom("shells", 24, generator=np.random.default_rng(0))
+    noise = np.random.default_rng(1).normal(size=truth.shape).astype(np.float32)
+    return truth, truth + 0.1 * noise
+
+
+def write(path, array, voxel_size=10.0):
+    with mrcfile.new(path, data=array.astype(np.float32)) as mrc:
+        mrc.voxel_size = voxel_size
+    return path
+
+
+def test_command_tells_all_and_draws_it(volumes, tmp_path):
+    truth, noisy = volumes
+    (tmp_path / "angles.tlt").write_text("-30\n0\n45\n")
+    result = run(
+        write(tmp_path / "a.mrc", 3 * noisy - 1), write(tmp_path / "b.mrc", truth), "--angles", tmp_path / "angles.tlt",
+        "--report", tmp_path / "page", "--json",
+    )  # fmt: skip
+    left = (
+        0.01 * truth.var() / (0.01 + truth.var()) / float(np.ptp(truth)) ** 2
+    )  # a least-squares gain shrinks the noise
+    assert result["errors"]["affine"]["mse"] == pytest.approx(left, rel=0.05)
+    assert result["errors"]["raw"]["psnr"] < result["errors"]["affine"]["psnr"] - 5
+    assert set(result["projections"]) == {"raw", "affine", "min-max"}
+    assert 0 < result["fsc_0.5"] < result["fsc_0.143"] <= 0.5
+    assert (tmp_path / "page" / "index.html").read_text().count("<img") == 2
+
+
+def test_projections_are_compared_image_by_image(volumes):
+    truth, noisy = volumes
+    angles = np.array([-40.0, 10.0])
+    found = compare_volumes(Volume(noisy), Volume(truth), tilt_angles=angles, mode="transmission").projections["affine"]
+    pairs = zip(project(noisy, angles, mode="transmission"), project(truth, angles, mode="transmission"), strict=True)
+    by_hand = [compare(one, other, scaling="affine") for one, other in pairs]
+    assert found.psnr == pytest.approx(np.mean([errors.psnr for errors in by_hand]))
+    assert found.dssim == pytest.approx(np.mean([errors.dssim for errors in by_hand]))
+
+
+def test_every_image_is_scaled_by_itself():
+    images = np.random.default_rng(0).random((3, 16, 16))
+    gains = np.array([1.0, 5.0, 0.2])[:, None, None]
+    assert compare_images(gains * images + gains, images, scaling="affine").mse == pytest.approx(0, abs=1e-20)
+    with pytest.raises(ValueError, match="shapes"):
+        compare_images(images, images[:2])
+
+
+def test_resolution_is_where_the_curve_crosses():
+    frequency = np.linspace(0, 0.5, 6)
+    correlation = np.array([0.0, 1.0, 0.8, 0.4, 0.1, 0.0])
+    assert resolution(frequency, correlation, 0.5) == pytest.approx(0.275)
+    assert resolution(frequency, correlation, 0.143) == pytest.approx(0.3 + 0.1 * (0.4 - 0.143) / 0.3)
+    assert resolution(frequency, np.ones(6), 0.5) == 0.5
+    assert resolution(frequency, np.zeros(6), 0.5) == 0.0
+
+
+def test_blurring_costs_resolution():
+    noise = np.random.default_rng(0).normal(size=(32, 32, 32))
+    other = np.random.default_rng(1).normal(size=(32, 32, 32))
+    crossings = [
+        resolution(*fourier_shell_correlation(gaussian_filter(noise, blur) + 0.05 * other, noise), 0.5)
+        for blur in (0.7, 1.0, 1.4)
+    ]
+    assert crossings == sorted(crossings, reverse=True)
+    # a Gaussian of width b leaves half the correlation where exp(-(2π f b)²/2) = 0.05 / √3
+    expected = [np.sqrt(2 * np.log(np.sqrt(3) / 0.05)) / (2 * np.pi * blur) for blur in (1.4,)]
+    assert crossings[2] == pytest.approx(expected[0], abs=0.02)
+
+
+def test_what_cannot_be_compared_gets_one_clear_line(volumes, tmp_path):
+    truth, noisy = volumes
+    a = write(tmp_path / "a.mrc", truth)
+    with pytest.raises(ValueError, match=r"24 x 24 x 24 voxels and the reference 24 x 24 x 20"):
+        run(a, write(tmp_path / "small.mrc", truth[..., :20]))
+    with pytest.raises(ValueError, match="10 Å in the volume and 12 Å"):
+        run(a, write(tmp_path / "coarse.mrc", noisy, voxel_size=12.0))
+    with pytest.raises(ValueError, match="volume \\(z, y, x\\) is needed"):
+        run(a, write(tmp_path / "image.mrc", truth[0]))
+    with pytest.raises(ValueError, match="flat"):
+        run(a, write(tmp_path / "flat.mrc", np.ones_like(truth)))
