@@ -1,0 +1,122 @@
+"""One row of the accuracy table: a model fitted to a known noise and judged on noise it has not seen."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import noise_rivals
+import numpy as np
+import torch
+from noise_rivals import PaperFlow
+from noise_truths import clean_image, noises
+from torch import Tensor, nn
+
+import noiseflow
+from noiseflow import metrics
+from noiseflow.console import Output
+from noiseflow.selection import select
+
+OURS = ("Gaussian", "SignalDependentGaussian", "PoissonGaussian", "Mixture", "RadialFlow", "SplineFlow", "PhysicsFlow")
+MODELS = ("automatic", *OURS, "zuko", "normflows", "paper", "paper-as-published")
+"""Rows of every noise: the automatic choice, each of our models, the rivals."""
+NOISES = tuple(noises())
+_FRESH = 4
+_HELD_OUT = 0.2
+
+
+def measure(noise: str, model: str, *, size: int, num_steps: int, seed: int) -> dict[str, Any]:
+    """Fit one model to one noise; all figures in nats per pixel."""
+    truth, signals = noises()[noise].model, noises()[noise].signals
+    clean = clean_image(*signals, size).reshape(-1)
+    with torch.no_grad():
+        noisy = truth(clean).sample(generator=torch.Generator().manual_seed(seed))
+    # NumPy's stream, as in `select`: noise that was sampled with the same seed must not decide which pixels judge
+    apart = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < _HELD_OUT)
+    fitted, row = fit(model, clean, noisy, apart, num_steps=num_steps, seed=seed)
+    row = {"noise": noise, "model": model, "label": model, "size": size, "num_steps": num_steps, "seed": seed} | row
+    return row | judge(truth, fitted, clean, noisy, apart, seed=seed)
+
+
+def judge(
+    truth: nn.Module, fitted: nn.Module, clean: Tensor, noisy: Tensor, apart: Tensor, *, seed: int
+) -> dict[str, float]:
+    """KL on fresh noise, the gap of the held-out likelihood to the truth's on the same pixels, marginal JSD and its floor."""
+    kl, error = metrics.kl_divergence(truth, fitted, clean.repeat(_FRESH), seed=seed + 1000)
+    with torch.no_grad():
+        fresh = truth(clean).sample(generator=torch.Generator().manual_seed(seed + 2000))
+    true, found = (metrics.pixel_log_prob(each, clean[apart], noisy[apart]) for each in (truth, fitted))
+    divergence = metrics.divergence(fitted, clean, fresh)
+    row = {"kl": kl, "kl_error": error, "nll": -float(found.mean()), "nll_gap": float((true - found).mean())}
+    return row | {"jsd": divergence.jsd, "jsd_floor": divergence.jsd_floor}
+
+
+def fit(
+    name: str,
+    clean: Tensor,
+    noisy: Tensor,
+    apart: Tensor,
+    *,
+    num_steps: int,
+    seed: int,
+    changes: dict[str, Any] | None = None,
+) -> tuple[nn.Module, dict[str, Any]]:
+    """A fitted model and what its row says of the fit; `changes` alter a rival's settings."""
+    if name == "automatic":
+        started = time.perf_counter()
+        found = select(clean, noisy, held_out=_HELD_OUT, num_steps=num_steps, seed=seed)
+        return found.chosen.model, {
+            "label": f"automatic: {found.chosen.name}",
+            "chosen": found.chosen.name,
+            "seconds": time.perf_counter() - started,
+        }
+    signal, observation = clean[~apart], noisy[~apart]
+    if name.startswith("paper"):
+        return _paper(signal, observation, as_published=name != "paper", seed=seed)
+    settings: dict[str, Any] = {}
+    if name in OURS:
+        model: nn.Module = getattr(noiseflow, name)()
+    else:
+        model, settings = noise_rivals.make(name, changes or {})
+    digitisation = noiseflow.detect_digitisation(noisy.numpy())
+    if digitisation.found:
+        model = noiseflow.Digitised(model, *digitisation)
+    steps = {"num_steps": settings.get("num_steps", num_steps)}
+    rate = {"learning_rate": settings["learning_rate"]} if settings else {}
+    generator = torch.Generator().manual_seed(seed)
+    result = noiseflow.fit(model, signal, observation, digitise=False, generator=generator, **steps, **rate)
+    return model, {"seconds": result.seconds, "recoveries": result.recoveries, "settings": settings}
+
+
+def _paper(signal: Tensor, observation: Tensor, *, as_published: bool, seed: int) -> tuple[nn.Module, dict[str, Any]]:
+    model = PaperFlow(as_published=as_published)
+    seconds = model.fit(signal, observation, seed=seed)
+    return model, {"seconds": seconds, "integral": model.integral(float(signal.median()))}
+
+
+SEARCH_NOISES = ("gamma", "student-t")
+SEARCH_GRID = {"transforms": (1, 3), "learning_rate": (5e-3, 1.5e-2)}
+
+
+def search(output: Output, *, size: int = 128, num_steps: int = 500) -> Iterator[dict[str, Any]]:
+    """Mean KL of the rivals over two noises for every setting of a small grid; yields a row each."""
+    for model in ("zuko", "normflows"):
+        for values in itertools.product(*SEARCH_GRID.values()):
+            setting = dict(zip(SEARCH_GRID, values, strict=True))
+            started = time.perf_counter()
+            kls = [_searched(model, noise, size, setting | {"num_steps": num_steps}) for noise in SEARCH_NOISES]
+            row = {"model": model, "setting": setting, "kl": sum(kls) / len(kls), "size": size}
+            row["seconds"] = (time.perf_counter() - started) / len(kls)
+            output.line(f"{model} {setting}: mean KL {row['kl']:.4f}, {row['seconds']:.0f} s a fit")
+            yield row
+
+
+def _searched(model: str, noise: str, size: int, setting: dict[str, Any]) -> float:
+    truth = noises()[noise]
+    clean = clean_image(*truth.signals, size).reshape(-1)
+    noisy = truth.model(clean).sample(generator=torch.Generator().manual_seed(1))
+    apart = torch.from_numpy(np.random.default_rng(1).random(clean.numel()) < _HELD_OUT)
+    fitted, _ = fit(model, clean, noisy, apart, num_steps=0, seed=1, changes=setting)
+    return metrics.kl_divergence(truth.model, fitted, clean.repeat(_FRESH), seed=1000)[0]
