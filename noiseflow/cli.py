@@ -15,7 +15,11 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from noiseflow.console import Invocation, invoked
+
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
+_TYPED = "noiseflow.typed"
+_UNASKED = ("DEFAULT", "DEFAULT_MAP")
 
 
 def build_app() -> typer.Typer:
@@ -36,10 +40,23 @@ def build_app() -> typer.Typer:
 
 
 class _ListCommand(TyperCommand):
-    """A command whose list options take several values: ``--short a b c`` for ``--short a --short b --short c``; Ctrl-C
-    ends it with one line."""
+    """A command that remembers how it was called, and whose list options take several values.
+
+    ``--short a b c`` stands for ``--short a --short b --short c``; Ctrl-C ends it with one line.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        given = {name: ctx.get_parameter_source(name).name not in _UNASKED for name in ctx.params}
+        options = {name: (value, given[name]) for name, value in ctx.params.items()}
+        try:
+            with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+                return super().invoke(ctx)
+        except KeyboardInterrupt:
+            print(f"noiseflow: {self.name} stopped; no unfinished output was left", file=sys.stderr)
+            raise typer.Exit(130) from None
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta[_TYPED] = tuple(args)
         lists = {name for option in self.params if getattr(option, "multiple", False) for name in option.opts}
         spread: list[str] = []
         current = None
@@ -51,13 +68,6 @@ class _ListCommand(TyperCommand):
             spread.append(argument)
         rest: list[str] = super().parse_args(ctx, spread)
         return rest
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            print(f"noiseflow: {self.name} stopped; no unfinished output was left", file=sys.stderr)
-            raise typer.Exit(130) from None
 
 
 def _show_version(asked: bool) -> None:

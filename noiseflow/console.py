@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
@@ -123,3 +126,39 @@ def choose_device(name: str) -> Any:
             "--device cuda: torch sees no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
         )
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """How the running command was called.
+
+    Attributes:
+        words: the command's name and its arguments as typed.
+        options: parameter → its value, and whether the user gave it.
+    """
+
+    words: tuple[str, ...]
+    options: dict[str, tuple[Any, bool]]
+
+    @property
+    def command_line(self) -> str:
+        """The command as one would type it again."""
+        return shlex.join(["noiseflow", *self.words])
+
+
+_INVOCATION: ContextVar[Invocation | None] = ContextVar("invocation", default=None)
+
+
+def invocation() -> Invocation | None:
+    """How the running command was called; None where no command runs."""
+    return _INVOCATION.get()
+
+
+@contextlib.contextmanager
+def invoked(call: Invocation) -> Iterator[None]:
+    """Within the block, `invocation` returns this call."""
+    token = _INVOCATION.set(call)
+    try:
+        yield
+    finally:
+        _INVOCATION.reset(token)

@@ -28,10 +28,10 @@ def demo(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; name a folder with --out")
     out.mkdir(parents=True, exist_ok=True)
-    report = Report("noiseflow demo")
+    report = Report("noiseflow demo", "Everything below was made by the commands shown; repeat them on your own files.")
     report.text(
         "Three uses on real data: calibrate a detector from a short and a long exposure, sample its noise, and reconstruct "
-        "volumes from noisy tilt series. Each command below can be repeated on your own files."
+        "volumes from noisy tilt series."
     )
     run = _Runner(output, report, str(seed))
     with as_file(files("noiseflow") / "data") as data:
@@ -46,7 +46,16 @@ def demo(
         run("reconstruct", needle, "-o", out / "needle.mrc", "--mode", "linear", "--report", out / "needle")
     phantom = out / "phantom"
     run("simulate", phantom, "--size", "64")
-    run("reconstruct", phantom / "tilts.mrc", "-o", out / "phantom.mrc", "--report", out / "phantom-report")
+    run(
+        "reconstruct",
+        phantom / "tilts.mrc",
+        "-o",
+        out / "phantom.mrc",
+        "--report",
+        out / "phantom-report",
+        "--reference",
+        phantom / "truth.mrc",
+    )
     run("compare", out / "phantom.mrc", phantom / "truth.mrc")
     page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
@@ -65,7 +74,7 @@ class _Runner:
         words = [command, *map(str, arguments)]
         shown = "noiseflow " + " ".join(words)
         self.output.line(f"\n$ {shown}")
-        self.report.text(f"$ {shown}")
+        self.report.command(f"$ {shown}")
         if command != "compare":
             words += ["--seed", self.seed]
         printed = textio.StringIO()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,6 +53,13 @@ def reconstruct(
     save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
+    fsc: Annotated[
+        bool,
+        typer.Option("--fsc", help="Reconstruct the even and the odd tilts too: their correlation is in the report."),
+    ] = False,
+    reference: Annotated[
+        Path | None, typer.Option(help="Volume that the report correlates the result with, where --fsc is not given.")
+    ] = None,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -59,7 +67,7 @@ def reconstruct(
     """Reconstruct a clean volume, and the noise model with it, from one noisy tilt series."""
     from noiseflow import io
     from recon.methods import reconstruct as run
-    from recon.report import reconstruction_report
+    from recon.report import even_odd, read_reference, reconstruction_report
     from recon.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
 
     output = Output(json)
@@ -70,21 +78,27 @@ def reconstruct(
     if invert_tilt:
         tilt_series = TiltSeries(tilt_series.images, -tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
     fixed = load_noise_model(noise_model)
+    grid = VolumeGrid.of(tilt_series, thickness)
+    truth = None if reference is None else read_reference(reference, grid)
+    solve = partial(
+        run,
+        grid=grid,
+        method=method,
+        weight=weight,
+        num_steps=steps,
+        window=window,
+        denoiser=denoiser,
+        noise_model=fixed,
+        seed=seed,
+        device=choose_device(device),
+    )
     started = time.perf_counter()
     with progress_bar(f"reconstruct ({method})", steps or 150, json_mode=json) as progress:
-        outcome = run(
-            tilt_series,
-            VolumeGrid.of(tilt_series, thickness),
-            method=method,
-            weight=weight,
-            num_steps=steps,
-            window=window,
-            denoiser=denoiser,
-            noise_model=fixed,
-            seed=seed,
-            device=choose_device(device),
-            progress=progress,
-        )
+        outcome = solve(tilt_series, progress=progress)
+    halves = None
+    if fsc and report is not None:
+        first, second = (solve(half).volume for half in even_odd(tilt_series))
+        halves = first, second
     rows = _figures(tilt_series, outcome, time.perf_counter() - started)
     outcome.volume.write(out)
     if save_noise_model is not None:
@@ -94,7 +108,11 @@ def reconstruct(
     page = None
     if report is not None:
         report.mkdir(parents=True, exist_ok=True)
-        page = reconstruction_report(tilt_series, outcome, list(rows.items())).save(report / "index.html")
+        inputs = [path for path in (tilts, angles, noise_model) if path is not None]
+        content = reconstruction_report(
+            tilt_series, outcome, list(rows.items()), inputs=inputs, seed=seed, halves=halves, reference=truth
+        )
+        page = content.save(report / "index.html")
         output.line(f"report: {page}")
     fit = outcome.fit_result
     output.result(

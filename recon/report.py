@@ -1,76 +1,224 @@
-"""The pictures of a reconstruction that a user wants first."""
+"""The report of a reconstruction: a page to look at, that also says why it may be believed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import torch
 
-from noiseflow.report import Report, new_figure, show_image
+from noiseflow import io
+from noiseflow.console import invocation
+from noiseflow.report import COLOURS, Report, make_sprites, new_chart, provenance
+from noiseflow.spatial import spatial_structure
 from recon.methods import Outcome
-from recon.tilt_series import TiltSeries
+from recon.metrics import fourier_shell_correlation
+from recon.report_noise import noise_charts
+from recon.tilt_series import TiltSeries, Volume, VolumeGrid
+
+_VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
+_NOT_SETTINGS = frozenset({"tilts", "out", "report", "json", "seed", "device", "fsc", "reference"})
+_NAMES = {
+    "transmission": "bright field, I₀·exp(−line integral)",
+    "linear": "linear (HAADF, EDX), line integral + offset",
+}
 
 
-def reconstruction_report(tilt_series: TiltSeries, outcome: Outcome, figures: Sequence[tuple[str, str]]) -> Report:
-    """A page with three orthogonal slices, data against prediction, the fit's course and a table of figures.
+def reconstruction_report(
+    tilt_series: TiltSeries,
+    outcome: Outcome,
+    figures: Sequence[tuple[str, str]],
+    *,
+    inputs: Sequence[str | Path] = (),
+    seed: int | None = None,
+    halves: tuple[Volume, Volume] | None = None,
+    reference: Volume | None = None,
+) -> Report:
+    """A page with slices, the tilt series against its prediction, the noise, the fit's course, settings and provenance.
 
     Args:
         tilt_series: the data.
         outcome: what was reconstructed from it.
         figures: rows of the table, (name, value).
+        inputs: files that were read, for their checksums.
+        seed: of the random choices.
+        halves: reconstructions of the even and of the odd tilts, for the Fourier shell correlation.
+        reference: a volume to correlate with instead.
     """
-    report = Report(f"Reconstruction ({outcome.method})")
-    report.table(("figure", "value"), figures)
-    _add_slices(report, outcome)
-    _add_residual(report, tilt_series, outcome)
-    _add_history(report, outcome)
+    name = Path(inputs[0]).name if inputs else "tilt series"
+    report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
+    report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
+    _add_volume(report, outcome.volume)
+    _add_tilts(report, tilt_series, outcome)
+    _add_noise(report, tilt_series, outcome)
+    _add_course(report, outcome)
+    _add_resolution(report, outcome.volume, halves, reference)
+    report.heading("Settings and choices")
+    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    report.heading("Provenance")
+    report.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
     return report
 
 
-def _add_slices(report: Report, outcome: Outcome) -> None:
-    volume = outcome.volume.attenuation
-    z, y, x = (size // 2 for size in volume.shape)
-    limits = float(np.percentile(volume, 0.5)), max(float(np.percentile(volume, 99.8)), float(volume.max()) * 0.05)
-    figure, axes = new_figure(3)
-    for axis, image, title in zip(
-        axes[0],
-        (volume[z], volume[:, y], volume[:, :, x]),
-        (f"z = {z} (y, x)", f"y = {y} (z, x)", f"x = {x} (z, y)"),
-        strict=True,
-    ):
-        show_image(axis, image, title, limits=limits)
+def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
+    """The series of every other tilt, in the order of the stack, then of those between.
+
+    Raises:
+        ValueError: fewer than four tilts.
+    """
+    if tilt_series.num_tilts < 4:
+        raise ValueError(f"{tilt_series.num_tilts} tilts cannot be halved for --fsc; leave it out")
+    for half in (slice(0, None, 2), slice(1, None, 2)):
+        mask = None if tilt_series.mask is None else tilt_series.mask[half]
+        images, angles = tilt_series.images[half], tilt_series.tilt_angles[half]
+        yield replace(tilt_series, images=images, tilt_angles=angles, mask=mask)
+
+
+def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
+    """A volume to correlate with.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, or is no volume on this grid.
+    """
+    image = io.read(path)
+    if image.data.shape != grid.shape:
+        raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
+    io.require_finite(image.data, path)
+    return Volume(image.data.astype(np.float32), None if image.voxel_size is None else image.voxel_size[0])
+
+
+def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, str]]:
+    """Rows (setting, value, evidence): what the user gave, what was left at its default, what the data decided."""
+    called = invocation()
+    rows = [
+        (name.replace("_", " "), "none" if value is None else str(value), "given" if given else "default")
+        for name, (value, given) in (called.options if called else {}).items()
+        if name not in _NOT_SETTINGS and (given or value is not None) and name not in outcome.choices
+    ]
+    depth = outcome.volume.attenuation.shape[0]
+    if not any(name == "thickness" for name, _, _ in rows):
+        rows.append(("thickness", f"{depth} voxels", "as deep as the images are wide, where nothing else is asked for"))
+    return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
+
+
+def _evidence(name: str, outcome: Outcome) -> str:
+    tried = outcome.weights_tried
+    called = invocation()
+    if called is not None and called.options.get(name, (None, False))[1]:
+        return "given"
+    if name == "weight" and tried:
+        return f"lowest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
+    if name == "noise model" and outcome.method == "joint":
+        return (
+            "rails and rounding as the readings show them; of the candidates the one that predicts held-out pixels best"
+        )
+    if name in ("intensity", "offset"):
+        return "estimated from the images, then learnt in the fit"
+    return "set by the method" if outcome.method != "joint" else "found from the data"
+
+
+def _text(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
+
+
+def _add_volume(report: Report, volume: Volume) -> None:
+    values = volume.attenuation
+    sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
+    low, high = float(np.percentile(values, 0.5)), float(np.percentile(values, 99.8))
+    high = max(high, low + 0.05 * (float(values.max()) - low))
+    size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading("Volume")
-    report.figure(figure, caption="Attenuation per voxel in three orthogonal slices through the centre.")
+    options = {
+        "original": list(values.shape),
+        "limits": [low, high],
+        "voxelSize": size,
+        "unit": "attenuation per voxel",
+    }
+    caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
+    report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
 
-def _add_residual(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
     images, predicted = tilt_series.images.astype(np.float32), outcome.projections
-    tilt, row = int(np.argmin(np.abs(tilt_series.tilt_angles))), images.shape[1] // 2
-    figure, axes = new_figure(3, 2)
-    for axis, data, model, title in (
-        (axes[0], images[tilt], predicted[tilt], f"tilt {tilt_series.tilt_angles[tilt]:.1f}°"),
-        (axes[1], images[:, row], predicted[:, row], f"sinogram of row {row}"),
-    ):
-        limits = float(np.percentile(data, 0.5)), float(np.percentile(data, 99.5))
-        show_image(axis[0], data, f"{title}: observed", limits=limits)
-        show_image(axis[1], model, "predicted clean", limits=limits)
-        show_image(axis[2], data - model, "residual")
-    report.heading("Data and prediction")
-    report.figure(figure, caption="A good fit leaves noise without structure in the residual.")
+    ends = np.percentile(images, (0.1, 99.9))
+    limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
+    sprites = make_sprites(
+        np.concatenate([images, predicted]), most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True
+    )
+    size = tilt_series.pixel_size
+    data = {
+        "sprites": sprites.as_json(),
+        "angles": tilt_series.tilt_angles.tolist(),
+        "start": int(np.argmin(np.abs(tilt_series.tilt_angles))),
+        "limits": [float(end) for end in np.percentile(images, (0.5, 99.5))],
+        "names": ["data", "clean projection"],
+        "unit": "detector units",
+        "pixelSize": None if size is None else size * images.shape[2] / sprites.shape[2],
+    }
+    report.heading("Tilt series")
+    words = sprites.in_words().replace(f"{sprites.original[0]} × ", "").replace(f"{sprites.shape[0]} × ", "")
+    caption = (
+        f"A good fit leaves noise without structure in the residuals; waves along the tilts mean misalignment. {words}"
+    )
+    report.widget("tilts", data, caption=caption)
 
 
-def _add_history(report: Report, outcome: Outcome) -> None:
-    if outcome.fit_result is None or not outcome.fit_result.history:
+def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+    if outcome.noise_model is None:
         return
-    figure, axes = new_figure(1)
-    history = outcome.fit_result.history
-    axes[0][0].plot(list(history), list(history.values()), marker=".")
-    axes[0][0].set_xlabel("step")
-    axes[0][0].set_ylabel("held-out NLL (nats per pixel)")
-    report.heading("Course of the fit")
-    report.figure(figure, caption="Negative log-likelihood of pixels that the fit never saw.")
+    images = tilt_series.images.astype(np.float32)
+    use = slice(None) if tilt_series.mask is None else tilt_series.mask
+    report.heading("Noise")
+    caption = (
+        "The data are all pixels of the tilt series, against the clean projections of the volume; the model is exact."
+    )
+    report.charts(
+        noise_charts(outcome.noise_model, outcome.projections[use].ravel(), images[use].ravel()), caption=caption
+    )
+    device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
+    pair = (torch.from_numpy(np.ascontiguousarray(stack)).to(device) for stack in (outcome.projections, images))
+    report.text(f"Residuals under this model: {spatial_structure(outcome.noise_model, *pair).in_words()}.")
+
+
+def _add_course(report: Report, outcome: Outcome) -> None:
+    charts = []
+    if outcome.fit_result is not None and outcome.fit_result.history:
+        history = outcome.fit_result.history
+        figure, axis = new_chart("Course of the fit", x="step", y="held-out NLL, nats per pixel")
+        axis.plot(list(history), list(history.values()), color=COLOURS["accent"], marker="o", markersize=2.5)
+        charts.append(figure)
     if outcome.weights_tried:
-        rows = [(f"{weight:.4g}", f"{nll:.5f}") for weight, nll in sorted(outcome.weights_tried.items())]
-        report.heading("Choice of the weight")
-        caption = "Held-out likelihood of a slab of slices; the weight is where the parabola through the best three is lowest."
-        report.table(("weight of the total variation", "held-out NLL"), rows, caption=caption)
+        tried = sorted(outcome.weights_tried.items())
+        figure, axis = new_chart("Choice of the weight", x="weight of the total variation", y="held-out NLL")
+        axis.semilogx(*zip(*tried, strict=True), color=COLOURS["accent"], marker="o", markersize=4)
+        axis.axvline(float(outcome.choices["weight"]), color=COLOURS["warm"], linewidth=1.5)
+        charts.append(figure)
+    if charts:
+        report.heading("Convergence")
+        report.charts(charts, caption="Negative log-likelihood of pixels that the fit never saw: lower is better.")
+
+
+def _add_resolution(
+    report: Report, volume: Volume, halves: tuple[Volume, Volume] | None, reference: Volume | None
+) -> None:
+    if halves is not None:
+        pair, level, what = halves, 0.143, "reconstructions of the even and of the odd tilts"
+    elif reference is not None:
+        pair, level, what = (volume, reference), 0.5, "the volume and the reference"
+    else:
+        return
+    frequency, correlation = fourier_shell_correlation(pair[0].attenuation, pair[1].attenuation)
+    figure, axis = new_chart("Fourier shell correlation", x="cycles per voxel", y="correlation")
+    axis.plot(frequency, correlation, color=COLOURS["accent"])
+    axis.axhline(level, color=COLOURS["warm"], linewidth=1, linestyle="--")
+    axis.set_ylim(min(0.0, float(correlation.min())), 1.05)
+    below = np.flatnonzero(correlation[1:] < level)
+    reach = float(frequency[below[0] + 1]) if below.size else 0.5
+    report.heading("Resolution")
+    text = f"Between {what}; it falls below {level} at {reach:.3f} cycles per voxel."
+    if not below.size:
+        text = f"Between {what}; it stays above {level} at all frequencies."
+    report.charts([figure], caption=text)

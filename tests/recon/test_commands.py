@@ -45,7 +45,7 @@ def test_every_method_writes_a_volume_and_a_report(series, tmp_path, method):
         assert volume.data.shape == (16, 16, 16)
         assert float(volume.voxel_size.z) == pytest.approx(7.5)
         assert np.isfinite(volume.data).all()
-    assert "<img" in (page / "index.html").read_text()
+    assert 'data-widget="volume"' in (page / "index.html").read_text(encoding="utf-8")
     assert run("compare", out, series / "truth.mrc", "--json")["errors"]["affine"]["psnr"] > 5
 
 

@@ -1,0 +1,18 @@
+"""Building blocks of the self-contained HTML report: the page, its figures and interactive pictures, provenance."""
+
+from noiseflow.report.charts import COLOURS, add_legend, new_chart, new_figure, show_image
+from noiseflow.report.page import Report
+from noiseflow.report.provenance import provenance
+from noiseflow.report.sprites import Sprites, make_sprites
+
+__all__ = [
+    "COLOURS",
+    "Report",
+    "Sprites",
+    "add_legend",
+    "make_sprites",
+    "new_chart",
+    "new_figure",
+    "provenance",
+    "show_image",
+]

@@ -1,0 +1,118 @@
+"""The self-contained HTML page: text, tables, figures and interactive pictures that work offline, in light and dark."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from noiseflow.io import atomic_path, check_output
+from noiseflow.report.charts import themed_svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SCRIPTS = ("core.js", "volume.js", "tilts.js", "start.js")
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+
+
+class Report:
+    """An HTML page that grows part by part; it asks nothing of any network.
+
+    Args:
+        title: page title; this and all other text is escaped.
+        lead: a sentence under the title.
+    """
+
+    def __init__(self, title: str, lead: str = "") -> None:
+        self.title, self.lead = title, lead
+        self._parts: list[str] = []
+
+    def heading(self, text: str) -> None:
+        """Start a section."""
+        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+
+    def text(self, text: str) -> None:
+        """Add a paragraph."""
+        self._parts.append(f"<p>{html.escape(text)}</p>")
+
+    def command(self, text: str) -> None:
+        """Add a command as it would be typed."""
+        self._parts.append(f'<p class="command">{html.escape(text)}</p>')
+
+    def facts(self, facts: Sequence[tuple[str, str]]) -> None:
+        """Add the few figures that matter most, (name, value), as cards."""
+        cards = "".join(f"<div><dt>{html.escape(n)}</dt><dd>{html.escape(v)}</dd></div>" for n, v in facts)
+        self._parts.append(f'<dl class="facts">{cards}</dl>')
+
+    def table(
+        self, header: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str = "", prose: bool = False
+    ) -> None:
+        """Add a table; the first column is left-aligned, and with `prose` all are, and long cells wrap."""
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        note = f'<p class="note">{html.escape(caption)}</p>' if caption else ""
+        kind = ' class="prose"' if prose else ""
+        self._parts.append(f'<div class="scroll"><table{kind}><tr>{head}</tr>{body}</table></div>{note}')
+
+    def figure(self, figure: Figure, *, caption: str) -> None:
+        """Add a matplotlib figure, embedded as PNG on white; use it for images, and `charts` for curves."""
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches="tight")
+        data = base64.b64encode(stream.getvalue()).decode()
+        text = html.escape(caption)
+        self._parts.append(
+            f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
+        )
+
+    def charts(self, figures: Sequence[Figure], *, caption: str) -> None:
+        """Add small figures of `new_chart` side by side, as many in a row as fit; they follow light and dark."""
+        drawn = "".join(themed_svg(figure) for figure in figures)
+        self._parts.append(
+            f'<figure><div class="charts">{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>'
+        )
+
+    def widget(self, kind: str, data: dict[str, Any], *, caption: str) -> None:
+        """Add an interactive picture: ``volume`` or ``tilts``, with the data its script in ``assets`` reads."""
+        stored = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+        self._parts.append(
+            f'<figure data-widget="{html.escape(kind)}"><script type="application/json">{stored}</script>'
+            "<noscript><p>This picture needs JavaScript.</p></noscript>"
+            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        )
+
+    def include(self, path: str | Path) -> None:
+        """Add the content of a page that another report saved, as a part of this one."""
+        page = Path(path).read_text(encoding="utf-8")
+        title = page.partition("<title>")[2].partition("</title>")[0]
+        content = page.partition("<main>")[2].rpartition("</main>")[0]
+        if not content:
+            raise ValueError(f"{path} is not a noiseflow report; it has no content to include")
+        content = content.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
+        self._parts.append(f'<section class="part"><h2>{title}</h2>{content}</section>')
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page; returns its path."""
+        path = check_output(path, suffixes=frozenset({".html"}))
+        title, lead = html.escape(self.title), html.escape(self.lead)
+        page = (
+            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}"><title>{title}</title>'
+            '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
+            f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'
+            f'<p class="note">{lead}</p></header><nav class="contents" aria-label="Contents"></nav>'
+            f"<main>{''.join(self._parts)}</main></div>"
+            f"<script>'use strict';\n{''.join(map(_asset, _SCRIPTS))}</script></body></html>\n"
+        )
+        with atomic_path(path) as partial:
+            partial.write_text(page, encoding="utf-8")
+        return path
+
+
+def _asset(name: str) -> str:
+    return (files("noiseflow.report") / "assets" / name).read_text(encoding="utf-8")

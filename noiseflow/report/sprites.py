@@ -1,0 +1,135 @@
+"""Stacks of images as a few compressed sprite sheets that a page can carry and a browser can unpack."""
+
+from __future__ import annotations
+
+import base64
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SHEET = 2048
+_QUALITIES = (101, 90, 75, 60)
+_LOSSLESS = 101
+_MOST_HALVINGS = 12
+_PROBED = 6
+
+
+@dataclass(frozen=True)
+class Sprites:
+    """A stack as 8-bit images tiled on sheets.
+
+    Attributes:
+        sheets: WebP files; tiles run along rows, ``columns`` to a row, ``per_sheet`` to a sheet.
+        shape: (section, y, x) as stored.
+        original: (section, y, x) before it was made smaller.
+        columns, per_sheet: layout.
+        low, high: detector or volume units of the grey values 0 and 255.
+        lossless: whether the sheets hold the 8-bit values exactly.
+    """
+
+    sheets: tuple[bytes, ...]
+    shape: tuple[int, int, int]
+    original: tuple[int, int, int]
+    columns: int
+    per_sheet: int
+    low: float
+    high: float
+    lossless: bool
+
+    @property
+    def num_bytes(self) -> int:
+        """Size in the page, where it is written in base64."""
+        return sum(4 * math.ceil(len(sheet) / 3) for sheet in self.sheets)
+
+    def as_json(self) -> dict[str, Any]:
+        """What the page's script needs to unpack it."""
+        sheets = ["data:image/webp;base64," + base64.b64encode(sheet).decode() for sheet in self.sheets]
+        layout = {"shape": list(self.shape), "columns": self.columns, "perSheet": self.per_sheet}
+        return layout | {"low": self.low, "high": self.high, "sheets": sheets}
+
+    def in_words(self) -> str:
+        """How the stored stack differs from the original, for the reader of the page."""
+        depth = "8-bit grey values" if self.lossless else "8-bit grey values, compressed with slight losses"
+        if self.shape == self.original:
+            return f"Shown at full size in {depth}."
+        sizes = " × ".join(map(str, self.shape)), " × ".join(map(str, self.original))
+        return f"Shown at {sizes[0]}, averaged down from {sizes[1]} to keep this page small, in {depth}."
+
+
+def make_sprites(
+    stack: NDArray[Any],
+    *,
+    most_bytes: int = 6_000_000,
+    limits: tuple[float, float] | None = None,
+    keep_sections: bool = False,
+) -> Sprites:
+    """Pack a stack into sheets of at most 2048² pixels: exact where that is small enough, else compressed, else smaller.
+
+    Args:
+        stack: (section, y, x), finite.
+        most_bytes: of all sheets in base64.
+        limits: values of black and white; the smallest and largest by default.
+        keep_sections: make only y and x smaller, for stacks whose sections are separate views.
+
+    Raises:
+        ValueError: not a stack, or pixels that are not finite.
+    """
+    if stack.ndim != 3 or not stack.size:
+        raise ValueError(f"a stack (section, y, x) is needed; this array has shape {stack.shape}")
+    if not np.isfinite(stack).all():
+        raise ValueError("the stack has NaN or infinite pixels; replace them before drawing it")
+    low, high = limits or (float(stack.min()), float(stack.max()))
+    high = high if high > low else low + 1.0
+    small = np.asarray(stack)
+    for _ in range(_MOST_HALVINGS):
+        while max(small.shape[1:]) > _SHEET:
+            small = _halved(small, keep_sections)
+        grey = np.clip(np.rint((small.astype(np.float32) - low) * (255 / (high - low))), 0, 255).astype(np.uint8)
+        for quality in _QUALITIES:
+            if _expected_bytes(grey, quality) <= most_bytes:
+                sprites = _packed(grey, quality, stack.shape, (low, high))
+                if sprites.num_bytes <= most_bytes:
+                    return sprites
+        small = _halved(small, keep_sections)
+    raise ValueError(f"a stack of shape {stack.shape} does not fit {most_bytes} bytes; allow more")
+
+
+def _expected_bytes(grey: NDArray[np.uint8], quality: int) -> float:
+    """Size of the whole stack from a few of its sections: packing all of it at every quality would take minutes."""
+    chosen = grey[np.unique(np.linspace(0, len(grey) - 1, _PROBED).round().astype(int))]
+    return _packed(chosen, quality, chosen.shape, (0.0, 1.0)).num_bytes * len(grey) / len(chosen)
+
+
+def _packed(grey: NDArray[np.uint8], quality: int, original: Any, limits: tuple[float, float]) -> Sprites:
+    import cv2
+
+    count, height, width = grey.shape
+    columns = min(count, max(1, _SHEET // width))
+    per_sheet = min(count, columns * max(1, _SHEET // height))
+    sheets = []
+    for start in range(0, count, per_sheet):
+        tiles = grey[start : start + per_sheet]
+        rows = math.ceil(len(tiles) / columns)
+        sheet = np.zeros((rows, columns, height, width), np.uint8)
+        sheet.reshape(-1, height, width)[: len(tiles)] = tiles
+        image = np.ascontiguousarray(sheet.transpose(0, 2, 1, 3)).reshape(rows * height, columns * width)
+        _, encoded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+        sheets.append(encoded.tobytes())
+    return Sprites(tuple(sheets), grey.shape, tuple(original), columns, per_sheet, *limits, quality == _LOSSLESS)
+
+
+def _halved(stack: NDArray[Any], keep_sections: bool) -> NDArray[np.float32]:
+    """The stack averaged over 2 × 2 pixels, and pairs of sections; an odd last one is left out."""
+    sizes = [size if size == 1 or (axis == 0 and keep_sections) else size // 2 for axis, size in enumerate(stack.shape)]
+    steps = [1 if size == full else 2 for size, full in zip(sizes, stack.shape, strict=True)]
+    total = np.zeros(sizes, np.float32)
+    for offset in np.ndindex(*steps):
+        total += stack[
+            tuple(
+                slice(start, start + size * step, step) for start, size, step in zip(offset, sizes, steps, strict=True)
+            )
+        ]
+    return total / np.float32(math.prod(steps))
