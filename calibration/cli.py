@@ -43,10 +43,12 @@ def calibrate(
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.models import require_kind
     from calibration.report import write_report
-    from noiseflow.io import check_output
+    from noiseflow.io import check_folder, check_output
     from noiseflow.model_files import MODEL_SUFFIXES
 
     check_output(output, suffixes=MODEL_SUFFIXES)
+    if report is not None:
+        check_folder(report)
     require_kind(kind)
     chosen_device = _device(device)
     if not long and exposure_ratio is not None:

@@ -21,12 +21,12 @@ def demo(
     json: JsonOption = False,
 ) -> None:
     """Calibrate, sample and reconstruct on real data that ships with the library; ends with a report."""
+    from noiseflow.io import check_folder
     from noiseflow.report import Report
 
     output = Output(json)
     started = time.perf_counter()
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file; name a folder with --out")
+    check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     report = Report("noiseflow demo", "Everything below was made by the commands shown; repeat them on your own files.")
     report.text(

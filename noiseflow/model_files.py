@@ -15,6 +15,7 @@ import noiseflow
 from noiseflow.io import atomic_path, check_output
 
 FORMAT_VERSION = 1
+_DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
@@ -71,22 +72,18 @@ def load(path: str | Path) -> nn.Module:
     metadata, tensors = _open(Path(path))
     try:
         description = json.loads(metadata["model"])
+        sizes = _checked_sizes(description, sum(tensor.numel() for tensor in tensors.values()))
+        if max(sizes, default=0) > _LARGEST_USUAL_SIZE:
+            with torch.device("meta"):  # takes no memory, whatever the description claims
+                _check_parameters(_build(description), tensors)
         model = _build(description)
+        _check_parameters(model, tensors)
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
         raise ValueError(
             f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})"
         ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    expected = model.state_dict()
-    wrong = sorted(
-        set(expected) ^ set(tensors)
-        | {name for name in set(expected) & set(tensors) if expected[name].shape != tensors[name].shape}
-    )
-    if wrong:
-        raise ValueError(
-            f"{path}: parameters do not fit a {description['kind']}: {', '.join(wrong[:3])}; fit and save the model again"
-        )
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
     model.load_state_dict(tensors)
@@ -103,6 +100,29 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         "provenance": json.loads(metadata.get("provenance", "{}")),
         "library_version": metadata.get("library_version"),
     }
+
+
+def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> None:
+    expected = model.state_dict()
+    common = set(expected) & set(found)
+    wrong = sorted(set(expected) ^ set(found) | {name for name in common if expected[name].shape != found[name].shape})
+    if wrong:
+        names = ", ".join(name[-40:] for name in wrong[:3])
+        raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")
+
+
+def _checked_sizes(description: Mapping[str, Any], num_parameters: int, *, depth: int = 0) -> list[int]:
+    """All whole numbers among the arguments; refuses what could only cost memory and time: a size larger than the
+    parameters it would have, and models nested without end."""
+    inner = description.get("models", {})
+    if depth > _DEEPEST or len(inner) > _DEEPEST:
+        raise ValueError("models within models without end; fit and save the model again")
+    sizes = [abs(value) for value in description["arguments"].values() if isinstance(value, int)]
+    if max(sizes, default=0) > max(num_parameters, _LARGEST_USUAL_SIZE):
+        raise ValueError(f"a size of {max(sizes)} with {num_parameters} parameters; fit and save the model again")
+    for child in inner.values():
+        sizes += _checked_sizes(child, num_parameters, depth=depth + 1)
+    return sizes
 
 
 def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:

@@ -41,7 +41,7 @@ def reconstruct(
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
     ] = None,
     weight: Annotated[float | None, typer.Option(help="Weight of the total variation.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps of the fit, or iterations.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
     window: Annotated[
         str | None,
         typer.Option(help="Of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen by itself if not given."),
@@ -72,8 +72,8 @@ def reconstruct(
 
     output = Output(json)
     io.check_output(out)
-    if report is not None and report.exists() and not report.is_dir():
-        raise ValueError(f"{report} is a file; name a folder for the report")
+    if report is not None:
+        io.check_folder(report)
     tilt_series = read_tilt_series(tilts, angles=angles, transforms=transforms, mode=parse_mode(mode))
     if invert_tilt:
         tilt_series = TiltSeries(tilt_series.images, -tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)

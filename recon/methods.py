@@ -62,7 +62,7 @@ class Settings:
         run_fit: runs every fit; `Journal.fit` keeps what each has reached.
 
     Raises:
-        ValueError: a negative weight, or an unknown window.
+        ValueError: a negative weight, no steps, or an unknown window.
     """
 
     weight: float | None = None
@@ -78,6 +78,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.weight is not None and not 0 <= self.weight < np.inf:
             raise ValueError(f"--weight {self.weight} must be zero or more")
+        if self.num_steps is not None and self.num_steps < 1:
+            raise ValueError(f"--steps {self.num_steps} must be 1 or more")
         if self.window is not None and self.window not in WINDOWS:
             raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
 

@@ -71,6 +71,7 @@ class Simulation:
         Raises:
             ValueError: an unknown phantom, or an empty one.
         """
+        is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(dir=folder, prefix=".simulate-"))
         try:
@@ -79,6 +80,8 @@ class Simulation:
                 path.replace(folder / path.name)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+            if is_new and not any(folder.iterdir()):
+                folder.rmdir()
         return unit
 
 

@@ -8,6 +8,7 @@ from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite
 from .files import atomic_path as atomic_path
+from .files import check_folder as check_folder
 from .files import check_output as check_output
 from .images import SUFFIXES as SUFFIXES
 from .images import ImageFile as ImageFile

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
 import os
 import shutil
@@ -42,6 +43,39 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
     if not os.access(path.parent, os.W_OK):
         raise PermissionError(f"{path.parent} is not writable; choose another output folder")
     return path
+
+
+def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
+    """Fail now, before long work, where results could not be written into a folder, which need not exist yet.
+
+    Args:
+        path: the folder.
+        num_bytes: room that the results will take.
+
+    Raises:
+        ValueError: a file of that name, or a file above it.
+        PermissionError: it could not be made or written to.
+        OSError: the disk has not as much room.
+    """
+    path = Path(path)
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir():
+        raise ValueError(f"{existing} is a file; name a folder instead of {path}")
+    if not os.access(existing, os.W_OK):
+        raise PermissionError(f"{existing} is not writable; choose another output folder")
+    free = shutil.disk_usage(existing).free
+    if num_bytes > free:
+        raise OSError(
+            f"{path} would take {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB left; "
+            "free some space, choose another disk or a smaller size"
+        )
+    return path
+
+
+def require_whole(path: Path, num_bytes: int) -> None:
+    """Raise what a full disk should have raised: some libraries lose the last buffer without a word."""
+    if path.stat().st_size < num_bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, as_array
-from noiseflow.io.files import atomic_folder, atomic_path, check_output
+from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -127,12 +127,14 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            mrc.write(target, data, voxel_size)
+            stored = mrc.write(target, data, voxel_size)
         elif suffix in TIFF_SUFFIXES:
-            tiff.write(target, data, voxel_size)
+            stored = tiff.write(target, data, voxel_size)
         else:
+            stored = data
             with target.open("wb") as stream:
                 np.save(stream, data, allow_pickle=False)
+        require_whole(target, stored.nbytes)
 
 
 def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:

@@ -43,13 +43,19 @@ def read(path: Path) -> ImageFile:
     return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles)
 
 
-def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
-    """Write 8 and 16-bit integers and floats as they are; float64 is rounded to float32, wide integers must fit exactly."""
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
+    """Write 8 and 16-bit integers and floats as they are; float64 is rounded to float32, wide integers must fit exactly.
+
+    Returns:
+        The pixels as stored.
+    """
     import mrcfile
 
-    with mrcfile.new(path, data=np.ascontiguousarray(_storable(data)), overwrite=True) as mrc:
+    stored = np.ascontiguousarray(_storable(data))
+    with mrcfile.new(path, data=stored, overwrite=True) as mrc:
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]
+    return stored
 
 
 def _storable(data: NDArray[Any]) -> NDArray[Any]:

@@ -36,13 +36,17 @@ def read(path: Path) -> ImageFile:
     return ImageFile(data, voxel_size)
 
 
-def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
-    """Write any real type as it is: as ImageJ's TIFF where that can say the voxel size, else as OME-TIFF."""
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
+    """Write any real type as it is: as ImageJ's TIFF where that can say the voxel size, else as OME-TIFF.
+
+    Returns:
+        The pixels as stored.
+    """
     import tifffile
 
     if voxel_size is None:
         tifffile.imwrite(path, data, photometric="minisblack")  # or a stack of three would be stored as colour
-        return
+        return data
     z, y, x = voxel_size
     if data.dtype in _OUTSIDE_OME:
         data = exactly_as(data, (np.float32, np.int32, np.uint32, np.float64), "OME-TIFF")
@@ -50,11 +54,12 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
         tifffile.imwrite(
             path, data, imagej=True, resolution=(1 / x, 1 / y), metadata={"spacing": z, "unit": "angstrom"}
         )
-        return
+        return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
     units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
     metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata)
+    return data
 
 
 def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:

@@ -39,12 +39,13 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles to judge by."""
+    from noiseflow import io
     from recon.simulation import angles_between, tilt_range
     from recon.streaming import Simulation
 
     output = Output(json)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file; name a folder for the simulated series")
+    if size < 4:
+        raise ValueError(f"--size {size}: give at least 4 voxels")
     angles = tilt_range(tilts)
     if len(angles) < 2:
         raise ValueError(f"--tilts {tilts}: a tilt series needs at least two tilts")
@@ -56,6 +57,8 @@ def simulate(
         "validation": angles_between(angles, _VALIDATION, share=1 / 3),
         "test": angles_between(angles, _TEST, share=2 / 3),
     }
+    num_images = sum(map(len, stacks.values())) + len(angles)
+    io.check_folder(folder, num_bytes=4 * size**2 * (size + num_images))
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed)
     with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
         simulation.write(folder, progress)
