@@ -184,8 +184,9 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not found:
         return None
     mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
+    smooth = ndimage.gaussian_filter(long, 1.0)  # or the motion whose interpolation smooths more would win
     motion = max(
-        found, key=lambda name: _information(short, long, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
+        found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
     matrix = found[motion]
     checks = [correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0)]

@@ -94,3 +94,15 @@ def test_a_transform_of_nothing_returns_the_frame_untouched(exposures):
     warped, mask = still.warp(exposures.long)
     assert warped is exposures.long
     assert mask.all()
+
+
+def test_a_small_rotation_is_not_lost_to_the_smoothing_of_a_half_pixel_shift():
+    generator = np.random.default_rng(0)
+    matrix, scene = rigid(0.4, (3.5, -2.5), 192), sparse_scene(generator, 192)
+    y, x = np.mgrid[:192, :192].astype(float)
+    moved = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([x, y])) + matrix[:, 2][:, None, None]
+    short = scene(*moved) + 0.5 * generator.standard_normal(x.shape)
+    long = 16 * scene(x, y) + 4 * 0.5 * generator.standard_normal(x.shape)
+    found = register(short, long)
+    assert found.motion == "euclidean"
+    assert error_px(found, matrix, 192) < 0.2
