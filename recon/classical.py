@@ -97,7 +97,7 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     rows = contrast_slab(tilt_series, _SLAB)
     out = np.arange(tilt_series.num_tilts) % _LEAVE_OUT == _LEAVE_OUT // 2
     slab = replace(grid, height=rows.stop - rows.start)
-    rest = LineIntegralProblem.of(_part(tilt_series, ~out, rows), slab)
+    rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
     judge = SliceProjector(
         tilt_angles=tilt_series.tilt_angles[out],
         depth=grid.depth,
@@ -113,7 +113,8 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     return rest, score
 
 
-def _part(tilt_series: TiltSeries, tilts: NDArray[Any], rows: slice) -> TiltSeries:
+def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
+    """Some tilts and some rows of a series."""
     mask = None if tilt_series.mask is None else tilt_series.mask[tilts][:, rows]
     images = tilt_series.images[tilts][:, rows]
     return replace(tilt_series, images=images, tilt_angles=tilt_series.tilt_angles[tilts], mask=mask)

@@ -1,0 +1,53 @@
+"""The command `noiseflow benchmark`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from noiseflow.console import JsonOption, Output, SeedOption
+
+
+def benchmark(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(help="rivals, slow-rivals, resolution; the first alone if not given."),
+    ] = None,
+    size: Annotated[int | None, typer.Option(help="Voxels along each edge; 64, or 48 with --quick.")] = None,
+    noise: Annotated[str, typer.Option(help="Noise of the scene, as in `noiseflow simulate`.")] = "clipped",
+    phantom: Annotated[str, typer.Option(help="Volume of the scene, as in `noiseflow simulate`.")] = "shells",
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A small scene and few settings: under three minutes.")
+    ] = False,
+    repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are told.")] = 3,
+    budget: Annotated[float, typer.Option(help="Seconds for each of the slow rivals.")] = 600.0,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for results and figures; a stopped run goes on there.")
+    ] = Path("noiseflow-benchmark"),
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Measure run time against error of every method, on this machine. Stopped, it goes on where it was."""
+    from dataclasses import replace
+
+    from recon.benchmark_named import BENCHMARKS, Options
+    from recon.benchmark_rivals import QUICK, Effort
+
+    output = Output(json)
+    names = names or ["rivals"]
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        raise ValueError(f"benchmark '{unknown[0]}': choose from {', '.join(BENCHMARKS)}")
+    if repeats < 1:
+        raise ValueError(f"--repeats {repeats} must be at least 1")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; name a folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+    effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
+    scene = {"noise": noise, "phantom": phantom, "seed": seed}
+    if quick:
+        scene["tilts"] = "-60:60:4"
+    options = Options(size or (48 if quick else 64), scene, effort, out, output)
+    output.result({name: BENCHMARKS[name](options) for name in names})

@@ -1,0 +1,134 @@
+"""Benchmarks: cells are computed once and kept, settings are searched, timing is in turn, rivals stand the right way round."""
+
+import json
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from noiseflow import Gaussian
+from recon import benchmark_rivals
+from recon.benchmark import Results, in_turn, make_scene, plain
+from recon.benchmark_rivals import Effort, best_cutoff, curves, own_sirt, summary, table
+from recon.commands.benchmark import benchmark
+from recon.external import _oriented, astra_sirt, missing
+from recon.joint import JointReconstructor
+
+TINY = {"tilts": "-60:60:12"}
+
+
+def test_what_is_kept_is_not_computed_again(tmp_path):
+    path, calls = tmp_path / "r.json", []
+
+    def compute():
+        calls.append(1)
+        return {"value": np.float32(0.123456789), "bad": float("nan")}
+
+    first = Results(path, "test").cell("a", compute)
+    again = Results(path, "test").cell("a", compute)
+    assert first == again == json.loads(path.read_text())["cells"]["a"]
+    assert len(calls) == 1
+    assert first["value"] == 0.12346
+    assert first["bad"] is None
+
+
+def test_a_run_that_stops_keeps_the_cells_before(tmp_path):
+    results = Results(tmp_path / "r.json", "test")
+    results.cell("a", lambda: {"x": 1})
+    with pytest.raises(KeyboardInterrupt):
+        results.cell("b", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert set(Results(tmp_path / "r.json", "test").cells) == {"a"}
+
+
+@pytest.mark.parametrize("text", ["{", '{"benchmark": "other", "cells": {}}'])
+def test_files_of_something_else_are_refused(tmp_path, text):
+    (tmp_path / "r.json").write_text(text)
+    with pytest.raises(ValueError, match="remove it"):
+        Results(tmp_path / "r.json", "test")
+
+
+def test_functions_are_timed_in_turn():
+    order = []
+    found = in_turn([lambda: order.append("a"), lambda: order.append("b") or "last"], repeats=3)
+    assert order == ["a", "b"] * 3
+    assert found[1][1] == "last"
+    assert all(seconds >= 0 for seconds, _ in found)
+
+
+def test_scene_errors_vanish_for_the_truth_only():
+    scene = make_scene(16, **TINY)
+    assert scene.errors(scene.truth)["mse raw"] == 0
+    assert scene.projection_errors(scene.truth)["2d mse min-max"] == 0
+    assert scene.errors(np.zeros_like(scene.truth))["mse raw"] > 0.001
+    assert not set(scene.test_angles) & set(scene.noisy.tilt_angles)
+
+
+def test_searched_cutoff_is_the_best_of_those_tried():
+    found = best_cutoff(make_scene(16, **TINY), "hann")
+    assert found["tried"][found["cutoff"]] == max(found["tried"].values())
+
+
+def test_curves_have_the_median_seconds_of_their_repeats(tmp_path):
+    results = Results(tmp_path / "r.json", "rivals")
+    for repeat, seconds in enumerate((3.0, 1.0, 2.0)):
+        point = {"setting": "s", "seconds": seconds, "psnr affine": 20.0, "psnr raw": 19.0, "mse affine": 0.01}
+        results.cell(f"16/curve {repeat}/m", lambda p=point: {"points": [p]})
+    assert summary(results, 16)["m"][0]["seconds"] == 2.0
+    assert table(summary(results, 16))[1][0][:3] == ("m", "s", "20.00")
+
+
+def test_every_rival_is_ready_at_its_searched_setting(tmp_path, monkeypatch):
+    small = JointReconstructor(noise_model=Gaussian, num_steps=3, slab=4)
+    monkeypatch.setattr(benchmark_rivals, "reconstructors", lambda scene: {"L2 + TV": small})
+    scene, effort = make_scene(16, **TINY), Effort(steps=(3,), weights=(0.2,), refine=0, repeats=1)
+    results = Results(tmp_path / "r.json", "rivals")
+    ready = curves(scene, results, "16", effort)
+    assert {"SIRT", "WBP hann", "L2 + TV", "joint", "joint, voxels"} <= set(ready)
+    assert results.cells["16/search/L2 + TV"]["weight"] == 0.2
+    points = list(ready["L2 + TV"]())
+    assert [setting for setting, _, _ in points] == ["3 steps"]
+    assert points[0][2].shape == scene.truth.shape
+
+
+@pytest.mark.skipif(missing("astra"), reason="the ASTRA toolbox is not installed")
+def test_both_sirts_agree():
+    scene = make_scene(16, **TINY)
+    ours = {setting: volume for setting, _, volume in own_sirt(scene)}
+    theirs = {setting: volume for setting, _, volume in astra_sirt(scene.noisy, scene.grid, (4, 16))}
+    for setting, volume in theirs.items():
+        assert np.corrcoef(volume.ravel(), ours[setting].ravel())[0, 1] > 0.995
+
+
+def test_volumes_of_other_programs_are_turned_the_right_way():
+    volume = np.random.default_rng(0).random((5, 6, 7))
+    turned = volume.transpose(2, 0, 1)[:, ::-1]
+    np.testing.assert_array_equal(_oriented(turned, volume), volume)
+
+
+def test_command_refuses_what_it_does_not_know(tmp_path):
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(benchmark)
+    for arguments, words in ((["magic"], "choose from rivals"), (["--repeats", "0"], "at least 1")):
+        result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+        assert isinstance(result.exception, ValueError)
+        assert words in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_command_writes_results_and_a_figure(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark_rivals, "QUICK", Effort(steps=(2,), weights=(0.2,), refine=0, repeats=1))
+    monkeypatch.setattr(benchmark_rivals, "reconstructors", lambda scene: {})
+    monkeypatch.setattr(benchmark_rivals, "JointReconstructor", lambda **options: None)
+    monkeypatch.setattr(benchmark_rivals, "fitted", lambda scene, reconstructor, steps: iter(()))
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(benchmark)
+    result = CliRunner().invoke(app, ["--quick", "--size", "16", "--out", str(tmp_path), "--json"])
+    found = json.loads(result.stdout.splitlines()[-1])["rivals"]
+    assert found["machine"]["versions"]["torch"]
+    assert set(found["curves"]) >= {"SIRT", "WBP ramp"}
+    assert len(list(tmp_path.glob("*.png"))) == 1
+
+
+def test_plain_values_are_json():
+    assert plain({"a": (np.float64(1 / 3), np.arange(2))}) == {"a": [0.33333, [0, 1]]}
