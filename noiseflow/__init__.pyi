@@ -15,7 +15,9 @@ from .model_files import load as load
 from .model_files import save as save
 from .physical import PoissonGaussian as PoissonGaussian
 from .physics_flow import PhysicsFlow as PhysicsFlow
+from .pixel_maps import WithMaps as WithMaps
 from .protocols import NoiseModel as NoiseModel
 from .protocols import SignalModel as SignalModel
+from .scan_noise import ScanNoise as ScanNoise
 from .signal_models import KnownSignal as KnownSignal
 from .signal_models import StaticScene as StaticScene

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from noiseflow import tabulated
 from noiseflow.distributions import NoiseDistribution
+from noiseflow.picked import Signal, given_to, values_of
 
 _MOMENT_NODES = 257
 _LEAST_CLEAR, _RAILED = 256, 0.02
@@ -27,7 +28,7 @@ class Digitised(nn.Module):
         low, high: rails, detector units; infinite where there is none.
 
     Raises:
-        ValueError: negative step, or rails in the wrong order.
+        ValueError: negative step, or rails in the wrong order, or a model with offsets of rows or columns.
     """
 
     describes_single_readings = True
@@ -38,25 +39,28 @@ class Digitised(nn.Module):
             raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
         if not low < high:
             raise ValueError(f"low is {low} and high is {high}; the low rail must lie below the high one")
+        if any(hasattr(module, "behind") for module in model.modules()):
+            raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
         self.model = model
         self.step, self.low, self.high = float(step), float(low), float(high)
 
-    def forward(self, signal: Tensor) -> DigitisedDistribution:
-        return DigitisedDistribution(self, signal)
+    def forward(self, signal: Signal) -> DigitisedDistribution:
+        return DigitisedDistribution(self, self.model(given_to(self.model, signal)), values_of(signal))
 
     def without_rails(self) -> Digitised:
         """The same detector with the same model inside, rounding but never clipping."""
         return Digitised(self.model, step=self.step)
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+    def standardise(self, signal: Signal, observation: Tensor) -> None:
         """Standardise the model inside, on the (N,) pixels whose signal lies clear of the rails where there are enough."""
-        clear = self._clear_of_rails(signal, observation)
+        values = values_of(signal)
+        clear = self._clear_of_rails(values, observation)
         if int(clear.sum()) < max(_LEAST_CLEAR, 0.1 * clear.numel()):
             clear = torch.ones_like(clear)
         if not hasattr(self.model, "standardise"):
             return
-        span = {"span": (float(signal.min()), float(signal.max()))} if hasattr(self.model, "standardisation") else {}
-        self.model.standardise(signal[clear], observation[clear], **span)  # type: ignore[operator]
+        span = {"span": (float(values.min()), float(values.max()))} if hasattr(self.model, "standardisation") else {}
+        self.model.standardise(given_to(self.model, signal[clear]), observation[clear], **span)  # type: ignore[operator]
 
     def _clear_of_rails(self, signal: Tensor, observation: Tensor) -> Tensor:
         """Pixels among whose 64 equally populated groups by signal hardly any reading is clipped."""
@@ -82,14 +86,17 @@ class DigitisedDistribution(NoiseDistribution):
     With ``step = 0`` the readings between the rails keep their log-density.
     """
 
-    def __init__(self, detector: Digitised, signal: Tensor) -> None:
-        super().__init__(signal.shape)
-        self.base: NoiseDistribution = detector.model(signal)
+    def __init__(self, detector: Digitised, base: NoiseDistribution, signal: Tensor | None = None) -> None:
+        super().__init__(base.batch_shape)
+        self.base = base
         self.step, self.low, self.high = detector.step, detector.low, detector.high
         self._detector, self._signal = detector, signal
 
+    def rescaled(self, scale: Tensor, shift: Tensor) -> DigitisedDistribution:
+        return DigitisedDistribution(self._detector, self.base.rescaled(scale, shift))
+
     def log_prob(self, value: Tensor) -> Tensor:
-        if tabulated.is_large(self._detector, self._signal, value):
+        if self._signal is not None and tabulated.is_large(self._detector, self._signal, value):
             found = tabulated.log_prob(self._detector, self._signal, value)
             if found is not None:
                 return found

@@ -39,6 +39,12 @@ class NoiseDistribution(Distribution):
         """P(observation < value); differs from `cdf` only where single readings have mass."""
         return self.cdf(value)
 
+    def rescaled(self, scale: Tensor, shift: Tensor) -> NoiseDistribution:
+        """The distribution of scale·o + shift; a digitised one rounds and clips after that. Both broadcast with the batch."""
+        from noiseflow.rescaled import RescaledDistribution
+
+        return RescaledDistribution(self, scale, shift)
+
     @abstractmethod
     def icdf(self, value: Tensor) -> Tensor:
         """The quantile: smallest observation whose CDF reaches `value`."""

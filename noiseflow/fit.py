@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,7 +11,10 @@ from torch import Tensor, nn
 
 from noiseflow.digitisation import Digitisation, detect_digitisation
 from noiseflow.digitised import Digitised
-from noiseflow.fit_loop import Checkpoint, FitLoop, FitPixels, FitResult, Progress, Schedule
+from noiseflow.fit_loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.fit_pixels import FitPixels
+from noiseflow.picked import needs_image
+from noiseflow.scan_noise import ScanNoise, shared_axis
 from noiseflow.signal_models import KnownSignal
 
 _log = logging.getLogger("noiseflow")
@@ -47,7 +51,8 @@ def fit(
         noise_model: the model to fit; one without trainable parameters stays as it is.
         signal: clean signals shaped like `observation`, or a `SignalModel`. A trainable one may offer ``parameter_groups()``,
             parameter groups with their learning rates for Adam.
-        observation: noisy readings, any shape and real type, detector units.
+        observation: noisy readings, any shape and real type, detector units; for models that look beyond single pixels,
+            images (..., y, x).
         mask: pixels to use, shaped like `observation`; all by default.
         skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
         digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
@@ -80,7 +85,14 @@ def fit(
     digitisation = Digitisation()
     if digitise and _may_be_wrapped(noise_model):
         noise_model, digitisation = _behind_converter(noise_model, observation, use)
-    pixels = FitPixels.choose(_as_floating(observation), use, held_out, _own_generator(generator))
+    axis = shared_axis(noise_model)
+    if needs_image(noise_model) and observation.ndim < 2:
+        raise ValueError(
+            f"{type(noise_model).__name__} looks beyond single pixels: give images (..., y, x); these pixels have shape "
+            f"{tuple(observation.shape)}"
+        )
+    choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
+    pixels = choose(_as_floating(observation), use, held_out, _own_generator(generator))
     loop = FitLoop(noise_model, signal_model, pixels, FitResult(noise_model, digitisation))
     loop.prepare(num_steps, learning_rate, standardise and resume is None)
     if resume is not None:
@@ -123,13 +135,18 @@ def _behind_converter(noise_model: nn.Module, observation: Tensor, use: Tensor) 
     """The model behind the rounding and rails that its readings show, and these; the model itself where they show none."""
     readings = observation.detach().reshape(-1)[use].cpu()
     found = detect_digitisation((readings.float() if readings.dtype == torch.bfloat16 else readings).numpy())
-    if not found.found or not hasattr(noise_model(torch.zeros(1, device=observation.device)), "log_interval_prob"):
+    if not found.found or not (needs_image(noise_model) or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
         "readings are %s: the model is fitted behind that, and the result's noise_model describes it (digitise=False: do not)",
         found.in_words(),
     )
-    return Digitised(noise_model, *found), found
+    return noise_model.behind(found) if isinstance(noise_model, ScanNoise) else Digitised(noise_model, *found), found
+
+
+def _has_intervals(noise_model: nn.Module, device: torch.device) -> bool:
+    """Whether the model's distributions give the mass of an interval; those of other libraries do not."""
+    return hasattr(noise_model(torch.zeros(1, device=device)), "log_interval_prob")
 
 
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:

@@ -13,7 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.digitisation import Digitisation
+from noiseflow.fit_pixels import FitPixels, thinned
 from noiseflow.observation_table import ObservationTable
+from noiseflow.picked import Signal, needs_image, pick, values_of, window_size
 
 Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
@@ -61,42 +63,6 @@ class Schedule:
     checkpoint_interval: float | None
 
 
-@dataclass(frozen=True)
-class FitPixels:
-    """The pixels of a fit.
-
-    Attributes:
-        observation: (N,) readings; unusable ones hold some finite number.
-        train, judge: indices of the pixels that train and of those that judge.
-        weight: (N,) weight of each pixel in a full-batch loss.
-        generator: source of the random choices.
-    """
-
-    observation: Tensor
-    train: Tensor
-    judge: Tensor
-    weight: Tensor
-    generator: torch.Generator
-
-    @staticmethod
-    def choose(observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> FitPixels:
-        """Divide the usable pixels, `use` (N,), of observations of any shape."""
-        observation = observation.reshape(-1)
-        if isinstance(held_out, Tensor):
-            judge = held_out.reshape(-1).bool()
-        else:
-            judge = (torch.rand(use.shape, generator=generator) < held_out).to(use.device)
-        train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
-        if train.numel() < 2 or judging.numel() < 1:
-            raise ValueError(
-                f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image"
-            )
-        bad = ~torch.isfinite(observation)
-        if bool(bad.any()):  # unused pixels get weight 0, and 0·NaN must not reach the sum
-            observation = torch.where(bad, observation[use].mean(), observation)
-        return FitPixels(observation, train, judging, (use & ~judge).to(observation.dtype) / train.numel(), generator)
-
-
 class FitLoop:
     """A noise model, a signal model and pixels, on their way to the most likely parameters."""
 
@@ -111,7 +77,7 @@ class FitLoop:
         """Scale the noise model to the data and set up the optimisers."""
         if standardise and hasattr(self.noise_model, "standardise"):
             with torch.no_grad():
-                pixels = self.pixels.train[:: max(1, self.pixels.train.numel() // _STANDARDISE_COUNT)]
+                pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
                 self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
         noise = [p for p in self.noise_model.parameters() if p.requires_grad]
         self.noise_optimiser = _adam([{"params": noise, "lr": learning_rate}]) if noise else None
@@ -127,7 +93,8 @@ class FitLoop:
         """Take all steps that are left, and end at the best held-out state."""
         started = saved = time.perf_counter()
         num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
-        if joint and schedule.tabulate and self.pixels.train.numel() >= _TABLE_COUNT:
+        large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
+        if joint and schedule.tabulate and large:
             self.table = self._make_table()
         check_every = max(1, num_steps // 20)
         good = self._models()
@@ -166,7 +133,7 @@ class FitLoop:
         finite = self._signal_step(schedule.batch_size)
         if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
             for _ in range(schedule.noise_steps if joint else 1):
-                finite &= _step(self.noise_optimiser, lambda: self._noise_loss(schedule.batch_size))
+                finite &= _step(self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size)))
             if self.table is not None:
                 self.table.rebuild(self.noise_model)
         return finite
@@ -192,53 +159,57 @@ class FitLoop:
 
     def _make_table(self) -> ObservationTable:
         with torch.no_grad():
-            signal = self._signal(self.pixels.train[:: max(1, self.pixels.train.numel() // 100_000)])
+            signal = values_of(self._signal(thinned(self.pixels.train, 100_000)))
         observed = self.pixels.observation[self.pixels.train]
         low = float(torch.minimum(signal.min(), observed.min()))
         high = float(torch.maximum(signal.max(), observed.max()))
         return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=self.resumed_table)
 
     def _signal_step(self, batch_size: int) -> bool:
-        table, observation = self.table, self.pixels.observation
-
         def loss() -> Tensor:
-            if hasattr(self.signal_model, "signal"):
-                signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
-                log_prob = (
-                    table.log_prob(signal) if table is not None else self.noise_model(signal).log_prob(observation)
-                )
-                value = -torch.dot(log_prob, self.pixels.weight.to(log_prob.dtype))
-            else:
-                pixels = self._batch(batch_size)
-                value = -self.noise_model(self._signal(pixels)).log_prob(self.pixels.observation[pixels]).mean()
+            whole = hasattr(self.signal_model, "signal") and self.pixels.train.ndim == 1
+            value = self._full_batch_loss() if whole else self._loss(self.pixels.batch(batch_size), learn_signal=True)
             return value + self.signal_model.penalty() if hasattr(self.signal_model, "penalty") else value  # type: ignore[operator]
 
         return self.signal_optimiser is None or _step(self.signal_optimiser, loss)
 
-    def _noise_loss(self, batch_size: int) -> Tensor:
-        pixels = self._batch(batch_size)
-        with torch.no_grad():
-            signal = self._signal(pixels)
-        return -self.noise_model(signal).log_prob(self.pixels.observation[pixels]).mean()  # type: ignore[no-any-return]
+    def _full_batch_loss(self) -> Tensor:
+        signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
+        observation = self.pixels.observation
+        if self.table is not None:
+            log_prob = self.table.log_prob(signal)
+        elif needs_image(self.noise_model):
+            shape = self.pixels.shape
+            log_prob = self.noise_model(signal.reshape(shape)).log_prob(observation.reshape(shape)).reshape(-1)
+        else:
+            log_prob = self.noise_model(signal).log_prob(observation)
+        return -torch.dot(log_prob, self.pixels.weight.to(log_prob.dtype))
 
-    def _signal(self, pixels: Tensor) -> Tensor:
+    def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
+        """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""
+        with torch.set_grad_enabled(learn_signal):
+            signal = self._signal(pixels)
+        observation = self.pixels.observation[pixels]
+        if pixels.ndim == 1:
+            return -self.noise_model(signal).log_prob(observation).mean()  # type: ignore[no-any-return]
+        return -self.noise_model(signal).line_log_prob(observation).sum() / torch.isfinite(observation).sum()  # type: ignore[no-any-return]
+
+    def _signal(self, pixels: Tensor) -> Signal:
+        if needs_image(self.noise_model):
+            return pick(self.signal_model, pixels, self.pixels.image, window_size(self.noise_model))
         predicted: Tensor = self.signal_model(pixels)
         return predicted
-
-    def _batch(self, batch_size: int) -> Tensor:
-        draw = torch.randint(
-            self.pixels.train.numel(), (min(batch_size, self.pixels.train.numel()),), generator=self.pixels.generator
-        )
-        return self.pixels.train[draw.to(self.pixels.train.device)]
 
     @torch.no_grad()
     def held_out_nll(self, most: int = 100_000) -> float:
         """Mean negative log-likelihood of at most so many held-out pixels, nats per pixel."""
-        pixels = self.pixels.judge[:: max(1, self.pixels.judge.numel() // most)]
-        total = 0.0
-        for part in torch.split(pixels, 32768):
-            total -= float(self.noise_model(self._signal(part)).log_prob(self.pixels.observation[part]).double().sum())
-        return total / pixels.numel()
+        total, count = 0.0, 0
+        pixels = thinned(self.pixels.judge, most)
+        for part in torch.split(pixels, max(1, 32768 // pixels[0].numel())):
+            number = int(torch.isfinite(self.pixels.observation[part]).sum())
+            total += float(self._loss(part).double()) * number
+            count += number
+        return total / count
 
     def _models(self) -> dict[str, Any]:
         models = {"noise_model": self.noise_model.state_dict()}

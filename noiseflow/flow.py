@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from noiseflow import tabulated
 from noiseflow.distributions import LatentDistribution, normal_quadrature
+from noiseflow.picked import Signal, require_image, values_of, windows_of
 from noiseflow.standardisation import Standardisation, interpolate_cubic
 from noiseflow.transforms import Affine, Radial, Spline, StudentTail, Transform
 
@@ -72,10 +73,10 @@ def tail_layer(*, conditional: bool = False) -> Layer:
     return Layer((-4.0, -4.0), build, conditional)
 
 
-def conditioning_network(num_outputs: int, width: int) -> nn.Sequential:
-    """A small network of two features of the signal; its outputs start at zero, and its weights at the same numbers always."""
+def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
+    """A small network of features of the signal; its outputs start at zero, and its weights at the same numbers always."""
     generator = torch.Generator().manual_seed(0)
-    first, hidden, last = nn.Linear(2, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
+    first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
     with torch.no_grad():
         for layer in (first, hidden):
             nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
@@ -110,15 +111,22 @@ class ConditionalFlow(nn.Module):
         mean_preserving: shift the noise so that E[observation | signal] = signal (before any digitisation). A joint fit
             needs it: otherwise an offset of the signal cannot be told from a mean of the noise.
         width: hidden units of the network that turns a signal into the parameters of the conditional layers.
+        neighbourhood: side, odd, of the window of clean signals around each pixel that moves and widens its noise. Off (1) by
+            default: a model that sees the scene around a pixel can learn the scene's structure in place of the noise's.
+            With it, signals are images (..., y, x).
 
     Attributes:
         tabulate: look likelihoods and samples of large inputs up in tables (interpolation error below 1e-3 nats and 1e-3
             standard deviations in the mean); set it to False for the exact values at any size.
     """
 
-    def __init__(self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32) -> None:
+    def __init__(
+        self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+    ) -> None:
         super().__init__()
-        self.layers = tuple(layers)
+        if neighbourhood < 1 or neighbourhood % 2 == 0:
+            raise ValueError(f"neighbourhood is {neighbourhood}; a window around a pixel has an odd side: 3, 5, …")
+        self.layers, self.neighbourhood = tuple(layers), neighbourhood
         self.mean_preserving = mean_preserving
         self.tabulate = True
         self.width = width
@@ -126,23 +134,49 @@ class ConditionalFlow(nn.Module):
         self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
         self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
         self.conditioner = conditioning_network(self.num_conditional, width)
+        if neighbourhood > 1:
+            self.surroundings = conditioning_network(2, width, num_inputs=neighbourhood**2 - 1)
 
-    def forward(self, signal: Tensor) -> FlowDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
-        return FlowDistribution(self, signal)
+    @property
+    def needs_image(self) -> bool:
+        """Whether the model looks beyond single pixels."""
+        return self.neighbourhood > 1
 
-    def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
+    def forward(self, signal: Signal) -> FlowDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units.
+
+        Raises:
+            ValueError: a flat signal where the model looks at a neighbourhood.
+        """
+        if not self.needs_image:
+            return FlowDistribution(self, values_of(signal))
+        require_image(signal, f"this model looks at {self.neighbourhood} x {self.neighbourhood} pixels around each")
+        return FlowDistribution(self, values_of(signal), windows_of(signal, self.neighbourhood))
+
+    def standardise(self, signal: Signal, observation: Tensor, span: tuple[float, float] | None = None) -> None:
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
-        self.standardisation.set_from(signal, observation, span)
+        self.standardisation.set_from(values_of(signal), observation, span)
 
-    def parameters_at(self, signal: Tensor) -> tuple[Tensor, Tensor, list[Transform]]:
-        """Location and log-scale of the noise, detector units, and the maps, at each signal."""
+    def parameters_at(self, signal: Tensor, windows: Tensor | None = None) -> tuple[Tensor, Tensor, list[Transform]]:
+        """Location and log-scale of the noise, detector units, and the maps, at each signal, whatever surrounds it (..., k²)."""
         with torch.autocast(signal.device.type, enabled=False):
             coordinate = self.standardisation.coordinate(signal)
             location, log_scale = self.standardisation(coordinate)
+            if windows is not None:
+                shift, widening = self._effect_of_surroundings(coordinate, windows)
+                log_scale = log_scale + widening
+                location = location + torch.exp(log_scale) * shift
             if self.mean_preserving:
                 location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
             return signal + location, log_scale, self.transforms(coordinate)
+
+    def _effect_of_surroundings(self, coordinate: Tensor, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """Shift, in standard deviations, and change of the log-scale of the noise."""
+        contrast = self.standardisation.coordinate(windows) - coordinate[..., None]
+        middle = self.neighbourhood**2 // 2
+        others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
+        raw = self.surroundings(4 * others.to(self.bias.dtype))
+        return _bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
         """The maps at each signal coordinate."""
@@ -173,7 +207,8 @@ class ConditionalFlow(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""
-        return {"mean_preserving": self.mean_preserving, "width": self.width}
+        window = {"neighbourhood": self.neighbourhood} if self.needs_image else {}
+        return {"mean_preserving": self.mean_preserving, "width": self.width} | window
 
 
 def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
@@ -187,13 +222,13 @@ def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, T
 class FlowDistribution(LatentDistribution):
     """The distribution that a `ConditionalFlow` returns; its parameters are computed when first needed."""
 
-    def __init__(self, flow: ConditionalFlow, signal: Tensor) -> None:
+    def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
         super().__init__(signal.shape)
-        self._flow, self._signal = flow, signal
+        self._flow, self._signal, self._windows = flow, signal, windows
 
     @cached_property
     def _parameters(self) -> tuple[Tensor, Tensor, list[Transform]]:
-        return self._flow.parameters_at(self._signal)
+        return self._flow.parameters_at(self._signal, self._windows)
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters
@@ -217,7 +252,7 @@ class FlowDistribution(LatentDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self._signal.expand((*sample_shape, *self.batch_shape))
-        if self._flow.tabulate and signal.numel() >= tabulated.LARGE:
+        if self._flow.tabulate and self._windows is None and signal.numel() >= tabulated.LARGE:
             found = tabulated.sample(self._flow, signal, generator)
             if found is not None:
                 return found
@@ -238,15 +273,23 @@ class RadialFlow(ConditionalFlow):
             of the noise and only its location and scale vary.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
+        neighbourhood: see `ConditionalFlow`.
     """
 
     def __init__(
-        self, num_layers: int = 8, *, num_conditional: int | None = None, mean_preserving: bool = False, width: int = 32
+        self,
+        num_layers: int = 8,
+        *,
+        num_conditional: int | None = None,
+        mean_preserving: bool = False,
+        width: int = 32,
+        neighbourhood: int = 1,
     ) -> None:
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
         radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
-        super().__init__([affine_layer(), *radials], mean_preserving=mean_preserving, width=width)
+        layers = [affine_layer(), *radials]
+        super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_layers, self.num_layers_conditional = num_layers, conditional
 
     def config(self) -> dict[str, Any]:
@@ -260,11 +303,14 @@ class SplineFlow(ConditionalFlow):
         num_bins: bins of the spline.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
+        neighbourhood: see `ConditionalFlow`.
     """
 
-    def __init__(self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32) -> None:
+    def __init__(
+        self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+    ) -> None:
         layers = [affine_layer(), spline_layer(num_bins), tail_layer()]
-        super().__init__(layers, mean_preserving=mean_preserving, width=width)
+        super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_bins = num_bins
 
     def config(self) -> dict[str, Any]:
@@ -276,10 +322,11 @@ class SignalDependentGaussian(ConditionalFlow):
 
     Args:
         width: hidden units of the network that gives the standard deviation.
+        neighbourhood: see `ConditionalFlow`.
     """
 
-    def __init__(self, *, width: int = 32) -> None:
-        super().__init__([scale_layer()], mean_preserving=True, width=width)
+    def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
+        super().__init__([scale_layer()], mean_preserving=True, width=width, neighbourhood=neighbourhood)
 
     def config(self) -> dict[str, Any]:
-        return {"width": self.width}
+        return {name: value for name, value in super().config().items() if name != "mean_preserving"}

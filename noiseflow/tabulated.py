@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from noiseflow.picked import needs_image
+
 LARGE = 2**18
 """Inputs of at least so many pixels are tabulated where no gradient is asked for."""
 
@@ -128,7 +130,8 @@ def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> boo
     differentiable = torch.is_grad_enabled() and (
         signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
     )
-    return observation.numel() >= LARGE and signal.shape == observation.shape and not differentiable
+    large = observation.numel() >= LARGE and signal.shape == observation.shape
+    return large and not differentiable and not needs_image(noise_model)
 
 
 _likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Columns, Tensor]]] = (

@@ -10,13 +10,16 @@ from safetensors.torch import save_file
 import noiseflow
 from noiseflow.model_files import kinds, read_metadata
 
-SIGNAL = torch.linspace(0, 1, 7)
+SIGNAL = torch.linspace(0, 1, 7)[None]
+WRAPPERS = {
+    "Digitised": lambda: noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0),
+    "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow(), 0.3),
+    "WithMaps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.full((1, 7), 1.5)),
+}
 
 
 def make(kind: str) -> torch.nn.Module:
-    model = (
-        noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0) if kind == "Digitised" else kinds()[kind]()
-    )
+    model = WRAPPERS[kind]() if kind in WRAPPERS else kinds()[kind]()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -30,7 +33,7 @@ def test_same_model_comes_back(tmp_path: Path, kind: str) -> None:
     path = noiseflow.save(model, tmp_path / "model.safetensors", units="counts", provenance={"from": "a test"})
     again = noiseflow.load(path)
     assert type(again) is type(model)
-    observation = torch.linspace(-0.2, 1.5, 7)
+    observation = torch.linspace(-0.2, 1.5, 7)[None]
     assert torch.equal(again(SIGNAL).log_prob(observation), model(SIGNAL).log_prob(observation))
     metadata = read_metadata(path)
     assert metadata["kind"] == kind

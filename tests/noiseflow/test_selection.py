@@ -58,3 +58,29 @@ def test_spatial_structure_is_seen(kind: str) -> None:
         assert found.rows == pytest.approx(1 + 0.09 * 300, rel=0.3)
     elif kind == "neighbours":
         assert found.horizontal == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [
+        ("rows", "ScanNoise(model) adds"),
+        ("columns", 'along="column"'),
+        ("pattern", "WithMaps"),
+        ("neighbours", "no term"),
+    ],
+)
+def test_the_term_that_would_help_is_named(kind: str, remedy: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal, noise = torch.rand((3, 80, 100), generator=generator), torch.randn((3, 80, 100), generator=generator)
+    if kind == "neighbours":
+        noise = noise + 0.3 * torch.roll(noise, 1, dims=2)
+    else:
+        shape = {"rows": (3, 80, 1), "columns": (3, 1, 100), "pattern": (80, 100)}[kind]
+        noise = noise + 0.3 * torch.randn(shape, generator=generator)
+    observation = signal + 0.1 * noise
+    found = spatial_structure(noiseflow.Gaussian(0.1 * float(noise.std())), signal, observation)
+    assert len(found.remedies) == 1
+    assert remedy in found.remedies[0]
+    assert remedy in found.in_words()
+    if kind == "rows":
+        assert spatial_structure(noiseflow.ScanNoise(noiseflow.Gaussian(0.1), 0.03), signal, observation).suffices

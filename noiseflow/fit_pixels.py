@@ -1,0 +1,95 @@
+"""The pixels of a fit: which train and which judge, one by one or in whole lines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class FitPixels:
+    """The pixels of a fit.
+
+    Attributes:
+        observation: (N,) readings; unusable ones hold some finite number, or NaN where lines are fitted.
+        shape: of the images they come from.
+        train, judge: indices of the pixels that train and of those that judge, (P,); or of lines of pixels, (P, L).
+        weight: (N,) weight of each pixel in a full-batch loss.
+        generator: source of the random choices.
+    """
+
+    observation: Tensor
+    shape: torch.Size
+    train: Tensor
+    judge: Tensor
+    weight: Tensor
+    generator: torch.Generator
+
+    @staticmethod
+    def choose(observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> FitPixels:
+        """Divide the usable pixels, `use` (N,), of observations of any shape.
+
+        Raises:
+            ValueError: too few usable pixels.
+        """
+        judge = _drawn(use, held_out, generator)
+        train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
+        if train.numel() < 2 or judging.numel() < 1:
+            raise ValueError(
+                f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image"
+            )
+        flat = observation.reshape(-1)
+        bad = ~torch.isfinite(flat)
+        if bool(bad.any()):  # unused pixels get weight 0, and 0·NaN must not reach the sum
+            flat = torch.where(bad, flat[use].mean(), flat)
+        weight = (use & ~judge).to(flat.dtype) / train.numel()
+        return FitPixels(flat, observation.shape, train, judging, weight, generator)
+
+    @staticmethod
+    def choose_lines(
+        observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator, *, axis: int
+    ) -> FitPixels:
+        """Divide whole rows (axis −1) or columns (−2) of images; a given `held_out` takes the lines of which it holds most.
+
+        Raises:
+            ValueError: too few lines.
+        """
+        lines = torch.arange(observation.numel(), device=use.device).reshape(observation.shape).movedim(axis, -1)
+        lines = lines.reshape(-1, observation.shape[axis])
+        lines = lines[use[lines].any(1)]
+        if isinstance(held_out, Tensor):
+            judge = held_out.reshape(-1)[lines].float().mean(1) > 0.5
+        else:
+            judge = _drawn(torch.ones(len(lines), dtype=torch.bool, device=use.device), held_out, generator)
+        train, judging = lines[~judge], lines[judge]
+        if len(train) < 2 or len(judging) < 1:
+            raise ValueError(
+                f"{len(lines)} usable rows or columns are too few to fit and judge offsets of each; use a larger image"
+            )
+        flat = torch.where(use, observation.reshape(-1), math.nan)
+        return FitPixels(flat, observation.shape, train, judging, torch.zeros_like(flat), generator)
+
+    @property
+    def image(self) -> tuple[int, int]:
+        """Height and width of each image."""
+        return self.shape[-2], self.shape[-1]
+
+    def batch(self, size: int) -> Tensor:
+        """About `size` training pixels, or lines of as many, drawn at random."""
+        count = min(size, self.train.numel()) // max(1, self.train[0].numel())
+        draw = torch.randint(len(self.train), (max(1, count),), generator=self.generator)
+        return self.train[draw.to(self.train.device)]
+
+
+def _drawn(use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> Tensor:
+    if isinstance(held_out, Tensor):
+        return held_out.reshape(-1).bool()
+    return (torch.rand(use.shape, generator=generator) < held_out).to(use.device)
+
+
+def thinned(pixels: Tensor, most: int) -> Tensor:
+    """At most about `most` pixels, evenly picked from pixels (P,) or lines (P, L)."""
+    return pixels[:: max(1, pixels.numel() // most)]
