@@ -1,3 +1,4 @@
+from . import adapters as adapters
 from . import io as io
 from . import metrics as metrics
 from .baselines import Gaussian as Gaussian

@@ -73,14 +73,16 @@ def fit(
             "seconds": time.perf_counter() - started,
         }
     signal, observation = clean[~apart], noisy[~apart]
-    if name.startswith("paper"):
-        return _paper(signal, observation, as_published=name != "paper", seed=seed)
     settings: dict[str, Any] = {}
+    model: nn.Module
+    digitisation = noiseflow.detect_digitisation(noisy.numpy())
+    if name.startswith("paper"):
+        model, row = _paper(signal, observation, as_published=name != "paper", seed=seed)
+        return (noiseflow.Digitised(model, *digitisation) if digitisation.found else model), row
     if name in OURS:
-        model: nn.Module = getattr(noiseflow, name)()
+        model = getattr(noiseflow, name)()
     else:
         model, settings = noise_rivals.make(name, changes or {})
-    digitisation = noiseflow.detect_digitisation(noisy.numpy())
     if digitisation.found:
         model = noiseflow.Digitised(model, *digitisation)
     steps = {"num_steps": settings.get("num_steps", num_steps)}
@@ -92,8 +94,9 @@ def fit(
 
 def _paper(signal: Tensor, observation: Tensor, *, as_published: bool, seed: int) -> tuple[nn.Module, dict[str, Any]]:
     model = PaperFlow(as_published=as_published)
-    seconds = model.fit(signal, observation, seed=seed)
-    return model, {"seconds": seconds, "integral": model.integral(float(signal.median()))}
+    row = {"seconds": model.fit(signal, observation, seed=seed), "integral": model.integral(float(signal.median()))}
+    model.as_published = False  # what it samples has a density, whatever it was told while it learnt
+    return model, row
 
 
 SEARCH_NOISES = ("gamma", "student-t")
