@@ -20,6 +20,9 @@ DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda."
 
 Progress = Callable[[int, str], None]
 """``progress(done, note)``: steps done so far, and a few words such as the current likelihood."""
+StepReport = Callable[[str, int, int, str], None]
+"""``report(title, done, total, note)``: the same for several pieces of work one after the other."""
+_LOG_SECONDS = 10.0
 
 
 class Output:
@@ -64,51 +67,62 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
-    """A progress bar with rate and time left on a terminal, a plain line every ten seconds in a log, none with ``--json``."""
+    """Progress of one piece of work of so many steps; see `step_report`."""
+    with step_report(json_mode=json_mode) as report:
+        yield lambda done, note: report(title, done, total, note)
+
+
+@contextlib.contextmanager
+def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
+    """Progress with rate and time left: a bar on a terminal, a line now and then in a log, nothing in JSON mode."""
     if json_mode:
-        yield lambda done, note: None
-        return
-    if not sys.stderr.isatty():
-        yield _LogLines(title, total)
-        return
+        yield lambda title, done, total, note: None
+    elif not sys.stderr.isatty():
+        yield _LogLines()
+    else:
+        yield from _bars()
+
+
+class _Rate:
+    """Steps per second of the work at hand; a new title starts a new measurement."""
+
+    title, first, started = "", 0, 0.0
+
+    def __call__(self, title: str, done: int) -> float:
+        now = time.monotonic()
+        if title != self.title:
+            self.title, self.first, self.started = title, done - 1, now
+        return (done - self.first - 1) / (now - self.started) if now > self.started else 0.0
+
+
+class _LogLines:
+    def __init__(self) -> None:
+        self.rate, self.last = _Rate(), time.monotonic()
+
+    def __call__(self, title: str, done: int, total: int, note: str) -> None:
+        rate, now = self.rate(title, done), time.monotonic()
+        if now - self.last >= _LOG_SECONDS and rate > 0:
+            self.last = now
+            left = f"{(total - done) / rate:.0f} s left"
+            print(f"{title}: {done}/{total}, {rate:.2g} steps/s, {left}, {note}", file=sys.stderr, flush=True)
+
+
+def _bars() -> Iterator[StepReport]:
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    rate = TextColumn("{task.fields[rate]}")
-    note_column = TextColumn("{task.fields[note]}")
-    with RichProgress(*columns, rate, TimeRemainingColumn(), note_column, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=total, note="", rate="")
+    more = (TextColumn("{task.fields[rate]:.1f}/s"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    with RichProgress(*columns, *more, console=Console(stderr=True)) as bars:
+        task, measure = bars.add_task("", total=None, rate=0.0, note="", visible=False), _Rate()
 
-        def update(done: int, note: str) -> None:
-            speed = bar.tasks[0].speed
-            bar.update(task, completed=done, note=note, rate="" if speed is None else f"{speed:.3g}/s")
+        def report(title: str, done: int, total: int, note: str) -> None:
+            if title != measure.title:
+                bars.reset(task, total=total, description=title, visible=True)
+            bars.update(task, completed=done, rate=measure(title, done), note=note)
 
-        yield update
-
-
-class _LogLines:
-    """Progress for a log: a line with rate and time left, ten seconds after the last one at the earliest."""
-
-    INTERVAL = 10.0
-
-    def __init__(self, title: str, total: int) -> None:
-        self.title, self.total = title, total
-        self.started = self.last = time.monotonic()
-
-    def __call__(self, done: int, note: str) -> None:
-        now = time.monotonic()
-        if now - self.last < self.INTERVAL or done < 1:
-            return
-        self.last = now
-        rate = done / (now - self.started)
-        left = max(self.total - done, 0) / rate
-        print(
-            f"{self.title}: {done}/{self.total}, {rate:.3g}/s, about {left:.0f} s left{', ' + note if note else ''}",
-            file=sys.stderr,
-            flush=True,
-        )
+        yield report
 
 
 def choose_device(name: str) -> Any:

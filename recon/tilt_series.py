@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,6 +73,16 @@ class TiltSeries:
         """How many images."""
         return len(self.images)
 
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(tilt, y, u), True for the pixels to use."""
+        return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
+
+    def select(self, tilts: NDArray[Any]) -> TiltSeries:
+        """The series of some of its tilts, by index or boolean mask."""
+        mask = None if self.mask is None else self.mask[tilts]
+        return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask)
+
 
 @dataclass(frozen=True)
 class VolumeGrid:
@@ -132,6 +142,8 @@ def read_tilt_series(
     angles: str | Path | None = None,
     transforms: str | Path | None = None,
     mode: Mode = "transmission",
+    mask: NDArray[np.bool_] | None = None,
+    mask_nan: bool = False,
 ) -> TiltSeries:
     """Read a stack and its tilt angles.
 
@@ -141,10 +153,12 @@ def read_tilt_series(
             ``.mdoc`` beside the stack, or else the angles inside the stack's own file.
         transforms: IMOD's ``.xf`` alignment of this stack, to apply to the images (they become float32).
         mode: how the images were formed.
+        mask: True for the pixels to use, (tilt, y, u) or (y, u) for all tilts.
+        mask_nan: leave NaN and infinite pixels out instead of refusing them.
 
     Raises:
         FileNotFoundError: no such file, or no angles beside or inside the stack.
-        ValueError: a file cannot be read, or `TiltSeries` refuses what it holds.
+        ValueError: a file cannot be read, the mask does not match, or `TiltSeries` refuses what the stack holds.
     """
     image_file = io.read(path)
     if image_file.data.ndim != 3:
@@ -152,13 +166,53 @@ def read_tilt_series(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed"
         )
     tilt_angles = io.tilt_angles_of(path, image_file) if angles is None else io.read_angles(angles)
-    io.require_finite(image_file.data, path)
-    io.require_contrast(image_file.data, path)
+    images, mask = _masked(image_file.data, mask, mask_nan, str(path))
+    io.require_contrast(images, path)
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
-    images = image_file.data
     if transforms is not None:
         images = io.apply_transforms(images, io.read_transforms(transforms))
-    return TiltSeries(images, tilt_angles, pixel_size, mode)
+    if mask is None:
+        return TiltSeries(images, tilt_angles, pixel_size, mode)
+    empty = ~mask.any((1, 2))
+    if empty.any() and len(tilt_angles) == len(images):
+        named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
+        warnings.warn(f"{int(empty.sum())} tilts have no usable pixel and are left out: {named}", stacklevel=2)
+        images, mask, tilt_angles = images[~empty], mask[~empty], tilt_angles[~empty]
+    return TiltSeries(images, tilt_angles, pixel_size, mode, mask)
+
+
+def _masked(
+    images: NDArray[Any], mask: NDArray[np.bool_] | None, mask_nan: bool, name: str
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Images whose unused pixels hold their nearest used neighbour's reading, and the mask of the used ones."""
+    finite = np.isfinite(images)
+    if mask is not None and mask.shape not in (images.shape, images.shape[1:]):
+        raise ValueError(f"the mask has shape {mask.shape}; {name} needs {images.shape}, or {images.shape[1:]} for all")
+    use = np.ones_like(finite) if mask is None else np.broadcast_to(mask, images.shape)
+    bad = ~finite & use
+    if bad.any() and not mask_nan:
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name} has {int(bad.sum())} NaN or infinite pixels, the first at {where}; leave them out with --mask-nan"
+        )
+    use = use & finite
+    if use.all():
+        return images, None
+    if not use.any():
+        raise ValueError(f"{name} has no usable pixel: all are masked, NaN or infinite")
+    return np.stack([filled(image, part) for image, part in zip(images, use, strict=True)]), use
+
+
+def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
+    """A (y, u) image whose unused pixels hold the reading of the nearest used one; zero where there is none."""
+    from scipy.ndimage import distance_transform_edt
+
+    if use.all():
+        return image
+    if not use.any():
+        return np.zeros_like(image)
+    nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
+    return np.asarray(image[tuple(nearest)])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:

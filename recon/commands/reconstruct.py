@@ -1,0 +1,157 @@
+"""The command `noiseflow reconstruct`."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, step_report
+from recon.commands.options import load_noise_model
+from recon.commands.running import memory_line, open_journal, stoppable, warnings_as_lines
+
+if TYPE_CHECKING:
+    from recon.checkpoint import Journal
+    from recon.methods import Outcome
+    from recon.tilt_series import TiltSeries, Volume, VolumeGrid
+
+
+def reconstruct(
+    context: typer.Context,
+    tilts: Annotated[
+        Path,
+        typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")],
+    angles: Annotated[
+        Path | None,
+        typer.Option(help="Angle file; by default the .rawtlt, .tlt or .mdoc beside the stack, or its own."),
+    ] = None,
+    transforms: Annotated[Path | None, typer.Option(help="IMOD's .xf alignment to apply to the stack.")] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="auto, joint, joint-supervised, l2, l1, tv, explicit, l2-denoised, wbp-denoised, sirt or wbp."
+        ),
+    ] = "auto",
+    mode: Annotated[str, typer.Option(help="transmission (bright field) or linear (HAADF, EDX).")] = "transmission",
+    thickness: Annotated[
+        int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
+    ] = None,
+    weight: Annotated[float | None, typer.Option(help="Weight of the total variation.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
+    window: Annotated[
+        str | None,
+        typer.Option(help="Of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen by itself if not given."),
+    ] = None,
+    denoiser: Annotated[
+        str, typer.Option(help="Of the denoised methods: nlm, tv, wavelet, wiener, bm3d, or package.module:function.")
+    ] = "nlm",
+    noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
+    save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
+    invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
+    invert_contrast: Annotated[
+        bool, typer.Option("--invert-contrast", help="Swap bright and dark before anything else.")
+    ] = False,
+    mask: Annotated[Path | None, typer.Option(help="Image or stack, 0 at the pixels to leave out of the fit.")] = None,
+    mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave NaN and infinite pixels out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
+    checkpoint_interval: Annotated[float, typer.Option(help="Seconds between checkpoints.")] = 60.0,
+    report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
+    fsc: Annotated[
+        bool,
+        typer.Option("--fsc", help="Reconstruct the even and the odd tilts too: their correlation is in the report."),
+    ] = False,
+    reference: Annotated[
+        Path | None, typer.Option(help="Volume that the report correlates the result with, where --fsc is not given.")
+    ] = None,
+    seed: SeedOption = 0,
+    device: DeviceOption = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Reconstruct a clean volume, and the noise model with it, from one noisy tilt series.
+
+    Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
+    """
+    from recon.commands.inputs import load_tilt_series
+    from recon.commands.results import Targets
+    from recon.report import read_reference
+    from recon.tilt_series import VolumeGrid
+
+    output, targets = Output(json), Targets(out, report=report, noise_model=save_noise_model)
+    with warnings_as_lines(output) as warned:
+        tilt_series = load_tilt_series(
+            tilts,
+            angles=angles,
+            transforms=transforms,
+            mode=mode,
+            invert_tilt=invert_tilt,
+            invert_contrast=invert_contrast,
+            mask=mask,
+            mask_nan=mask_nan,
+        )
+        grid = VolumeGrid.of(tilt_series, thickness)
+        truth = None if reference is None else read_reference(reference, grid)
+        options = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
+        options |= {"window": window, "denoiser": denoiser}
+        settings = _settings(tilt_series, grid, {**options, "fsc": fsc}, noise_model)
+        fixed = load_noise_model(noise_model)
+        options |= {"noise_model": fixed, "device": choose_device(device)}
+        output.line(memory_line(tilt_series, grid, method, options["device"]))
+        with step_report(json_mode=json) as progress:
+            journal = open_journal(
+                out, settings, resume=resume, interval=checkpoint_interval, report=progress, output=output
+            )
+            started = time.perf_counter()
+            with stoppable(journal, context):
+                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc and report is not None)
+            seconds = time.perf_counter() - started
+        inputs = [path for path in (tilts, angles, noise_model) if path is not None]
+        targets.write(
+            output,
+            tilt_series,
+            outcome,
+            seconds=seconds,
+            inputs=inputs,
+            seed=seed,
+            halves=halves,
+            reference=truth,
+            warned=warned,
+        )
+    journal.discard()
+
+
+def _solve(
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
+) -> tuple[Outcome, tuple[Volume, Volume] | None]:
+    """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
+    from recon.methods import reconstruct
+    from recon.report import even_odd
+
+    solve = partial(reconstruct, grid=grid, **options, run_fit=journal.fit)
+    outcome = solve(tilt_series, progress=lambda done, note: None)
+    if not fsc:
+        return outcome, None
+    first, second = (solve(half).volume for half in even_odd(tilt_series))
+    return outcome, (first, second)
+
+
+def _settings(
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], noise_model: Path | None
+) -> dict[str, Any]:
+    """All that decides the volume, with digests in place of the data."""
+    import numpy as np
+
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask):
+        if array is not None:
+            digest.update(f"{array.dtype}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+    data = {"tilt series": digest.hexdigest(), "mode": tilt_series.mode, "grid": list(grid.shape)}
+    known = noise_model is not None and noise_model.is_file()
+    model = hashlib.blake2b(noise_model.read_bytes(), digest_size=16).hexdigest() if noise_model and known else None
+    return {**options, **data, "noise model": model}

@@ -1,0 +1,100 @@
+"""What `noiseflow reconstruct` writes and tells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import noiseflow
+from noiseflow import io
+from noiseflow.console import Output
+from noiseflow.model_files import MODEL_SUFFIXES
+from recon.methods import Outcome
+from recon.report import reconstruction_report
+from recon.tilt_series import TiltSeries, Volume
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Where results go, checked before the long work.
+
+    Attributes:
+        volume: the volume's file.
+        report: folder of the HTML report, or None.
+        noise_model: file for the learnt noise model, or None.
+
+    Raises:
+        ValueError, OSError: as `noiseflow.io.check_output`.
+    """
+
+    volume: Path
+    report: Path | None = None
+    noise_model: Path | None = None
+
+    def __post_init__(self) -> None:
+        io.check_output(self.volume)
+        if self.noise_model is not None:
+            io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES)
+        if self.report is not None:
+            io.check_folder(self.report)
+
+    def write(
+        self,
+        output: Output,
+        tilt_series: TiltSeries,
+        outcome: Outcome,
+        *,
+        seconds: float,
+        inputs: Sequence[Path],
+        seed: int,
+        halves: tuple[Volume, Volume] | None = None,
+        reference: Volume | None = None,
+        warned: Sequence[str] = (),
+    ) -> None:
+        """Write what was asked for and tell what was found."""
+        rows = _figures(tilt_series, outcome, seconds)
+        outcome.volume.write(self.volume)
+        if self.noise_model is not None:
+            _save_noise_model(outcome, self.noise_model, inputs[0])
+        output.table(("figure", "value"), list(rows.items()))
+        output.line(f"volume: {self.volume}")
+        page = None
+        if self.report is not None:
+            self.report.mkdir(parents=True, exist_ok=True)
+            content = reconstruction_report(
+                tilt_series, outcome, list(rows.items()), inputs=inputs, seed=seed, halves=halves, reference=reference
+            )
+            page = content.save(self.report / "index.html")
+            output.line(f"report: {page}")
+        fit = outcome.fit_result
+        output.result(
+            {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
+            | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
+            | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
+        )
+
+
+def _save_noise_model(outcome: Outcome, path: Path, source: Path) -> None:
+    if outcome.noise_model is None:
+        raise ValueError(f"--save-noise-model: method {outcome.method} learns no noise model; use --method joint")
+    noiseflow.save(outcome.noise_model, path, provenance={"tilt_series": source.name, "method": outcome.method})
+
+
+def _figures(tilt_series: TiltSeries, outcome: Outcome, seconds: float) -> dict[str, str]:
+    residual = tilt_series.images.astype(np.float32) - outcome.projections
+    rows = {
+        "method": outcome.method,
+        "volume (z, y, x)": " x ".join(str(size) for size in outcome.volume.attenuation.shape),
+        "voxel size (Å)": "unknown" if outcome.volume.voxel_size is None else f"{outcome.volume.voxel_size:.4g}",
+        "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
+        "residual rms": f"{float(np.sqrt(np.mean(residual[tilt_series.used] ** 2))):.4g}",
+    }
+    rows |= {
+        name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
+    }
+    if outcome.fit_result is not None:
+        rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
+    return rows | {"seconds": f"{seconds:.1f}"}

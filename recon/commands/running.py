@@ -1,0 +1,133 @@
+"""Long work that can be stopped: Ctrl-C, the command that goes on, and warnings as plain lines."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from noiseflow.console import Output, StepReport
+    from recon.checkpoint import Journal
+    from recon.tilt_series import TiltSeries, VolumeGrid
+
+
+class StopSignal:
+    """Within the ``with`` block, Ctrl-C or SIGTERM stops a journal's run: once after the running step, twice at once.
+
+    Args:
+        journal: whose fits are running.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal, self._report = journal, journal.report
+        self.requested = False
+
+    def __enter__(self) -> StopSignal:
+        self._journal.report = self.report
+        self._before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def report(self, title: str, done: int, total: int, note: str) -> None:
+        """Pass the step on; stop here if that was asked for."""
+        if self._report is not None:
+            self._report(title, done, total, note)
+        if self.requested:
+            raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
+
+    def _handle(self, number: int, frame: Any) -> None:
+        if self.requested or not self._journal.in_fit:
+            self._journal.abandoned = True
+            raise KeyboardInterrupt("stopped at once")
+        self.requested = True
+        print("noiseflow: finishing this step; Ctrl-C again stops at once", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
+    """Run fits that can be stopped; says how to go on, and ends with exit code 130.
+
+    Raises:
+        typer.Exit: the run was stopped.
+    """
+    try:
+        with StopSignal(journal):
+            yield
+    except KeyboardInterrupt as stop:
+        reason = str(stop) or "stopped"
+        advice = f"go on with: {resume_command(context)}" if journal.resumed else "before the first checkpoint"
+        print(f"noiseflow: {reason}; {advice}", file=sys.stderr)
+        raise typer.Exit(130) from None
+
+
+def resume_command(context: typer.Context) -> str:
+    """The command line that goes on with the present command."""
+    words = ["noiseflow", context.command.name or ""]
+    for parameter in context.command.params:
+        value, name = context.params.get(parameter.name or ""), max(parameter.opts, key=len)
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif value is True and name != "--resume":
+            words.append(name)
+        elif value not in (None, False, True) and value != parameter.default:
+            words += [name, str(value)]
+    return shlex.join([*words, "--resume"])
+
+
+@contextlib.contextmanager
+def warnings_as_lines(output: Output) -> Iterator[list[str]]:
+    """Show each warning once, as one line; yields the list that collects them."""
+    told: list[str] = []
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = " ".join(str(message).split())
+        if issubclass(category, UserWarning) and text not in told:
+            told.append(text)
+            print(f"noiseflow: warning: {text}", file=sys.stderr, flush=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield told
+
+
+def memory_line(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any) -> str:
+    """One line about the memory needed and available.
+
+    Raises:
+        MemoryError: it does not fit.
+    """
+    from recon.memory import needed_memory, require_memory
+
+    fitted = not method.startswith(("sirt", "wbp"))
+    return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
+
+
+def open_journal(
+    out: Path, settings: dict[str, Any], *, resume: bool, interval: float, report: StepReport, output: Output
+) -> Journal:
+    """The journal of the run that makes `out`, beside it. Raises as `Journal`."""
+    from recon.checkpoint import Journal
+
+    folder = out.with_name(f"{out.name}.checkpoint")
+    journal = Journal(folder, settings, resume=resume, interval=interval, report=report)
+    if resume and not journal.resumed:
+        output.line(f"no checkpoint {folder}: starting from the beginning")
+    elif journal.exists and not resume:
+        output.line(f"starting over; the checkpoint of an earlier run, {folder}, will be replaced")
+    return journal

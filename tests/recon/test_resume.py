@@ -1,0 +1,199 @@
+"""A reconstruction that was stopped, by Ctrl-C or by kill -9, goes on and ends in the same volume."""
+
+import json
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+import noiseflow
+import recon.commands.results  # noqa: F401  or every child process would import it again
+from noiseflow.cli import main
+from recon.checkpoint import Journal, read_state, write_state
+
+FORK = multiprocessing.get_context("fork")
+
+
+def child(arguments, log):
+    """In a process of its own: the command, with all it prints in a file."""
+    torch.set_num_threads(1)
+    with open(log, "w", buffering=1) as stream:
+        sys.stdout = sys.stderr = stream
+        main([str(argument) for argument in arguments])
+
+
+def start(arguments, log):
+    process = FORK.Process(target=child, args=(arguments, log))
+    process.start()
+    return process
+
+
+def finish(arguments, log):
+    process = start(arguments, log)
+    process.join(300)
+    assert process.exitcode == 0, log.read_text()
+    return log.read_text()
+
+
+def wait_for(condition, process, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.is_alive(), "the command ended before it could be stopped"
+        assert time.monotonic() < end, "the command never got there"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def series(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("resume")
+    finish(["simulate", folder / "new", "--size", 16, "--tilts=-60:60:10"], folder / "log")
+    return folder / "new" / "tilts.mrc"
+
+
+def command(series, out, *more):
+    return ["reconstruct", series, "-o", out, "--method", "l2", "--steps", 60, "--checkpoint-interval", 0.1, *more]
+
+
+@pytest.fixture(scope="module")
+def whole(series, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    started = time.monotonic()
+    text = finish(command(series, folder / "volume.npy", "--resume"), folder / "log")
+    assert "starting from the beginning" in text
+    assert "memory: about" in text
+    return np.load(folder / "volume.npy"), time.monotonic() - started
+
+
+def assert_same(found, expected):
+    assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
+
+
+def kill_and_resume(series, whole, folder, kills, randomness):
+    """Kill at random moments; at most one interval is lost each time, so every run gets further than the last."""
+    expected, seconds = whole
+    out, more = folder / "volume.npy", []
+    for _ in range(kills):
+        process = start(command(series, out, *more), folder / "log")
+        process.join(randomness.uniform(0, 1.1 * seconds / max(1, kills / 3)))
+        if process.is_alive():
+            os.kill(process.pid, signal.SIGKILL)
+            process.join()
+        more = ["--resume"]
+        assert not list(folder.glob(".volume*")) or not out.exists()
+    finish(command(series, out, *more), folder / "log")
+    assert_same(np.load(out), expected)
+    assert not (folder / "volume.npy.checkpoint").exists()
+
+
+def test_two_kills_at_random_moments_lose_nothing(series, whole, tmp_path):
+    kill_and_resume(series, whole, tmp_path, 2, random.Random(1))
+
+
+@pytest.mark.slow
+def test_thirty_kills_at_random_moments_lose_nothing(series, whole, tmp_path):
+    for seed in range(6):
+        (tmp_path / str(seed)).mkdir()
+        kill_and_resume(series, whole, tmp_path / str(seed), 5, random.Random(seed))
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
+    out, log = tmp_path / "volume.npy", tmp_path / "log"
+    process = start(command(series, out), log)
+    wait_for(lambda: (tmp_path / "volume.npy.checkpoint" / "fit-002.safetensors").exists(), process)
+    os.kill(process.pid, signal.SIGINT)
+    process.join(60)
+    assert process.exitcode == 130, log.read_text()
+    assert not out.exists()
+    last = log.read_text().strip().splitlines()[-1]
+    assert (
+        f"noiseflow reconstruct {series} --out {out} --method l2 --steps 60 --checkpoint-interval 0.1 --resume" in last
+    )
+    finish(command(series, out, "--resume"), log)
+    assert_same(np.load(out), whole[0])
+
+
+def test_ctrl_c_twice_leaves_the_last_checkpoint(series, tmp_path):
+    out, log = tmp_path / "volume.npy", tmp_path / "log"
+    process = start(command(series, out), log)
+    kept = tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors"
+    wait_for(kept.exists, process)
+    for _ in range(2):
+        os.kill(process.pid, signal.SIGINT)
+    process.join(60)
+    assert process.exitcode == 130, log.read_text()
+    assert read_state(kept)["result"]["num_steps"] > 0
+    assert log.read_text().strip().splitlines()[-1].endswith("--resume")
+
+
+def test_another_run_is_not_gone_on_with(series, tmp_path, refused):
+    out = tmp_path / "volume.npy"
+    process = start(command(series, out), tmp_path / "log")
+    wait_for(lambda: (tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists(), process)
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    message = refused(*command(series, out, "--seed", 5, "--resume"))
+    assert "seed was 0, now 5" in message
+    assert (tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists()
+    (tmp_path / "volume.npy.checkpoint" / "run.json").write_text("{")
+    assert "damaged" in refused(*command(series, out, "--resume"))
+
+
+def fits(journal, steps=30):
+    """Two fits in order, the second starting from the first, as a reconstruction does."""
+    torch.manual_seed(3)
+    generator = torch.Generator().manual_seed(1)
+    observation = torch.rand(4, 40, 40, generator=generator) + torch.linspace(0, 1, 40)
+    scene, first, second = noiseflow.StaticScene(observation), noiseflow.Gaussian(), noiseflow.RadialFlow()
+    for model in (first, second):
+        journal.fit(model, scene, observation, num_steps=steps, generator=generator)
+    return scene.image().detach(), torch.cat([p.detach().flatten() for p in second.parameters()])
+
+
+def test_journal_ends_where_an_unbroken_run_does_wherever_it_stopped(tmp_path):
+    expected = fits(Journal(tmp_path / "whole", {}))
+    for stop in (1, 17, 30, 31, 44, 60):
+        count = iter(range(1, 1000))
+
+        def report(*_, count=count, stop=stop):
+            if next(count) == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            fits(Journal(tmp_path / str(stop), {}, report=report))
+        found = fits(Journal(tmp_path / str(stop), {}, resume=True))
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_first_write_of_a_new_run_replaces_the_old_journal(tmp_path):
+    fits(Journal(tmp_path / "run", {"seed": 0}), steps=3)
+    journal = Journal(tmp_path / "run", {"seed": 1})
+    assert not journal.resumed
+    assert len(list((tmp_path / "run").glob("fit-*"))) == 2
+    journal.fit(noiseflow.Gaussian(), torch.rand(200), torch.rand(200), num_steps=2)
+    assert len(list((tmp_path / "run").glob("fit-*"))) == 1
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["settings"] == {"seed": 1}
+    journal.discard()
+    assert not (tmp_path / "run").exists()
+
+
+def test_state_survives_the_file_and_damage_is_told(tmp_path):
+    grid = torch.arange(12.0).view(3, 4)
+    state = {"a": [1, None, True, "x"], 3: {"inf": float("inf")}, "whole": grid, "view": grid[1:, 1], "same": grid}
+    write_state(tmp_path / "state.safetensors", state)
+    back = read_state(tmp_path / "state.safetensors")
+    assert list(back) == list(state)
+    assert back["a"] == state["a"]
+    assert back[3] == state[3]
+    for name in ("whole", "view", "same"):
+        torch.testing.assert_close(back[name], state[name])
+    data = (tmp_path / "state.safetensors").read_bytes()
+    (tmp_path / "state.safetensors").write_bytes(data[: len(data) // 2])
+    with pytest.raises(ValueError, match="damaged"):
+        read_state(tmp_path / "state.safetensors")
