@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ StepReport = Callable[[str, int, int, str], None]
 
 _FORMAT = "noiseflow checkpoint 1"
 _RUN, _CURRENT = "run.json", "current.safetensors"
+_RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
 
 
 class Journal:
@@ -75,7 +76,7 @@ class Journal:
         return not self._fresh
 
     def fit(self, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any) -> FitResult:
-        """`noiseflow.fit`, or what it reached earlier; arguments and errors are the same."""
+        """`noiseflow.fit` with ``digitise=False``, or what it reached earlier; other arguments and errors are the same."""
         self._num_fits += 1
         finished, generator = self._finished(self._num_fits), options.get("generator")
         models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
@@ -83,14 +84,14 @@ class Journal:
             return _replay(read_state(finished), models, generator)
         title = f"choosing, fit {self._num_fits}" if options.pop("progress", None) is None else "fitting the volume"
         options |= {"progress": self._progress(title, options.get("num_steps", 500)), "resume": self._current()}
-        options |= {"checkpoint": self._write_current, "checkpoint_interval": self.interval}
+        options |= {"digitise": False, "checkpoint": self._write_current, "checkpoint_interval": self.interval}
         self.in_fit = True
         result = fit(noise_model, signal, observation, **options)
         self.in_fit = False
         self._write(
             finished,
             {name: model.state_dict() for name, model in models.items()}
-            | {"result": asdict(result), "rng": torch.get_rng_state()}
+            | {"result": {name: getattr(result, name) for name in _RESULT}, "rng": torch.get_rng_state()}
             | ({"generator": generator.get_state()} if generator is not None else {}),
         )
         (self.folder / _CURRENT).unlink(missing_ok=True)
@@ -161,7 +162,7 @@ def _replay(kept: dict[str, Any], models: dict[str, nn.Module], generator: torch
     if generator is not None:
         generator.set_state(kept["generator"])
     torch.set_rng_state(kept["rng"])
-    return FitResult(**kept["result"])
+    return FitResult(models["noise_model"], **kept["result"])
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
