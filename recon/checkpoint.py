@@ -99,7 +99,7 @@ class Journal:
 
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
-        for file in (*self.folder.glob("fit-*.safetensors"), self.folder / _CURRENT, self.folder / _RUN):
+        for file in (*self.folder.glob("*.safetensors"), *self.folder.glob("*run*.json")):  # half-written ones too
             file.unlink(missing_ok=True)
         if self.folder.is_dir() and not any(self.folder.iterdir()):
             self.folder.rmdir()
