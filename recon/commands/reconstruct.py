@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -96,7 +95,7 @@ def reconstruct(
         )
         grid = VolumeGrid.of(tilt_series, thickness)
         truth = None if reference is None else read_reference(reference, grid)
-        options = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
+        options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
         options |= {"window": window, "denoiser": denoiser}
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc}, noise_model)
         fixed = load_noise_model(noise_model)
@@ -132,11 +131,11 @@ def _solve(
     from recon.methods import reconstruct
     from recon.report import even_odd
 
-    solve = partial(reconstruct, grid=grid, **options, run_fit=journal.fit)
-    outcome = solve(tilt_series, progress=lambda done, note: None)
+    options = {**options, "run_fit": journal.fit}
+    outcome = reconstruct(tilt_series, grid, **options, progress=lambda done, note: None)
     if not fsc:
         return outcome, None
-    first, second = (solve(half).volume for half in even_odd(tilt_series))
+    first, second = (reconstruct(half, grid, **options).volume for half in even_odd(tilt_series))
     return outcome, (first, second)
 
 
