@@ -84,6 +84,7 @@ def evaluate(
     *,
     num_bins: int = 64,
     num_signal_bins: int = 16,
+    skip_non_finite: bool = False,
     seed: int = 0,
 ) -> Evaluation:
     """Judge a noise model on clean signals and observations that it was not fitted to.
@@ -93,16 +94,25 @@ def evaluate(
         signal, observation: any shape, equal; detector units.
         num_bins: bins of the residual histograms.
         num_signal_bins: bins of equal population along the signal.
+        skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
         seed: of the bootstrap and of the randomised PIT.
 
     Raises:
-        ValueError: shapes differ or there are no pixels.
+        ValueError: shapes differ, pixels are not finite, or there are none.
     """
     signal, observation = signal.reshape(-1), observation.reshape(-1)
     if signal.shape != observation.shape or not signal.numel():
         raise ValueError(
             f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
         )
+    finite = torch.isfinite(signal) & torch.isfinite(observation)
+    if not bool(finite.all()):
+        if not (skip_non_finite and bool(finite.any())):
+            raise ValueError(
+                f"{int((~finite).sum())} of {finite.numel()} pixels of signal or observation are NaN or infinite; "
+                "mend them, or leave them out with skip_non_finite=True"
+            )
+        signal, observation = signal[finite], observation[finite]
     random = np.random.default_rng(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)

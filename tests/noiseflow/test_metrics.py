@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import noiseflow
 from noiseflow import metrics
@@ -65,3 +67,58 @@ def test_pit_of_rounded_data_is_uniform() -> None:
 def test_empty_input_is_refused() -> None:
     with pytest.raises(ValueError, match="non-zero"):
         metrics.evaluate(noiseflow.Gaussian(), torch.zeros(0), torch.zeros(0))
+
+
+def test_non_finite_pixels_are_refused_or_left_out() -> None:
+    signal, observation = noisy(0)
+    expected = metrics.evaluate(noiseflow.Gaussian(0.1), signal[2:], observation[2:])
+    observation = observation.clone()
+    observation[0], observation[1] = math.nan, math.inf
+    with pytest.raises(ValueError, match=r"2 of 40000 pixels .* skip_non_finite"):
+        metrics.evaluate(noiseflow.Gaussian(0.1), signal, observation)
+    found = metrics.evaluate(noiseflow.Gaussian(0.1), signal, observation, skip_non_finite=True)
+    assert found.num_pixels == 39_998
+    assert found.nll == expected.nll
+    assert found.overall == expected.overall
+    with pytest.raises(ValueError, match="4 of 4"):
+        metrics.evaluate(noiseflow.Gaussian(), torch.zeros(4), torch.full((4,), math.nan), skip_non_finite=True)
+
+
+def probabilities(seed: int, num_bins: int) -> np.ndarray:
+    """Two probability vectors of very different sizes of entries, some zero, (2, num_bins)."""
+    random = np.random.default_rng(seed)
+    weight = random.random((2, num_bins)) ** random.integers(1, 12) * (random.random((2, num_bins)) < 0.8)
+    weight[:, 0] += 1e-3
+    return np.asarray(weight / weight.sum(1, keepdims=True))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 40))
+def test_laws_of_the_divergences(seed: int, num_bins: int) -> None:
+    p, q = probabilities(seed, num_bins)
+    jsd, bc = float(metrics.jensen_shannon(p, q)), float(metrics.bhattacharyya(p, q))
+    assert -1e-12 <= jsd <= math.log(2) + 1e-12
+    assert 0 <= bc <= 1 + 1e-12
+    assert jsd == pytest.approx(float(metrics.jensen_shannon(q, p)), abs=1e-12)
+    total = np.abs(p - q).sum() / 2
+    assert 1 - bc <= total + 1e-12  # Hellinger's and Lin's bounds by the total variation
+    assert jsd <= math.log(2) * total + 1e-12
+    merged = [np.add.reduceat(each, np.arange(0, num_bins, 2)) for each in (p, q)]
+    assert float(metrics.jensen_shannon(*merged)) <= jsd + 1e-12  # coarser bins tell less
+    assert float(metrics.bhattacharyya(*merged)) >= bc - 1e-12
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.integers(4, 64), st.integers(20_000, 500_000))
+def test_floors_are_met_by_the_truth_and_follow_the_number_of_bins(seed: int, num_bins: int, total: int) -> None:
+    random = np.random.default_rng(seed)
+    masses = random.dirichlet(np.full(num_bins, 20.0))
+    found = [metrics.compare_histogram(random.multinomial(total, masses), masses, random) for _ in range(40)]
+    expected = (num_bins - 1) / (8 * total)
+    for values, floors in (
+        ([d.jsd for d in found], [d.jsd_floor for d in found]),
+        ([1 - d.bc for d in found], [1 - d.bc_floor for d in found]),
+        ([d.bd for d in found], [d.bd_floor for d in found]),
+    ):
+        assert np.mean(floors) == pytest.approx(expected, rel=0.15)
+        assert np.mean(values) == pytest.approx(expected, rel=5 * math.sqrt(2 / (num_bins - 1) / 40) + 0.05)
