@@ -26,6 +26,7 @@ from typing import Any
 import noise_page
 import torch
 from noise_accuracy import MODELS, NOISES, measure, search
+from noise_exposures import exposures
 from noise_speed import speed
 
 from noiseflow.console import Output, choose_device
@@ -130,8 +131,9 @@ def main() -> None:
     if "search" in chosen:
         for row in search(output):
             results.put("search", row, "model", "setting")
-    if "exposures" in chosen and (options.data is not None or options.part == "exposures"):
-        pass
+    if "exposures" in chosen:
+        for row in exposures(options.data, output):
+            results.put("exposures", row, "data", "model")
     if "page" in chosen:
         noise_page.write(results.content)
     if results.path is None:
@@ -141,5 +143,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except ValueError as error:
+    except (ValueError, FileNotFoundError) as error:
         sys.exit(f"noise_models.py: {error}")
