@@ -111,6 +111,11 @@ class VolumeGrid:
     def of(cls, tilt_series: TiltSeries, thickness: int | None = None) -> VolumeGrid:
         """One voxel per pixel: as high and wide as the images, `thickness` voxels deep (the width if None)."""
         _, height, width = tilt_series.images.shape
+        if thickness is not None and thickness > 2 * max(height, width):
+            raise ValueError(
+                f"--thickness {thickness} is more than twice the images' {max(height, width)} pixels; nothing so thick stays in "
+                "view when tilted: give it in voxels, as large as pixels"
+            )
         return cls(width if thickness is None else thickness, height, width, tilt_series.pixel_size)
 
 

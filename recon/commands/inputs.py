@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,11 @@ def load_tilt_series(
     if invert_contrast:
         series = inverted(series)
     check_contrast(series)
+    steps = np.diff(series.tilt_angles)
+    if (steps > 0).any() and (steps < 0).any():
+        warnings.warn(
+            "the tilt angles are not in order; each image keeps its own angle, which is all that counts", stacklevel=2
+        )
     return series
 
 
