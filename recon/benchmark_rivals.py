@@ -25,6 +25,7 @@ from recon.fields import VoxelField
 from recon.joint import JointReconstructor
 from recon.laplace import Laplace
 from recon.metrics import compare
+from recon.presets import PRESETS, Kniesel2022
 from recon.sirt import sirt
 from recon.wbp import WINDOWS, wbp
 
@@ -170,12 +171,27 @@ def run(size: int, results: Results, *, effort: Effort, line: Callable[[str], No
 def run_slow(size: int, results: Results, *, effort: Effort, line: Callable[[str], None], **scene_options: Any) -> None:
     """The rivals that take hours, as far as the budget goes; one curve each."""
     scene = make_scene(size, **scene_options)
-    slow: dict[str, Callable[[], Iterator[Point]]] = {}
+    slow: dict[str, Callable[[], Iterator[Point]]] = {
+        name: lambda p=preset: _trained(scene, p, effort.budget)  # type: ignore[misc]
+        for name, preset in PRESETS.items()
+    }
     if not missing("quantem"):
         slow["quantem INR"] = lambda: quantem_inr(scene.noisy, scene.grid, budget=effort.budget)
     for name, curve in slow.items():
         line(f"{scene.name}: {name}, {effort.budget:.0f} s")
         results.cell(f"{size}/curve 0/{name}", lambda c=curve: _measured(scene, c()))  # type: ignore[misc]
+
+
+def _trained(scene: Scene, preset: Kniesel2022, budget: float) -> Iterator[Point]:
+    """A preset's volumes at growing times, each half as long again as the one before."""
+    seconds, due, started = 0.0, budget / 30, time.perf_counter()
+    for state in preset.train(scene.noisy):
+        now = seconds + time.perf_counter() - started
+        if now >= due or now >= budget:
+            yield f"{state.steps} of {preset.num_steps} steps", now, state.volume(scene.grid).attenuation
+            seconds, due, started = now, 1.5 * now, time.perf_counter()
+        if now >= budget:
+            return
 
 
 def _measured(scene: Scene, points: Iterator[Point]) -> Cell:

@@ -16,6 +16,7 @@ from recon.denoise import find_denoiser
 from recon.fields import VoxelField
 from recon.joint import JointReconstructor, Reconstruction
 from recon.laplace import Laplace
+from recon.presets import PRESETS
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.wbp import WINDOWS, wbp
@@ -193,6 +194,21 @@ def _wbp(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outco
     problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
     volume = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
     return _classical("wbp", problem, volume, grid, {"window": window, "cutoff": cutoff})
+
+
+def _of_preset(name: str) -> Method:
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
+        preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)
+        volume, state = preset(tilt_series, grid, max_steps=settings.num_steps, progress=settings.progress)
+        problem = LineIntegralProblem.of(tilt_series, grid)
+        predicted = problem.predict(torch.from_numpy(volume.attenuation))
+        choices: dict[str, float | str] = {"steps": state.steps, "loss": state.loss}
+        return Outcome(volume, predicted, name, None, state.noise_model, choices)
+
+    return run
+
+
+METHODS |= {name: _of_preset(name) for name in PRESETS}
 
 
 def _classical(
