@@ -39,7 +39,7 @@ def wavelet(image: Array, strength: float) -> Array:
     from skimage.restoration import cycle_spin, denoise_wavelet
 
     options = {"sigma": strength, "method": "BayesShrink", "mode": "soft", "wavelet": "db2"}
-    spun = cycle_spin(image, func=denoise_wavelet, max_shifts=3, func_kw=options)
+    spun = cycle_spin(image, func=denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
     return np.asarray(spun)
 
 
