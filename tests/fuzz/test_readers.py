@@ -1,0 +1,141 @@
+"""Damaged files of every format: a reader gives an image or one ValueError, in bounded memory and time.
+
+``make fuzz`` runs many more examples than CI does; NOISEFLOW_FUZZ_EXAMPLES says how many of each kind.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import noiseflow
+from noiseflow import io
+
+EXAMPLES = int(os.environ.get("NOISEFLOW_FUZZ_EXAMPLES", "60"))
+SPARE_MEMORY = 600 * 2**20
+SECONDS = 10
+STACK = (np.arange(3 * 16 * 20) % 251).reshape(3, 16, 20)
+NEEDLE = Path(__file__).parents[3] / "shared" / "data" / "tilt_needle" / "needle_raw.dm3"
+
+fuzz = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+numbers = st.sampled_from([0, 1, 2, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**32 - 1])
+spots = st.floats(0, 1, exclude_max=True)
+near_start = spots.map(lambda spot: spot**3)  # headers sit in front
+damage = st.one_of(
+    st.tuples(st.just("cut"), spots, st.just(0)),
+    st.tuples(st.just("byte"), st.one_of(spots, near_start), st.integers(0, 255)),
+    st.tuples(st.just("word"), st.one_of(spots, near_start), numbers),
+    st.tuples(st.just("drop"), st.one_of(spots, near_start), st.integers(1, 64)),
+    st.tuples(st.just("double"), st.one_of(spots, near_start), st.integers(1, 64)),
+)
+
+
+def apply(content: bytes, wounds: list[tuple[str, float, int]]) -> bytes:
+    for kind, spot, value in wounds:
+        at = int(spot * len(content))
+        if kind == "cut":
+            content = content[:at]
+        elif kind == "byte":
+            content = content[:at] + bytes([value]) + content[at + 1 :]
+        elif kind == "word":
+            content = content[:at] + struct.pack("<I", value) + content[at + 4 :]
+        elif kind == "drop":
+            content = content[:at] + content[at + value :]
+        else:
+            content = content[: at + value] + content[at:]
+    return content
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """A small sound file of every kind, by suffix."""
+    folder = tmp_path_factory.mktemp("sound")
+    for name in ("a.mrc", "a.npy"):
+        io.write(folder / name, STACK.astype(np.float32))
+    tifffile.imwrite(folder / "a.tif", STACK.astype(np.uint16), photometric="minisblack", compression="zlib")
+    tifffile.imwrite(folder / "a.tiff", STACK.astype(np.uint16), ome=True, metadata={"axes": "ZYX"})
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("exchange/data", data=STACK.astype(np.float32), chunks=(1, 16, 20), compression="gzip")
+        file["exchange/theta"] = np.arange(3.0)
+    noiseflow.save(noiseflow.RadialFlow(2), folder / "a.safetensors")
+    return {path.suffix: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(autouse=True)
+def bounds() -> Iterator[None]:
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + SPARE_MEMORY, hard))
+    signal.signal(signal.SIGALRM, _give_up)
+    yield
+    signal.alarm(0)
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _give_up(*_: object) -> None:
+    pytest.fail(f"still reading after {SECONDS} s")
+
+
+def read_or_refuse(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    signal.alarm(SECONDS)
+    try:
+        noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
+    except ValueError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+    finally:
+        signal.alarm(0)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".tif", ".tiff", ".h5", ".safetensors"])
+@fuzz
+@given(wounds=st.lists(damage, min_size=1, max_size=4))
+def test_damaged_files_are_read_or_refused(
+    suffix: str, wounds: list[tuple[str, float, int]], sound: dict[str, bytes], tmp_path: Path
+) -> None:
+    read_or_refuse(tmp_path / f"a{suffix}", apply(sound[suffix], wounds))
+
+
+@pytest.mark.skipif(not NEEDLE.exists(), reason="the raw needle series is not here")
+@pytest.mark.filterwarnings("ignore")
+@settings(parent=fuzz, max_examples=max(1, EXAMPLES // 20))
+@given(wounds=st.lists(damage, min_size=1, max_size=3))
+def test_damaged_dm3_files_are_read_or_refused(wounds: list[tuple[str, float, int]], tmp_path: Path) -> None:
+    read_or_refuse(tmp_path / "a.dm3", apply(NEEDLE.read_bytes(), wounds))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("suffix", sorted(io.SUFFIXES - {".zarr"}))
+@settings(parent=fuzz, max_examples=max(1, EXAMPLES // 6))
+@given(content=st.binary(min_size=1, max_size=3000))
+def test_any_bytes_are_refused_or_read(suffix: str, content: bytes, tmp_path: Path) -> None:
+    read_or_refuse(tmp_path / f"a{suffix}", content)
+
+
+@fuzz
+@given(text=st.text(max_size=200))
+def test_any_text_is_an_angle_file_or_refused(text: str, tmp_path: Path) -> None:
+    for name, reader in (("a.tlt", io.read_angles), ("a.mdoc", io.read_angles), ("a.xf", io.read_transforms)):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8", errors="replace")
+        try:
+            assert reader(path).dtype == np.float64
+        except ValueError as error:
+            assert name in str(error)
