@@ -25,8 +25,9 @@ def read(path: Path) -> ImageFile:
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
-        compressed = any(getattr(page, "compression", 1) != 1 for page in tiff.pages)
-        require_room(sum(page.nbytes for page in tiff.pages), path, compressed=compressed)
+        pages = _pages(tiff)
+        compressed = any(getattr(page, "compression", 1) != 1 for page in pages)
+        require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
         series = tiff.series[0]
         require_room(series.nbytes, path, compressed=compressed)
         if "S" in series.axes:
@@ -60,6 +61,15 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata)
     return data
+
+
+def _pages(tiff: TiffFile) -> list[Any]:
+    pages: dict[int, Any] = {}
+    for page in tiff.pages:
+        if page.offset in pages:
+            raise ValueError("its list of pages runs in a circle")
+        pages[page.offset] = page
+    return list(pages.values())
 
 
 def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:

@@ -81,9 +81,9 @@ def bounds() -> Iterator[None]:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + SPARE_MEMORY, hard))
-    signal.signal(signal.SIGALRM, _give_up)
+    signal.signal(signal.SIGPROF, _give_up)
     yield
-    signal.alarm(0)
+    signal.setitimer(signal.ITIMER_PROF, 0)
     resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
@@ -93,14 +93,16 @@ def _give_up(*_: object) -> None:
 
 def read_or_refuse(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-    signal.alarm(SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    message = f"{path}"
     try:
         noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
     except ValueError as error:
-        assert str(path) in str(error)
-        assert "\n" not in str(error)
+        message = str(error)
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    assert str(path) in message
+    assert "\n" not in message
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -135,7 +137,9 @@ def test_any_text_is_an_angle_file_or_refused(text: str, tmp_path: Path) -> None
     for name, reader in (("a.tlt", io.read_angles), ("a.mdoc", io.read_angles), ("a.xf", io.read_transforms)):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8", errors="replace")
+        message = name
         try:
-            assert reader(path).dtype == np.float64
+            reader(path)
         except ValueError as error:
-            assert name in str(error)
+            message = str(error)
+        assert name in message

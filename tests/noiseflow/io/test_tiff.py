@@ -121,3 +121,17 @@ def test_folders_of_nothing_stacks_and_unequal_images_are_refused(tmp_path: Path
     tifffile.imwrite(tmp_path / "1.tif", STACK.astype("u2"), photometric="minisblack")
     with pytest.raises(ValueError, match="single images"):
         io.read(tmp_path)
+
+
+def test_pages_in_a_circle_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for section in STACK.astype("u2"):
+            writer.write(section, metadata=None)
+    with tifffile.TiffFile(path) as tiff:
+        first, last = tiff.pages[0].offset, tiff.pages[2]
+        end = last.offset + 2 + 12 * len(last.tags)
+    content = path.read_bytes()
+    path.write_bytes(content[:end] + first.to_bytes(4, "little") + content[end + 4 :])
+    with pytest.raises(ValueError, match="in a circle"):
+        io.read(path)
