@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: demo test test-slow fuzz package-test check docs clean
+.PHONY: demo test test-slow fuzz check docs clean
 
 demo: .venv/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
@@ -19,10 +19,6 @@ test-slow: .venv/test-ready
 fuzz: export NOISEFLOW_FUZZ_EXAMPLES ?= 5000
 fuzz: .venv/test-ready
 	$(BIN)/python -m pytest tests/fuzz
-
-# Builds wheel and sdist, installs the wheel into an empty environment and runs its demo there.
-package-test: .venv/test-ready
-	$(BIN)/python -m pytest -m "slow or not slow" tests/test_package.py
 
 check: .venv/test-ready
 	$(BIN)/ruff check .
