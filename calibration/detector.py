@@ -9,17 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.exposures import Burst, Image, rounding_step
-from calibration.likelihood import DetectorLikelihood
-from calibration.masks import clear_of_rails
-from calibration.photon_transfer import (
-    Levels,
-    NotMeasurable,
-    PhotonTransfer,
-    Readings,
-    collect_levels,
-    fit_photon_transfer,
-)
+from calibration.exposures import Burst, Image, rails, rounding_step
+from calibration.levels import Levels, Readings, Scale, collect_cells, collect_levels
+from calibration.likelihood import LevelMasses
+from calibration.masks import Mask, clear_of_rails
+from calibration.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.posterior import DetectorPosterior, sample_posterior
 from calibration.scaling import ring_mean
 
@@ -31,6 +25,9 @@ EXCESS_NOISE = (
     "the excess-noise factor: read 'gain' as that product."
 )
 
+FEW_ELECTRONS = 25.0
+"""Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
+
 
 @dataclass(frozen=True)
 class Detector:
@@ -39,14 +36,14 @@ class Detector:
     Attributes:
         posterior: gain, offset and read noise.
         line: the photon-transfer points and line.
-        levels: the residual histograms.
-        offset: measured offset and its standard error, counts; None where only the noise tells it.
-        misfit: χ² per degree of freedom of the residual histograms: about 1 for a Poisson-Gaussian detector.
+        levels: the histograms.
+        offset: offset measured by dark frames and its standard error, counts; None without.
+        misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector.
     """
 
     posterior: DetectorPosterior
     line: PhotonTransfer
-    levels: Levels
+    levels: Sequence[Levels]
     offset: tuple[float, float] | None
     misfit: float
 
@@ -72,48 +69,88 @@ def measure_detector(
         NotMeasurable: the noise does not grow with the signal, or nearly all readings are clipped.
         ValueError: the posterior does not converge.
     """
-    readings = [readings_of(pair) for pair in pairs]
-    readings += [
+    plain, cells, lines = [], [], []
+    for number, pair in enumerate(pairs):
+        residual, fine = readings_of(pair, number)
+        plain += residual
+        cells += fine
+        lines += [pair.total_variance] * len(fine)
+    plain += [
         one for burst, is_dark in ((dark, True), (flat, False)) if burst for one in _burst_readings(burst, is_dark)
     ]
-    levels = collect_levels(readings)
-    offset = dark_offset(dark) if dark else exposure_offset(pairs)
+    levels = ([collect_levels(plain)] if plain else []) + ([collect_cells(cells, lines)] if cells else [])
+    offset = dark_offset(dark) if dark else None
     posterior = sample_posterior(levels, offset=offset, seed=seed, progress=progress)
+    levels = list(posterior.levels)
     return Detector(posterior, fit_photon_transfer(levels), levels, offset, misfit(levels, posterior.most_likely))
 
 
-def misfit(levels: Levels, parameters: Image, *, least: float = 10.0) -> float:
-    """χ² per degree of freedom of the residual histograms, over bins where at least `least` readings are expected.
+def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0) -> float:
+    """χ² per degree of freedom of the histograms, over cells where at least `least` readings are expected.
 
     Args:
-        levels: from `collect_levels`.
+        levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
         least: readings expected.
     """
     gain, offset, read_noise = (np.array([value]) for value in parameters)
-    number = levels.histogram.sum(axis=1, keepdims=True)
-    expected = number * DetectorLikelihood(levels).masses(gain, offset, read_noise)[0]
-    used = expected > least
-    squares = (levels.weight[:, None] * (levels.histogram - expected) ** 2)[used] / expected[used]
-    return float(squares.sum() / max(used.sum() - 2 * len(number) - 3, 1))
+    squares, freedom = 0.0, -3
+    for one in levels:
+        number = one.histogram.sum(axis=1, keepdims=True)
+        expected = number * LevelMasses(one).masses(gain, offset, read_noise)[0]
+        used = expected > least
+        departure = one.weight[:, None] * (one.histogram - expected) ** 2
+        squares += float(np.sum(departure[used] / expected[used]))
+        freedom += int(used.sum()) - 2 * len(number)
+    return squares / max(freedom, 1)
 
 
-def readings_of(pair: AlignedPair) -> Readings:
-    """The trusted pixels of a pair whose neighbours lie clear of the rails, sorted by what these tell of the signal.
+def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
+    """The trusted pixels of a pair, in two parts: for residuals, and for histograms of the readings themselves.
+
+    The latter are those of few electrons, of a noise as fine as the rounding, or near the converter's rails: their residuals
+    would lose what the likelihood can use. A burst, whose signals are as noisy as its readings, has only residuals, clear of
+    the rails.
+
+    Args:
+        pair: aligned.
+        number: of the pair, for its scale.
 
     Raises:
-        NotMeasurable: nearly all readings are clipped.
+        NotMeasurable: too few pixels.
     """
     level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
-    used = pair.mask & clear_of_rails(pair.short, level, pair.mask)
-    if used.sum() < MINIMUM_PIXELS:
-        raise NotMeasurable(
-            f"all but {int(used.sum())} pixels lie within their noise of the converter's rails, so that their noise is cut "
-            "off; raise the detector's offset, or expose for longer"
-        )
+    clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
+    centre = float(pair.signal[pair.mask].mean())
+    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.exposure_ratio is not None)
     weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
-    parts = (pair.short[used], pair.signal[used], level[used], *_shares(pair))
-    return Readings(*parts, weight, False, rounding_step(pair.short))
+    shares = _shares(pair)
+
+    def part(mask: Mask) -> list[Readings]:
+        if mask.sum() < MINIMUM_PIXELS:
+            return []
+        values = (pair.short[mask], pair.signal[mask], level[mask])
+        own = scale if pair.frames == 1 else None
+        return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
+
+    if pair.frames > 1:
+        found = part(pair.mask & clear), []
+    else:
+        fine = ~clear | _fine(pair, level, step)
+        found = part(pair.mask & ~fine), part(pair.mask & fine)
+    if not found[0] and not found[1]:
+        raise NotMeasurable(
+            f"of {int(pair.mask.sum())} pixels none lie clear of the converter's rails, so that their noise is cut off; raise "
+            "the detector's offset, or expose for longer"
+        )
+    return found
+
+
+def _fine(pair: AlignedPair, level: Image, step: float) -> Mask:
+    """Pixels of few electrons, or whose noise is as fine as the rounding."""
+    variance = pair.total_variance(level)
+    gain = max(pair.total_variance.rate, 0.0)
+    return np.asarray((variance < FEW_ELECTRONS * gain**2) | (variance < (3 * step) ** 2))
 
 
 def _shares(pair: AlignedPair) -> tuple[float, float]:
@@ -130,19 +167,6 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     share = float(np.mean(pair.signal_variance(signal)) / np.mean(pair.total_variance(signal)))
     share = min(max(share, 0.0), 0.9)
     return share / (1 - share), share / (1 - share)
-
-
-def exposure_offset(pairs: Sequence[AlignedPair]) -> tuple[float, float] | None:
-    """Offset common to short and long exposures, and its standard error, where exposure ratios were given.
-
-    With one detector setting, signal − offset = (long − offset)/ratio, so the intercept is offset·(1 − slope).
-    """
-    known = [pair for pair in pairs if pair.exposure_ratio is not None]
-    if not known:
-        return None
-    values, errors = zip(*(pair.scaling.common_offset() for pair in known), strict=True)
-    weight = 1 / np.square(errors)
-    return float(np.average(values, weights=weight)), float(1 / np.sqrt(weight.sum()))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

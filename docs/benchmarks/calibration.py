@@ -134,10 +134,11 @@ def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     truth = {"gain": gain, "read_noise": read_noise, "offset": offset}
     setting = truth | {"electrons": electrons, "clipped": clipped, "bits": bits, "seed": seed}
     try:
-        posterior = measure_detector([align_with(pair, still)], seed=seed).posterior
+        detector = measure_detector([align_with(pair, still)], seed=seed)
     except ValueError as error:
         return setting | {"failed": str(error)}
-    return setting | {f"{name}_found": vars(getattr(posterior, name)) for name in truth}
+    found = {f"{name}_found": vars(getattr(detector.posterior, name)) for name in truth}
+    return setting | found | {"misfit": detector.misfit}
 
 
 def parameters(trials: int, workers: int, minutes: float) -> dict[str, Any]:
