@@ -11,12 +11,12 @@ from .exposures import Burst as Burst
 from .exposures import ExposurePair as ExposurePair
 from .exposures import read_burst as read_burst
 from .exposures import read_pairs as read_pairs
+from .levels import collect_levels as collect_levels
 from .models import ModelScore as ModelScore
 from .models import collect_pixels as collect_pixels
 from .models import fit_models as fit_models
 from .models import simplest_sufficient as simplest_sufficient
 from .photon_transfer import PhotonTransfer as PhotonTransfer
-from .photon_transfer import collect_levels as collect_levels
 from .photon_transfer import fit_photon_transfer as fit_photon_transfer
 from .pipeline import Findings as Findings
 from .pipeline import calibrate_exposures as calibrate_exposures

@@ -14,7 +14,7 @@ from calibration.levels import Levels, Readings, Scale, collect_cells, collect_l
 from calibration.likelihood import LevelMasses
 from calibration.masks import Mask, clear_of_rails
 from calibration.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
-from calibration.posterior import DetectorPosterior, sample_posterior
+from calibration.posterior import DetectorPosterior, LogPosterior, maximum_likelihood, sample_posterior
 from calibration.scaling import ring_mean
 
 if TYPE_CHECKING:
@@ -69,20 +69,54 @@ def measure_detector(
         NotMeasurable: the noise does not grow with the signal, or nearly all readings are clipped.
         ValueError: the posterior does not converge.
     """
-    plain, cells, lines = [], [], []
+    plain, cells = [], []
     for number, pair in enumerate(pairs):
         residual, fine = readings_of(pair, number)
         plain += residual
         cells += fine
-        lines += [pair.total_variance] * len(fine)
     plain += [
         one for burst, is_dark in ((dark, True), (flat, False)) if burst for one in _burst_readings(burst, is_dark)
     ]
-    levels = ([collect_levels(plain)] if plain else []) + ([collect_cells(cells, lines)] if cells else [])
     offset = dark_offset(dark) if dark else None
-    posterior = sample_posterior(levels, offset=offset, seed=seed, progress=progress)
+    levels = [collect_levels(plain)] if plain else []
+    start = None
+    if cells:
+        levels, start = _with_cells(levels, cells, offset, _guess(pairs))
+    posterior = sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress)
     levels = list(posterior.levels)
     return Detector(posterior, fit_photon_transfer(levels), levels, offset, misfit(levels, posterior.most_likely))
+
+
+def _with_cells(
+    plain: list[Levels],
+    cells: Sequence[Readings],
+    offset: tuple[float, float] | None,
+    guess: tuple[float, float, float],
+) -> tuple[list[Levels], tuple[float, float, float]]:
+    """Levels of residuals and of readings, the latter laid out by the parameters that a first fit of them finds; and
+    these."""
+    first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
+    gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
+    scales = first.levels[-1].scales
+    moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]
+    found = gain, middle, read_noise
+    return [*first.levels[:-1], collect_cells(moved, guess=found)], found
+
+
+def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
+    """Gain, offset and read noise as the variance lines of the pairs tell them, roughly."""
+    found: list[tuple[float, float, float]] = []
+    for pair in pairs:
+        line, share = pair.total_variance, 1 + _shares(pair)[0]
+        signal = float(pair.signal[pair.mask].mean())
+        variance = float(line(np.array(signal))) / share
+        gain = max(line.rate / share, 1e-2 * variance / max(abs(signal), 1.0))
+        lowest = signal - variance / gain
+        offset = max(pair.scaling.common_offset()[0], lowest) if pair.exposure_ratio else lowest
+        read = max(variance - gain * (signal - offset), 0.05 * gain**2)
+        found.append((gain, offset, float(np.sqrt(read)) / gain))
+    gain, offset, read_noise = (float(np.median(column)) for column in zip(*found, strict=True))
+    return gain, offset, read_noise
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0) -> float:
@@ -101,7 +135,7 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0) 
         used = expected > least
         departure = one.weight[:, None] * (one.histogram - expected) ** 2
         squares += float(np.sum(departure[used] / expected[used]))
-        freedom += int(used.sum()) - 2 * len(number)
+        freedom += int(used.sum()) - len(number) - int(np.sum(one.scale < 0))
     return squares / max(freedom, 1)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures import Image
-from calibration.scaling import VarianceLine
 
 NUM_LEVELS = 16
 """Signal levels into which the pixels of a pair are sorted, equally filled."""
@@ -22,10 +21,10 @@ REACH = 8.0
 """Standard deviations of the residual that the histogram covers either way; readings beyond it are defects, not
 noise."""
 
-LEVEL_WIDTH = 1.0
+LEVEL_WIDTH = 0.8
 """Standard deviations of the noise that a level of unaltered readings spans."""
 
-LEAST_READINGS = 50
+LEAST_READINGS = 100
 """Readings that such a level needs."""
 
 MOST_CELLS = 512
@@ -60,6 +59,13 @@ class Readings:
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
 
+    def rescaled(self, scale: Scale) -> Readings:
+        """The same readings with their signals on another scale of the same long exposure."""
+        old = self.scale or scale
+        factor = scale.slope / old.slope
+        signal = factor * (self.signal - old.intercept) + scale.intercept
+        return replace(self, signal=signal, scale=scale)
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -91,7 +97,7 @@ class Levels:
     Attributes:
         signal: (L,) mean signal, counts.
         spread: (L,) variance of the true signals within the level, counts²; in histograms of readings that of the
-            estimated ones, whose own noise the likelihood adds.
+            estimated ones.
         variance: (L,) variance of observation − signal, counts².
         count: (L,) readings.
         width: (L,) of a histogram cell, counts.
@@ -99,8 +105,9 @@ class Levels:
         histogram: (L, cells) readings.
         shot_share, read_share, weight, dark, step: (L,) as in `Readings`.
         low, high: (L,) rails; the cells that hold them hold all readings beyond them too.
-        tilt: (L,) logarithmic slope of the density of the estimated signals, 1/counts.
-        keep: (L,) slope of the expected true signal against the estimated one.
+        own: (L,) variance of the estimate's own noise that the next two go by, counts².
+        shift: (L,) how far the mean true signal lies above the mean estimate, counts.
+        excess: (L,) by how many times `own` the true signals' variance exceeds that of the estimates.
         scales: of the pairs.
         scale: (L,) index into `scales`; −1 where the mean of the level is its readings' own.
         absolute: the histograms are of the readings themselves.
@@ -120,8 +127,9 @@ class Levels:
     step: Image
     low: Image
     high: Image
-    tilt: Image
-    keep: Image
+    own: Image
+    shift: Image
+    excess: Image
     scale: NDArray[np.int64]
     scales: tuple[Scale, ...] = ()
     absolute: bool = False
@@ -172,7 +180,7 @@ class Levels:
             signal=signal,
             origin=moved,
             spread=factor**2 * self.spread,
-            tilt=self.tilt / factor,
+            shift=factor * self.shift,
             scales=tuple(scales),
         )
 
@@ -198,17 +206,17 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS
     return _gathered(rows, readings, absolute=False)
 
 
-def collect_cells(readings: Sequence[Readings], lines: Sequence[VarianceLine]) -> Levels:
+def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
     """Sort readings by their own estimated signal and count them as they are, on the converter's own lattice.
 
     That keeps what a residual blurs: rounding, clipping and the peaks of single electrons. Choosing pixels by an estimate
-    that is noisy itself makes the true signal regress towards where signals are common: `Levels.tilt` says how far.
+    that is noisy itself makes the true signals regress towards where signals are common; `regression` says how far.
 
     Args:
         readings: of exposure pairs, each with its scale.
-        lines: variance of observation − signal as a line in the signal.
+        guess: gain, offset and read noise, to lay out the levels and to find the regression.
     """
-    rows = [row for one, line in zip(readings, lines, strict=True) for row in _cell_levels(one, line)]
+    rows = [row for one in readings for row in _cell_levels(one, *guess)]
     cells = max(len(row["histogram"]) for row in rows)
     for row in rows:
         row["histogram"] = np.pad(row["histogram"], (0, cells - len(row["histogram"])))
@@ -225,7 +233,7 @@ def _gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absol
 def _constants(one: Readings) -> dict[str, Any]:
     names = ("shot_share", "read_share", "weight", "step")
     rails = {"low": one.rails[0], "high": one.rails[1]}
-    rest = {"dark": float(one.dark), "tilt": 0.0, "keep": 1.0}
+    rest = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0}
     return {name: getattr(one, name) for name in names} | rails | rest | {"scale": one.scale.pair if one.scale else -1}
 
 
@@ -254,34 +262,60 @@ def _residual_level(one: Readings, group: NDArray[np.int64]) -> dict[str, Any]:
     return found | _constants(one)
 
 
-def _cell_levels(one: Readings, line: VarianceLine) -> list[dict[str, Any]]:
-    signal, number = one.signal, len(one.signal)
-    low, high = np.percentile(signal, (0.1, 99.9))
-    grid = np.linspace(low, high, 2000)
-    residual = one.observation - signal
-    least = max(0.05 * float(np.var(residual)), one.step**2 / 12, np.finfo(float).tiny)
-    deviation = np.sqrt(np.maximum(line(grid), least))
+def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -> list[dict[str, Any]]:
+    signal = one.signal
+    low, high, beyond = np.percentile(signal, (0.05, 99.8, 99.99))
+    grid = np.linspace(low, beyond, 1500)
+    shot, read = gain * np.maximum(grid - offset, 0.0), (gain * read_noise) ** 2
+    deviation = np.sqrt(np.maximum(shot + read + one.step**2 / 12, 0.05 * gain**2))
     steps = np.concatenate([[0.0], np.cumsum(np.diff(grid) * 0.5 * (1 / deviation[1:] + 1 / deviation[:-1]))])
-    number = int(np.clip(np.ceil(steps[-1] / LEVEL_WIDTH), 8, 40))
-    edges = np.interp(np.linspace(0, steps[-1], number + 1), steps, grid)
-    own = np.sqrt(one.shot_share / (1 + one.shot_share))
-    density = _density(signal, edges, own * np.interp(edges, grid, deviation) / 4)
-    density[[0, -1]] = 0.0
-    index = np.searchsorted(edges[1:-1], signal)
-    rows, finest = [], float(deviation.min()) / 5
+    last = float(np.interp(high, grid, steps))
+    number = int(np.clip(np.ceil(last / LEVEL_WIDTH), 8, 40))
+    edges = np.interp(np.linspace(0, last, number + 1), steps, grid)
+    own = one.shot_share * shot + one.read_share * read
+    blur = np.maximum(np.sqrt(own) / 4, grid[1] - grid[0])
+    density = _density(signal, grid, blur)
+    moments = true_moments(grid - offset, density, one.shot_share * gain, one.read_share * read)
+    index = np.searchsorted(edges, signal) - 1
+    place = np.searchsorted(edges, grid, side="right") - 1
+    rows = []
     for level in range(number):
-        group = np.flatnonzero(index == level)
-        if len(group) < LEAST_READINGS:
+        group, cells = np.flatnonzero(index == level), place == level
+        if len(group) < LEAST_READINGS or cells.sum() < 3:
             continue
-        tilt = (density[level + 1] - density[level]) / len(group)
-        spread = float(np.interp(signal[group].mean(), grid, deviation))
-        rows.append(_cells(one, group, spread, finest) | {"tilt": tilt})
-    means = np.array([row["signal"] for row in rows])
-    shift = own**2 * np.interp(means, grid, deviation) ** 2 * np.array([row["tilt"] for row in rows])
-    keep = np.clip(1 + np.gradient(shift, means), 0.05, 1.5) if len(rows) > 1 else [1.0]
-    return [
-        row | {"keep": float(value), "spread": value**2 * row["spread"]} for row, value in zip(rows, keep, strict=True)
-    ]
+        row = _cells(one, group, float(np.interp(signal[group].mean(), grid, deviation)), float(deviation.min()) / 5)
+        mass, first, second = (float(moment[cells].sum()) for moment in moments)
+        mean = float(np.average(grid[cells], weights=density[cells]))
+        about = float(np.average((grid[cells] - mean) ** 2, weights=density[cells]))
+        noise = float(np.average(own[cells], weights=density[cells]))
+        regressed = {
+            "own": noise,
+            "shift": first / mass + offset - mean,
+            "excess": (second / mass - (first / mass) ** 2 - about) / noise if noise > 0 else 0.0,
+        }
+        rows.append(row | regressed)
+    return rows
+
+
+def true_moments(estimate: Image, density: Image, unit: float, variance: float) -> tuple[Image, Image, Image]:
+    """Density of noisy estimates, times 1, the mean and the mean square of the true values behind each.
+
+    An estimate is a Poisson count of true/unit in that unit, plus Gaussian noise. Robbins' and Tweedie's formulas
+    (doi:10.1198/jasa.2011.tm11181) know the true values' moments from the density of the estimates alone.
+
+    Args:
+        estimate: (N,) evenly spaced, above the offset.
+        density: (N,) of the estimates.
+        unit: counts of the estimate per electron of its own exposure; 0: no Poisson noise.
+        variance: of the Gaussian noise.
+    """
+
+    def times_truth(values: Image) -> Image:
+        gaussian = estimate * values + variance * np.gradient(values, estimate)
+        return np.asarray(np.interp(estimate + unit, estimate, gaussian, right=0.0))
+
+    first = times_truth(density)
+    return density, first, times_truth(first)
 
 
 def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: float) -> dict[str, Any]:

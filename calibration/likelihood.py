@@ -235,8 +235,9 @@ class LevelMasses:
         own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
         spread = levels.spread
         if levels.absolute:
-            signal = signal + own * levels.tilt + levels.shot_share * g
-            spread = spread + levels.keep * own
+            relative = own / levels.own
+            signal = signal + levels.shift * relative
+            spread = np.maximum(spread + levels.excess * own, 1e-3 * spread)
         electrons = (lit * np.maximum(signal - o, 0.0) / g)[..., None]
         spread = (lit * spread / g**2)[..., None]
         phase = g[..., None] * t

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.exposures import Image
-from calibration.likelihood import DetectorLikelihood
 from calibration.levels import Levels
+from calibration.likelihood import DetectorLikelihood
 from calibration.photon_transfer import fit_photon_transfer
 
 if TYPE_CHECKING:
@@ -129,12 +129,12 @@ class LogPosterior:
             return gain, second, read_noise
         return gain, self.reference + gain * read_noise**2 - np.exp(second) / gain, read_noise
 
-    def coordinates(self, gain: Image, offset: Image, read_noise: Image) -> Image:
+    def coordinates(self, gain: ArrayLike, offset: ArrayLike, read_noise: ArrayLike) -> Image:
         """The coordinates of parameter sets, (W, 3)."""
-        gain, offset, read_noise = (np.atleast_1d(value) for value in (gain, offset, read_noise))
-        variance = gain * (self.reference - offset) + (gain * read_noise) ** 2
-        second = offset if self.by_offset else np.log(np.maximum(variance, np.finfo(float).tiny))
-        return np.stack([np.log(gain), second, np.log(read_noise)], -1)
+        g, o, r = (np.atleast_1d(np.asarray(value, float)) for value in (gain, offset, read_noise))
+        variance = g * (self.reference - o) + (g * r) ** 2
+        second = o if self.by_offset else np.log(np.maximum(variance, np.finfo(float).tiny))
+        return np.stack([np.log(g), second, np.log(r)], -1)
 
     def rescaled(self, best: Image) -> LogPosterior | None:
         """The same posterior about the scales that are most likely at `best`; None if they are that already."""
@@ -145,8 +145,14 @@ class LogPosterior:
         return LogPosterior([one.rescaled(change) for one in self.levels], self.offset)
 
 
-def maximum_likelihood(log_posterior: LogPosterior) -> tuple[LogPosterior, Image]:
-    """The most likely coordinates, starting from the photon-transfer line.
+def maximum_likelihood(
+    log_posterior: LogPosterior, start: tuple[float, float, float] | None = None
+) -> tuple[LogPosterior, Image]:
+    """The most likely coordinates.
+
+    Args:
+        log_posterior: of the levels.
+        start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
 
     Returns:
         The posterior about the most likely scales of the signals, and the (3,) coordinates of its maximum.
@@ -154,19 +160,24 @@ def maximum_likelihood(log_posterior: LogPosterior) -> tuple[LogPosterior, Image
     Raises:
         NotMeasurable: the noise does not grow with the signal.
     """
-    from scipy.optimize import minimize
-
-    start = _start(log_posterior)
+    best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
     for _ in range(NUM_RESCALINGS):
-        first_step = 0.3 * float(np.exp(start[0])) if log_posterior.by_offset else 0.03
-        simplex = np.vstack([start, start + np.diag([0.03, first_step, 0.2])])
-        options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-2, "maxiter": 400}
-        start = minimize(lambda p: -float(log_posterior(p)[0]), start, method="Nelder-Mead", options=options).x
-        moved = log_posterior.rescaled(start)
+        best = _climb(log_posterior, best)
+        moved = log_posterior.rescaled(best)
         if moved is None:
             break
         log_posterior = moved
-    return log_posterior, np.asarray(start)
+    return log_posterior, best
+
+
+def _climb(log_posterior: LogPosterior, start: Image) -> Image:
+    from scipy.optimize import minimize
+
+    along_offset = 0.3 * float(np.exp(start[0])) if log_posterior.by_offset else 0.03
+    simplex = np.vstack([start, start + np.diag([0.03, along_offset, 0.2])])
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-2, "maxiter": 400}
+    found = minimize(lambda p: -float(log_posterior(p)[0]), start, method="Nelder-Mead", options=options)
+    return np.asarray(found.x)
 
 
 def _start(log_posterior: LogPosterior) -> Image:
@@ -185,7 +196,7 @@ def _start(log_posterior: LogPosterior) -> Image:
     coordinates = log_posterior.coordinates(*np.array(guesses).T)
     low, high = np.log(READ_NOISE_RANGE)
     coordinates[:, 2] = np.clip(coordinates[:, 2], low + 0.1, high - 0.1)
-    values = [float(log_posterior(row)[0]) for row in coordinates]
+    values = np.concatenate([log_posterior(part) for part in np.array_split(coordinates, 7)])
     return np.asarray(coordinates[int(np.argmax(values))])
 
 
@@ -199,6 +210,7 @@ def sample_posterior(
     levels: Sequence[Levels],
     *,
     offset: tuple[float, float] | None = None,
+    start: tuple[float, float, float] | None = None,
     num_steps: int = 200,
     largest_num_steps: int = 16000,
     seed: int = 0,
@@ -213,6 +225,7 @@ def sample_posterior(
     Args:
         levels: from `collect_levels` and `collect_cells`.
         offset: measured offset and its standard error, counts; None: unknown.
+        start: see `maximum_likelihood`.
         num_steps: steps before the first check.
         largest_num_steps: steps after which it gives up.
         seed: of the walkers and their moves.
@@ -221,7 +234,7 @@ def sample_posterior(
     Raises:
         ValueError: the chain has not converged; the message says how many steps it needs.
     """
-    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset))
+    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
     walkers = _walkers(log_posterior, best, np.random.default_rng(seed))
     first = _sampler(log_posterior, _local_moves(1.0), seed)
     state = first.run_mcmc(walkers[:NUM_WALKERS], BURN_IN)
@@ -314,7 +327,7 @@ def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Gene
         steps = 100 * 0.5 ** np.arange(30)
         around = np.stack([log_posterior(best + sign * steps[:, None] * unit) for sign in (1, -1)])
         scale[axis] = steps[np.argmax(around.max(axis=0) > highest - 1.0)]
-    spread = np.diag(scale**2)
+    spread: Image = np.diag(scale**2)
     for factor in (0.5, 1.0):  # the second time with steps along the axes of the first's ellipsoid
         axes = factor * np.linalg.cholesky(spread).T
         spread = _covariance(log_posterior, best, axes, spread)
