@@ -167,11 +167,8 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
         own = scale if pair.frames == 1 else None
         return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
 
-    if pair.frames > 1:
-        found = part(pair.mask & clear), []
-    else:
-        fine = ~clear | _fine(pair, level, step)
-        found = part(pair.mask & ~fine), part(pair.mask & fine)
+    fine = np.zeros_like(clear) if pair.frames > 1 else ~clear | _fine(pair, level, step)
+    found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
     if not found[0] and not found[1]:
         raise NotMeasurable(
             f"of {int(pair.mask.sum())} pixels none lie clear of the converter's rails, so that their noise is cut off; raise "

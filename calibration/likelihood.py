@@ -264,9 +264,9 @@ class LevelMasses:
 def _gamma_mixed(unit: Complex, rate: Image, variance: Image, with_slope: bool) -> tuple[Complex, Complex | None]:
     """log E exp(λ·unit) for λ of a gamma distribution with mean `rate`, and its derivative by that mean."""
     scale = np.maximum(np.minimum(variance / np.maximum(rate, 1e-9), np.maximum(rate, 1.0)), 1e-7)
-    logarithm = np.log1p(-scale * unit)
+    logarithm: Complex = np.log1p(-scale * unit)
     slope = -2 * logarithm / scale - unit / (1 - scale * unit) if with_slope else None
-    return -rate / scale * logarithm, slope
+    return np.asarray(-rate / scale * logarithm, complex), slope
 
 
 def _shot(phase: Image) -> Complex:

@@ -330,7 +330,7 @@ def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Gene
     spread: Image = np.diag(scale**2)
     for factor in (0.5, 1.0):  # the second time with steps along the axes of the first's ellipsoid
         axes = factor * np.linalg.cholesky(spread).T
-        spread = _covariance(log_posterior, best, axes, spread)
+        spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
     found = best + generator.standard_normal((6 * NUM_WALKERS, 3)) @ np.linalg.cholesky(spread).T
     found = np.concatenate([found, best + 0.1 * (found[:NUM_WALKERS] - best)])
     return np.asarray(found[log_posterior(found) > highest - FARTHEST])
