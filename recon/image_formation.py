@@ -41,6 +41,14 @@ class Transmission(nn.Module):
         share = (signal - self.offset) / self.log_intensity.detach().exp()
         return -torch.log(share.clamp_min(1e-3))
 
+    @torch.no_grad()
+    def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
+        """Set one incident intensity to the least-squares match of images (tilt, u, y), where `use`, by line integrals."""
+        share = torch.exp(-line_integrals) * use
+        intensity = torch.sum((images - self.offset) * share) / torch.sum(share**2)
+        if float(intensity) > 0:
+            self.log_intensity.fill_(float(intensity.log()))
+
     @property
     def intensity(self) -> Tensor:
         """Incident intensity, (1,) or (tilts,)."""
@@ -80,6 +88,11 @@ class Linear(nn.Module):
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""
         return signal / self.gain - self.scaled_offset.detach()
+
+    @torch.no_grad()
+    def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
+        """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
+        self.scaled_offset.fill_(float((images / self.gain - line_integrals)[use].mean()))
 
     @property
     def offset(self) -> Tensor:

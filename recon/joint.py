@@ -12,13 +12,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import Digitised, FitResult, Gaussian, RadialFlow, SplineFlow, detect_digitisation, fit
+from noiseflow import (
+    Digitised,
+    FitResult,
+    Gaussian,
+    Mixture,
+    PoissonGaussian,
+    RadialFlow,
+    SignalDependentGaussian,
+    SplineFlow,
+    detect_digitisation,
+    fit,
+)
+from recon.coarse_start import coarse_start, learning_rate
 from recon.fields import Field, MultiresolutionField
 from recon.first_guess import (
     attenuation_scale,
     contrast_slab,
     estimate_response,
-    rough_volume,
 )
 from recon.projector import SliceProjector, from_rays
 from recon.signal_model import TomographySignal
@@ -28,6 +39,7 @@ from recon.weight import WeightChoice, choose_weight
 Progress = Callable[[int, str], None]
 _FIRST_WEIGHT = 0.4
 _CLIPPED = 0.02
+_TOLERATED = 0.003
 
 
 @dataclass(frozen=True)
@@ -74,7 +86,7 @@ class JointReconstructor:
     weight: float | None = None
     noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
-    num_steps: int = 150
+    num_steps: int = 100
     estimate_response: bool = True
     slab: int = 24
     seed: int = 0
@@ -114,12 +126,15 @@ class JointReconstructor:
             detector_width=width,
             device=self.device,
         )
-        response = estimate_response(tilt_series, estimate=self.estimate_response).to(self.device)
-        rough = rough_volume(tilt_series, response, projector)
+        response = estimate_response(tilt_series, estimate=self.estimate_response)
+        generator = torch.Generator().manual_seed(self.seed)
+        rough = coarse_start(tilt_series, response, grid, generator=generator).to(self.device)
+        response = response.to(self.device)
         field = self.make_field(grid.shape, scale=attenuation_scale(rough)).to(self.device)
         field.start_from(rough)
         weight = _FIRST_WEIGHT if self.weight is None else self.weight
-        return TomographySignal(field, projector, response, weight=weight)
+        rate = learning_rate(rough, field)
+        return TomographySignal(field, projector, response, weight=weight, learning_rate=rate)
 
     def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> _Task:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
@@ -149,17 +164,19 @@ class JointReconstructor:
 
 
 def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
-    """Noise models worth trying for these images: mean-preserving flows, behind the rounding and rails that they show.
+    """Noise models worth trying for these images, simplest first, behind the rounding and rails that they show.
 
-    One lets only location and scale depend on the signal, the other lets the whole shape. Where clipping hides a tail of many
-    pixels, the second could put anything there, and with it any mean; only the first is offered then, because the shape seen
-    at other signals stands in for what is hidden.
+    All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
+    anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
+    seen at other signals stands in for what is hidden.
     """
     digitisation = detect_digitisation(images)
-    flows: list[nn.Module] = [RadialFlow(6, num_conditional=0, mean_preserving=True)]
+    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian()]
     if float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) < _CLIPPED:
-        flows.append(SplineFlow(mean_preserving=True))
-    return [Digitised(flow, *digitisation) for flow in flows] if digitisation.found else flows
+        models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
+    else:
+        models.append(RadialFlow(6, num_conditional=0, mean_preserving=True))
+    return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
 
 class _Task:
@@ -183,8 +200,8 @@ class _Task:
         if known:
             with torch.no_grad():
                 signal = self.signal_model.signal().view_as(self.observation)
-        options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "batch_size": 4096}
-        options |= {"learning_rate": _learning_rate(noise_model), "digitise": False}
+        options = {"batch_size": 4096, "learning_rate": _learning_rate(noise_model)} | options
+        options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
 
@@ -194,11 +211,10 @@ def _learning_rate(noise_model: nn.Module) -> float:
 
 
 def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
-    fitted = [
-        (task.fit(model.to(task.observation.device), known=True, num_steps=100).held_out_nll, index)
-        for index, model in enumerate(candidates)
-    ]
-    return candidates[min(fitted)[1]]
+    """The simplest that predicts held-out pixels nearly as well as the best: what a richer one gains beyond may be a bias of the
+    signal that it took for noise."""
+    nll = [task.fit(model.to(task.observation.device), known=True, num_steps=100).held_out_nll for model in candidates]
+    return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
 
 
 def _held_out_nll(task: _Task, noise_model: nn.Module, weight: float) -> float:
