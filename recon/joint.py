@@ -86,7 +86,7 @@ class JointReconstructor:
     weight: float | None = None
     noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
-    num_steps: int = 100
+    num_steps: int = 120
     estimate_response: bool = True
     slab: int = 24
     seed: int = 0
@@ -109,7 +109,7 @@ class JointReconstructor:
         if choice is not None:
             signal_model.weight = choice.weight
         task = self._task(signal_model, tilt_series)
-        result = task.fit(noise_model, num_steps=self.num_steps, standardise=False, progress=progress)
+        result = task.alternate(noise_model, num_steps=self.num_steps, progress=progress)
         return _finished(signal_model, noise_model, result, grid, choice)
 
     def prepare(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
@@ -154,13 +154,14 @@ class JointReconstructor:
         noise_model = (
             _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
         )
-        learns = any(parameter.requires_grad for parameter in noise_model.parameters())
-        task.fit(noise_model, num_steps=80, standardise=given is not None and learns)
+        task.alternate(noise_model, num_steps=80, standardise=given is not None)
+        task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
         if self.weight is not None:
             return noise_model, None
         with _frozen(noise_model):
-            return noise_model, choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
+            choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
+        return noise_model, choice
 
 
 def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
@@ -204,10 +205,39 @@ class _Task:
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
+    def alternate(
+        self, noise_model: nn.Module, *, num_steps: int, standardise: bool = False, progress: Progress | None = None
+    ) -> FitResult:
+        """Fit the signal to the noise model as it is, twice, and the noise model to the signal as it is in between.
+
+        Each turn ends at a small learning rate. Learning both at once from a rough start lets the mean of a heavy-tailed noise
+        wander with the few outliers of each batch, and drags the signal along.
+
+        Args:
+            noise_model: fitted in place.
+            num_steps: of the signal, both turns together.
+            standardise: fit the noise model from scratch first.
+            progress: called with the steps done and a note.
+        """
+        if standardise:
+            self.refine(noise_model, standardise=True)
+        with _frozen(noise_model):
+            first = self.fit(noise_model, num_steps=num_steps // 2, standardise=False, progress=progress)
+        self.refine(noise_model)
+        later = None if progress is None else lambda step, note: progress(first.num_steps + step, note)
+        with _frozen(noise_model):
+            return self.fit(noise_model, num_steps=num_steps - num_steps // 2, standardise=False, progress=later)
+
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
+        """Fit a noise model that learns to the signal as it is."""
+        if any(parameter.requires_grad for parameter in noise_model.parameters()):
+            self.fit(noise_model, known=True, num_steps=60, standardise=standardise)
+
 
 def _learning_rate(noise_model: nn.Module) -> float:
-    """Splines have many parameters and overshoot at rates that the others need to keep up with the volume."""
-    return 0.01 if any(isinstance(module, SplineFlow) for module in noise_model.modules()) else 0.03
+    """Models of many parameters overshoot at rates that the others need to keep up with the volume."""
+    rich = any(isinstance(module, SplineFlow | Mixture) for module in noise_model.modules())
+    return 0.01 if rich else 0.03
 
 
 def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
