@@ -57,7 +57,7 @@ def coarse_start(
     rate = learning_rate(start, field)
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
-    fit(Gaussian(), signal_model, images, mask=use, num_steps=num_steps, generator=generator)
+    fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
     return field.volume() / binning
 
 
