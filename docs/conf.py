@@ -1,0 +1,24 @@
+"""Settings of Sphinx: `make docs` builds the pages into docs/_build/html."""
+
+from importlib.metadata import version as installed_version
+
+project = "noiseflow"
+author = "The noiseflow developers"
+version = release = installed_version("noiseflow")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["_build", "examples"]
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+suppress_warnings = ["myst.xref_missing", "myst.header"]
+
+autosummary_generate = True
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_preserve_defaults = True
+napoleon_use_rtype = False
+napoleon_custom_sections = []
+
+html_theme = "furo"
+html_title = "noiseflow"

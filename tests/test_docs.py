@@ -1,0 +1,112 @@
+"""The documentation tells the truth: its code runs, its commands exist, and no public name is missing."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer.main
+
+import noiseflow
+from noiseflow import io
+from noiseflow.cli import build_app
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs" / "guide").glob("*.md")])
+QUICK = ("files.md", "report.md")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def commands() -> list[tuple[str, str]]:
+    """(page, line) of every call of the program."""
+    lines = [(page.name, line) for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
+    return [(page, line) for page, line in lines if line.startswith("noiseflow ")]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with the few files that the pages speak of, from the shipped data."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(data / "exposures_miro" / "channel1_050ms.tif", "short.tif")
+    shutil.copy(data / "exposures_miro" / "channel1_long.tif", "long.tif")
+    io.write("clean.tif", np.linspace(110, 250, 4096, dtype=np.float32).reshape(64, 64))
+    needle = io.read(data / "tilt_needle" / "needle_aligned.mrc")
+    io.write("tilts.mrc", needle.data[:, 24:32], voxel_size=needle.voxel_size)
+    shutil.copy(data / "tilt_needle" / "needle_aligned.rawtlt", "tilts.rawtlt")
+    noiseflow.save(noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0), "detector.safetensors")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, id=page.name, marks=[] if page.name in QUICK else [pytest.mark.slow]) for page in PAGES]
+)
+def test_python_blocks_run_page_by_page(page: Path, folder: Path) -> None:
+    namespace: dict[str, object] = {"__name__": page.stem}
+    for number, block in enumerate(blocks(page, "python"), 1):
+        exec(compile(block, f"{page.name}, block {number}", "exec"), namespace)
+
+
+@pytest.mark.parametrize(("page", "line"), commands(), ids=lambda value: value.replace(" ", "_")[:60])
+def test_commands_of_the_pages_parse(page: str, line: str) -> None:
+    words = shlex.split(line, comments=True)[1:]
+    program = typer.main.get_command(build_app())
+    if words == ["-h"]:
+        return
+    if words[-1] == "-h":
+        words.pop()
+        assert words[0] in program.commands or words[0] == "COMMAND"
+        return
+    command = program.commands[words[0]]
+    with command.make_context(words[0], words[1:]) as context:
+        assert context.params
+
+
+@pytest.mark.parametrize("package", ["noiseflow", "calibration", "recon"])
+def test_every_public_name_is_in_the_reference(package: str) -> None:
+    page = (ROOT / "docs" / "api" / f"{package}.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   (\w+)$", page, flags=re.MULTILINE))
+    public = set(importlib.import_module(package).__all__) - {"io", "metrics"}
+    assert public
+    assert public <= listed, sorted(public - listed)
+
+
+def test_every_listed_name_exists() -> None:
+    for page in (ROOT / "docs" / "api").glob("*.md"):
+        for section in page.read_text(encoding="utf-8").split(".. currentmodule:: ")[1:]:
+            module = importlib.import_module(section.split("\n", 1)[0])
+            for name in re.findall(r"^   (\w+)$", section, flags=re.MULTILINE):
+                assert hasattr(module, name), f"{module.__name__}.{name}"
+
+
+def test_every_page_is_linked_and_every_link_leads_somewhere() -> None:
+    for page in [*PAGES, *(ROOT / "docs").glob("*.md"), ROOT / "docs" / "gallery" / "index.md"]:
+        for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists() or (page.parent / f"{target}.md").exists(), f"{page.name}: {target}"
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert all(f"guide/{page.stem}\n" in index for page in PAGES if page.parent.name == "guide")
+
+
+@pytest.mark.parametrize("name", ["noise_of_a_camera", "classical_methods"])
+def test_gallery_draws_its_pictures(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = tmp_path / "picture.png"
+    monkeypatch.setattr(sys, "argv", [name, str(picture)])
+    runpy.run_path(str(ROOT / "docs" / "gallery" / f"{name}.py"), run_name="__main__")
+    assert picture.stat().st_size > 10_000
+    assert f"images/{name}.png" in (ROOT / "docs" / "gallery" / "index.md").read_text(encoding="utf-8")
+
+
+def test_settings_of_the_pages_name_installed_extensions_only() -> None:
+    pytest.importorskip("sphinx", reason="needs the extra [docs]")
+    settings = runpy.run_path(str(ROOT / "docs" / "conf.py"))
+    for extension in settings["extensions"]:
+        importlib.import_module(extension)
