@@ -18,7 +18,7 @@ autodoc_typehints_description_target = "documented"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
 napoleon_use_rtype = False
-napoleon_custom_sections = []
+napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = "noiseflow"

@@ -59,8 +59,7 @@ class Linear(nn.Module):
     """HAADF or EDX: signal = gain·line integral + offset.
 
     The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin
-        support) is learnt
-    for each tilt or for all.
+    support) is learnt for each tilt or for all.
 
     Args:
         gain: detector units per unit of line integral.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def total_variation(volume: Tensor, *, smoothing: float) -> Tensor:
-    """Isotropic total variation of a 3D array, summed: Σ √(|∇v|² + ε²) − ε (doi:10.1016/0167-2789(92)90242-F).
+    """Isotropic total variation of a 3D array, summed: Σ √(‖∇v‖² + ε²) − ε (doi:10.1016/0167-2789(92)90242-F).
 
     Forward differences; the gradient is defined everywhere and comes in the same pass. A flat volume has none of either.
 
