@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.aligned import MINIMUM_PIXELS, AlignedPair
+from calibration.cells import collect_cells
 from calibration.exposures import Burst, Image, rails, rounding_step
-from calibration.levels import Levels, Readings, Scale, collect_cells, collect_levels
+from calibration.levels import Levels, Readings, Scale, collect_levels
 from calibration.likelihood import LevelMasses
+from calibration.log_posterior import LogPosterior, maximum_likelihood
 from calibration.masks import Mask, clear_of_rails
 from calibration.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
-from calibration.posterior import DetectorPosterior, LogPosterior, maximum_likelihood, sample_posterior
+from calibration.posterior import DetectorPosterior, sample_posterior
 from calibration.scaling import ring_mean
 
 if TYPE_CHECKING:

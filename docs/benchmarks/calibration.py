@@ -26,8 +26,11 @@ from scipy import ndimage
 sys.path = [path for path in sys.path if Path(path or ".").resolve() != Path(__file__).resolve().parent]
 
 Image = NDArray[np.float64]
+Trial = Callable[[int], dict[str, Any]]
 RESULTS = Path(__file__).with_name("results") / "calibration.json"
+ROWS = RESULTS.with_name("calibration_rows")
 RATIO = 16.0
+NUM_TRIALS = {"registration": 200, "parameters": 300}
 
 
 def textured(generator: np.random.Generator, size: int) -> Any:
@@ -65,31 +68,39 @@ def registration_trial(kind: str, seed: int, size: int = 256) -> dict[str, Any]:
     try:
         found = register(100 + 20 * short, 300 + 20 * long)
     except ValueError:
-        return {"found": False}
+        return {"seed": seed, "snr": snr, "found": False}
     difference = np.einsum("ij,jkl->ikl", (found.matrix - matrix)[:, :2], np.stack([x, y]))
     difference += (found.matrix - matrix)[:, 2][:, None, None]
     error = float(np.sqrt((difference**2).sum(0).mean()))
-    return {"found": True, "error": error, "predicted": found.error_px, "method": found.method}
+    figures = {"error": error, "predicted": found.error_px, "method": found.method}
+    return {"seed": seed, "snr": snr, "found": True} | figures
 
 
-def run(trial: Callable[[int], dict[str, Any]], trials: int, workers: int, minutes: float) -> list[dict[str, Any]]:
-    """Results of trials 0, 1, …, as many as end in time."""
+def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) -> list[dict[str, Any]]:
+    """Results of the trials of some seeds, as many as end in time.
+
+    Each is kept as a line of the file `rows`, so that a run that was stopped goes on where it was.
+    """
+    rows.parent.mkdir(parents=True, exist_ok=True)
+    found = [json.loads(line) for line in rows.read_text().splitlines()] if rows.exists() else []
+    left = sorted(set(seeds) - {one["seed"] for one in found})
     deadline = time.perf_counter() + 60 * minutes
-    found = []
-    with Pool(workers) as pool:
-        for one in pool.imap(trial, range(trials)):
+    with Pool(workers) as pool, rows.open("a") as file:
+        for one in pool.imap_unordered(trial, left):
             found.append(one)
-            print(f"\r{len(found)}/{trials}", end="", file=sys.stderr, flush=True)
+            file.write(json.dumps(one) + "\n")
+            file.flush()
+            print(f"\r{len(found)} trials", end="", file=sys.stderr, flush=True)
             if time.perf_counter() > deadline:
                 break
-    return found
+    return sorted((one for one in found if one["seed"] in seeds), key=lambda one: int(one["seed"]))
 
 
-def registration(trials: int, workers: int, minutes: float) -> dict[str, Any]:
+def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict[str, Any]:
     """Error against the known transform, success rate, and failures that no message told."""
     results = {}
     for kind, limit in (("textured", 0.1), ("sparse", 0.3)):
-        found = run(partial(registration_trial, kind), trials, workers, minutes / 2)
+        found = run(partial(registration_trial, kind), seeds, workers, minutes / 2, rows / f"{kind}.jsonl")
         trials = len(found)
         errors = np.array([one["error"] for one in found if one["found"]])
         predicted = np.array([one["predicted"] for one in found if one["found"]])
@@ -141,9 +152,9 @@ def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     return setting | found | {"misfit": detector.misfit}
 
 
-def parameters(trials: int, workers: int, minutes: float) -> dict[str, Any]:
+def parameters(seeds: range, workers: int, minutes: float, rows: Path) -> dict[str, Any]:
     """Errors and coverage of the 90 % interval over random draws from the grid's ranges."""
-    found = run(parameter_trial, trials, workers, minutes)
+    found = run(parameter_trial, seeds, workers, minutes, rows / "parameters.jsonl")
     good = [one for one in found if "failed" not in one]
     results: dict[str, Any] = {"trials": len(found), "failed": [one for one in found if "failed" in one]}
     for name in ("gain", "read_noise", "offset"):
@@ -167,7 +178,6 @@ def parameters(trials: int, workers: int, minutes: float) -> dict[str, Any]:
                 "identifiable": float(identifiable.mean()),
                 "median_error_identifiable": float(np.median(error[identifiable])),
             }
-    results["draws"] = found
     return results
 
 
@@ -265,6 +275,8 @@ def main() -> None:
     parts = ("registration", "parameters", "real", "speed")
     parser.add_argument("part", nargs="?", choices=parts, help="default: all, the real data where --data is given")
     parser.add_argument("--trials", type=int, default=None, help="default: 200 registrations, 300 parameter sets")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--rows", type=Path, default=ROWS, help="folder of the trials' results, gone on with")
     parser.add_argument("--data", type=Path, default=None, help="folder with exposures_miro/ and detector_zhuang/")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=600.0, help="stop after the trials done by then")
@@ -275,15 +287,15 @@ def main() -> None:
         RESULTS.parent.mkdir(exist_ok=True)
         stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         RESULTS.write_text(json.dumps(stored | {part: result}, indent=1) + "\n")
-        print(part, json.dumps({key: value for key, value in result.items() if key != "draws"}, indent=1))
+        print(part, json.dumps(result, indent=1))
 
 
 def measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """The figures of one part."""
-    if part == "registration":
-        return registration(arguments.trials or 200, arguments.workers, arguments.minutes)
-    if part == "parameters":
-        return parameters(arguments.trials or 300, arguments.workers, arguments.minutes)
+    if part in ("registration", "parameters"):
+        seeds = range(arguments.first_seed, arguments.first_seed + (arguments.trials or NUM_TRIALS[part]))
+        trials = registration if part == "registration" else parameters
+        return trials(seeds, arguments.workers, arguments.minutes, arguments.rows)
     return real(arguments.data) if part == "real" else speed()
 
 

@@ -6,9 +6,10 @@ from scipy import ndimage, stats
 
 from calibration.align import Registration
 from calibration.aligned import align_with
+from calibration.cells import collect_cells, true_moments
 from calibration.detector import dark_offset, measure_detector, misfit
 from calibration.exposures import Burst, ExposurePair
-from calibration.levels import NUM_BINS, Readings, Scale, collect_cells, collect_levels, true_moments
+from calibration.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.likelihood import DetectorLikelihood, LevelMasses
 from calibration.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.posterior import potential_scale_reduction, sample_posterior
