@@ -104,17 +104,18 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
         width=grid.width,
         detector_width=tilt_series.images.shape[2],
     )
-    measured = np.asarray(tilt_series.images[out][:, rows], dtype=np.float64).ravel()
+    left = part_of(tilt_series, out, rows)
+    measured = left.images.astype(np.float64).ravel()
+    unseen = replace(rest, projector=judge, response=estimate_response(left))
 
     def score(volume: Tensor) -> float:
-        predicted = replace(rest, projector=judge).predict(volume).astype(np.float64).ravel()
+        predicted = unseen.predict(volume).astype(np.float64).ravel()
         return float(np.corrcoef(predicted, measured)[0, 1]) if np.ptp(predicted) > 0 else -1.0
 
     return rest, score
 
 
-def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
+def part_of(tilt_series: TiltSeries, tilts: NDArray[Any], rows: slice = slice(None)) -> TiltSeries:
     """Some tilts and some rows of a series."""
-    mask = None if tilt_series.mask is None else tilt_series.mask[tilts][:, rows]
-    images = tilt_series.images[tilts][:, rows]
-    return replace(tilt_series, images=images, tilt_angles=tilt_series.tilt_angles[tilts], mask=mask)
+    some = tilt_series.select(tilts)
+    return replace(some, images=some.images[:, rows], mask=None if some.mask is None else some.mask[:, rows])

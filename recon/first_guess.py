@@ -24,17 +24,20 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
         ValueError: bright-field images that are nowhere positive.
     """
     images = tilt_series.images.astype(np.float32)
+    beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
     block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
     tilts, height, width = (images.shape[0], *(size // block * block for size in images.shape[1:]))
     means = images[:, :height, :width].reshape(tilts, height // block, block, width // block, block).mean((2, 4))
     if tilt_series.mode == "linear":
-        return Linear(offset=float(np.quantile(means, 0.02)), estimate=estimate)
+        return Linear(offset=float(np.quantile(means, 0.02)), beam=beam, estimate=estimate)
+    if tilt_series.beam is not None:
+        means = means / tilt_series.beam[:, None, None]
     intensity = float(np.quantile(means, 0.95))
     if intensity <= 0:
         raise ValueError(
             "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
         )
-    return Transmission(intensity, estimate=estimate)
+    return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 
 def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:

@@ -43,11 +43,11 @@ class Transmission(nn.Module):
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
-        """Set one incident intensity to the least-squares match of images (tilt, u, y), where `use`, by line integrals."""
+        """Set the intensity, one or each, to the least-squares match of images (tilt, u, y), where `use`, by line integrals."""
         share = torch.exp(-line_integrals) * use
-        intensity = torch.sum((images - self.offset) * share) / torch.sum(share**2)
-        if float(intensity) > 0:
-            self.log_intensity.fill_(float(intensity.log()))
+        dims = (0, 1, 2) if self.log_intensity.numel() == 1 else (1, 2)
+        intensity = ((images - self.offset) * share).sum(dims, keepdim=True) / (share**2).sum(dims, keepdim=True)
+        self.log_intensity.copy_(torch.where(intensity > 0, intensity.log(), self.log_intensity))
 
     @property
     def intensity(self) -> Tensor:
@@ -56,42 +56,56 @@ class Transmission(nn.Module):
 
 
 class Linear(nn.Module):
-    """HAADF or EDX: signal = gain·line integral + offset.
+    """HAADF or EDX: signal = gain·beam·line integral + offset.
 
-    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin
-    support) is learnt for each tilt or for all.
+    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is
+    learnt for each tilt or for all, and so are the beam's changes from tilt to tilt, where there are any.
 
     Args:
         gain: detector units per unit of line integral.
         offset: detector units; a number, or one for each tilt.
-        estimate: whether the offset is learnt.
+        beam: (tilts,) incident intensities; only their ratios count. None where they are all the same.
+        estimate: whether offset and beam are learnt.
 
     Raises:
         ValueError: a gain of zero, or one that is not finite.
     """
 
     gain: Tensor
+    log_beam: nn.Parameter | None
 
-    def __init__(self, gain: float = 1.0, *, offset: float | Tensor = 0.0, estimate: bool = True) -> None:
+    def __init__(
+        self, gain: float = 1.0, *, offset: float | Tensor = 0.0, beam: Tensor | None = None, estimate: bool = True
+    ) -> None:
         super().__init__()
         if not math.isfinite(gain) or gain == 0:
             raise ValueError(f"gain {gain} must be finite and not zero")
         self.register_buffer("gain", torch.tensor(float(gain)))
         start = torch.as_tensor(offset, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
         self.scaled_offset = nn.Parameter(start / gain, requires_grad=estimate)
+        log_beam = None if beam is None else nn.Parameter(beam.reshape(-1, 1, 1).log(), requires_grad=estimate)
+        self.register_parameter("log_beam", log_beam)
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Line integrals (tilt, u, y) to signals of the same shape."""
+        if self.log_beam is not None:
+            line_integrals = line_integrals * self._beam()
         return self.gain * (line_integrals + self.scaled_offset)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""
-        return signal / self.gain - self.scaled_offset.detach()
+        scaled = signal / self.gain - self.scaled_offset.detach()
+        return scaled if self.log_beam is None else scaled / self._beam().detach()
+
+    def _beam(self) -> Tensor:
+        """Its geometric mean is one: a brighter beam could not be told from a denser volume."""
+        return torch.exp(self.log_beam - self.log_beam.mean())
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
         """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
-        self.scaled_offset.fill_(float((images / self.gain - line_integrals)[use].mean()))
+        scaled = line_integrals if self.log_beam is None else line_integrals * self._beam()
+        self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean()))
 
     @property
     def offset(self) -> Tensor:

@@ -115,7 +115,7 @@ class PresetState:
             raise ValueError(
                 "the preset kniesel2022 knows bright-field images only; a linear series needs another method"
             )
-        images = np.asarray(tilt_series.images, dtype=np.float32) / float(response.intensity.mean())
+        images = np.asarray(tilt_series.images, dtype=np.float32) / response.intensity.numpy()[:, None, None]
         self.images = torch.from_numpy(images).to(preset.device)
         self.theta = torch.from_numpy(np.deg2rad(tilt_series.tilt_angles)).float().to(preset.device)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,10 +69,7 @@ def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
     """
     if tilt_series.num_tilts < 4:
         raise ValueError(f"{tilt_series.num_tilts} tilts cannot be halved for --fsc; leave it out")
-    for half in (slice(0, None, 2), slice(1, None, 2)):
-        mask = None if tilt_series.mask is None else tilt_series.mask[half]
-        images, angles = tilt_series.images[half], tilt_series.tilt_angles[half]
-        yield replace(tilt_series, images=images, tilt_angles=angles, mask=mask)
+    yield from (tilt_series.select(np.arange(first, tilt_series.num_tilts, 2)) for first in (0, 1))
 
 
 def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
@@ -117,6 +113,8 @@ def _evidence(name: str, outcome: Outcome) -> str:
         )
     if name in ("intensity", "offset"):
         return "estimated from the images, then learnt in the fit"
+    if name in ("tilts left out", "beam drift"):
+        return "each tilt against a coarse volume of the others"
     return "set by the method" if outcome.method != "joint" else "found from the data"
 
 

@@ -27,9 +27,10 @@ class TiltSeries:
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
         mask: (tilt, y, u), True for the pixels to use; None for all. Fits leave the others out; the classical methods take
             them as they stand in `images`, so they should hold something plausible.
+        beam: (tilt,) incident intensity relative to the median tilt's, where the beam drifts; a fit starts from it.
 
     Raises:
-        ValueError: not a stack, angles or a mask that do not match it, pixels or angles that are not finite, or a flat stack.
+        ValueError: not a stack, angles, mask or beam that do not match it, pixels or angles that are not finite, a flat stack.
     """
 
     images: NDArray[Any]
@@ -37,6 +38,7 @@ class TiltSeries:
     pixel_size: float | None = None
     mode: Mode = "transmission"
     mask: NDArray[np.bool_] | None = None
+    beam: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -56,6 +58,8 @@ class TiltSeries:
             raise ValueError(
                 f"the mask is {self.mask.dtype} of shape {self.mask.shape}; it must be boolean, shaped {self.images.shape}"
             )
+        if self.beam is not None and (self.beam.shape != self.tilt_angles.shape or not (self.beam > 0).all()):
+            raise ValueError(f"beam needs one positive number for each of the {len(self.images)} tilts")
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
@@ -81,7 +85,8 @@ class TiltSeries:
     def select(self, tilts: NDArray[Any]) -> TiltSeries:
         """The series of some of its tilts, by index or boolean mask."""
         mask = None if self.mask is None else self.mask[tilts]
-        return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask)
+        beam = None if self.beam is None else self.beam[tilts]
+        return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from noiseflow import io
 from recon.commands.options import parse_mode
 from recon.contrast import check_contrast
 from recon.contrast import invert_contrast as inverted
+from recon.screening import Screening, screen
 from recon.tilt_series import TiltSeries, read_tilt_series
 
 
@@ -52,6 +53,23 @@ def load_tilt_series(
             "the tilt angles are not in order; each image keeps its own angle, which is all that counts", stacklevel=2
         )
     return series
+
+
+def screened(tilt_series: TiltSeries, *, keep_tilts: bool) -> tuple[TiltSeries, Screening]:
+    """The tilts that belong to the series, with their beam where it drifts; a warning names those left out.
+
+    Args:
+        tilt_series: the series.
+        keep_tilts: only warn, and leave none out.
+    """
+    found = screen(tilt_series)
+    if found.bad.any():
+        angles = tilt_series.tilt_angles[found.bad]
+        named = ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
+        what = f"{len(angles)} of {tilt_series.num_tilts} tilts do not fit the volume of the others: {named}"
+        advice = "kept (--keep-tilts)" if keep_tilts else "left out (--keep-tilts keeps them)"
+        warnings.warn(f"{what}; {advice}", stacklevel=2)
+    return found.passed(tilt_series, keep=keep_tilts), found
 
 
 def _read_mask(path: Path) -> NDArray[Any]:

@@ -58,6 +58,9 @@ def reconstruct(
     ] = False,
     mask: Annotated[Path | None, typer.Option(help="Image or stack, 0 at the pixels to leave out of the fit.")] = None,
     mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave NaN and infinite pixels out.")] = False,
+    keep_tilts: Annotated[
+        bool, typer.Option("--keep-tilts", help="Leave no tilt out, though it does not fit the others.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
     checkpoint_interval: Annotated[float, typer.Option(help="Seconds between checkpoints.")] = 60.0,
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
@@ -76,7 +79,7 @@ def reconstruct(
 
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
-    from recon.commands.inputs import load_tilt_series
+    from recon.commands.inputs import load_tilt_series, screened
     from recon.commands.results import Targets
     from recon.report import read_reference
     from recon.tilt_series import VolumeGrid
@@ -93,6 +96,7 @@ def reconstruct(
             mask=mask,
             mask_nan=mask_nan,
         )
+        tilt_series, screening = screened(tilt_series, keep_tilts=keep_tilts)
         grid = VolumeGrid.of(tilt_series, thickness)
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
@@ -117,6 +121,7 @@ def reconstruct(
             seconds=seconds,
             inputs=inputs,
             seed=seed,
+            screening=screening,
             halves=halves,
             reference=truth,
             warned=warned,
@@ -146,7 +151,7 @@ def _settings(
     import numpy as np
 
     digest = hashlib.blake2b(digest_size=16)
-    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask):
+    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam):
         if array is not None:
             digest.update(f"{array.dtype}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())

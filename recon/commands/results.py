@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from noiseflow.console import Output
 from noiseflow.model_files import MODEL_SUFFIXES
 from recon.methods import Outcome
 from recon.report import reconstruction_report
+from recon.screening import Screening
 from recon.tilt_series import TiltSeries, Volume
 
 
@@ -50,11 +51,13 @@ class Targets:
         seconds: float,
         inputs: Sequence[Path],
         seed: int,
+        screening: Screening,
         halves: tuple[Volume, Volume] | None = None,
         reference: Volume | None = None,
         warned: Sequence[str] = (),
     ) -> None:
         """Write what was asked for and tell what was found."""
+        outcome = replace(outcome, choices=outcome.choices | screening.choices())
         rows = _figures(tilt_series, outcome, seconds)
         outcome.volume.write(self.volume)
         if self.noise_model is not None:
@@ -73,6 +76,7 @@ class Targets:
         output.result(
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
+            | {"screening": screening.as_dict()}
             | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
         )
 
