@@ -20,7 +20,7 @@ from recon.tilt_series import TiltSeries
 _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
-_TIMES_WORSE, _DEVIATIONS = 1.5, 6.0
+_DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
 _LEAST_DRIFT = 0.04  # steady beams seem to drift by 0.004 to 0.035, by noise and by what lies outside the volume
 _FEWEST = 8
 
@@ -67,26 +67,25 @@ class Screening:
 def screen(tilt_series: TiltSeries) -> Screening:
     """Judge every tilt by a coarse volume of the others; with few tilts, all are good.
 
-    A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. Tilts whose residual likelihood
-    stands out from their neighbours' are taken out, and the rest is done again, so that they do not spoil it.
+    A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. The tilts whose residual
+    likelihood stands out most from their neighbours' are taken out and the rest is done again, until none stands out.
     """
     if tilt_series.num_tilts < _FEWEST:
         count = tilt_series.num_tilts
         return Screening(np.ones(count), np.zeros(count), np.zeros(count, dtype=np.bool_))
     coarse = replace(tilt_series, images=coarse_images(tilt_series, _WIDTH, _HEIGHT), mask=None, beam=None)
     bad = np.zeros(tilt_series.num_tilts, dtype=np.bool_)
-    for _ in range(3):
+    while True:
         beam, residual, predicted = _fit_beam(coarse, bad)
         nll = _negative_log_likelihood(residual, predicted, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
         spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
-        found = excess > max(_DEVIATIONS * spread, (_TIMES_WORSE - 1) / 2)
-        if found.sum() > tilt_series.num_tilts // 4:  # so many cannot all be exceptions
+        worst = float(excess[~bad].max())
+        if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
+            return Screening(beam, excess, bad)
+        bad = bad | (excess > _OF_WORST * worst)
+        if bad.sum() > tilt_series.num_tilts // 4:  # so many cannot all be exceptions
             return Screening(beam, excess, np.zeros_like(bad))
-        if (found == bad).all():
-            break
-        bad = found
-    return Screening(beam, excess, bad)
 
 
 def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
