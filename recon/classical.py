@@ -115,7 +115,7 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     return rest, score
 
 
-def part_of(tilt_series: TiltSeries, tilts: NDArray[Any], rows: slice = slice(None)) -> TiltSeries:
+def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
     """Some tilts and some rows of a series."""
     some = tilt_series.select(tilts)
     return replace(some, images=some.images[:, rows], mask=None if some.mask is None else some.mask[:, rows])

@@ -89,25 +89,26 @@ class Linear(nn.Module):
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Line integrals (tilt, u, y) to signals of the same shape."""
         if self.log_beam is not None:
-            line_integrals = line_integrals * self._beam()
+            line_integrals = line_integrals * _relative(self.log_beam)
         return self.gain * (line_integrals + self.scaled_offset)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""
         scaled = signal / self.gain - self.scaled_offset.detach()
-        return scaled if self.log_beam is None else scaled / self._beam().detach()
-
-    def _beam(self) -> Tensor:
-        """Its geometric mean is one: a brighter beam could not be told from a denser volume."""
-        return torch.exp(self.log_beam - self.log_beam.mean())
+        return scaled if self.log_beam is None else scaled / _relative(self.log_beam.detach())
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
         """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
-        scaled = line_integrals if self.log_beam is None else line_integrals * self._beam()
+        scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
         self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean()))
 
     @property
     def offset(self) -> Tensor:
         """Detector units, (1,) or (tilts,)."""
         return (self.gain * self.scaled_offset.detach()).reshape(-1)
+
+
+def _relative(log_beam: Tensor) -> Tensor:
+    """The beam with a geometric mean of one: a brighter beam could not be told from a denser volume."""
+    return torch.exp(log_beam - log_beam.mean())

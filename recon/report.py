@@ -69,7 +69,7 @@ def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
     """
     if tilt_series.num_tilts < 4:
         raise ValueError(f"{tilt_series.num_tilts} tilts cannot be halved for --fsc; leave it out")
-    yield from (tilt_series.select(np.arange(first, tilt_series.num_tilts, 2)) for first in (0, 1))
+    yield from (tilt_series.select(slice(first, None, 2)) for first in (0, 1))
 
 
 def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:

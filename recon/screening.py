@@ -54,10 +54,14 @@ class Screening:
         series = replace(tilt_series, beam=self.beam) if self.beam_drifts else tilt_series
         return series.select(~self.bad) if self.bad.any() and not keep else series
 
-    def choices(self) -> dict[str, str]:
+    def choices(self) -> dict[str, float | str]:
         """What a table of results shows of it."""
-        found = {"tilts left out": str(int(self.bad.sum()))} if self.bad.any() else {}
-        return found | ({"beam drift": f"{self.drift:.1%}"} if self.beam_drifts else {})
+        found: dict[str, float | str] = {}
+        if self.bad.any():
+            found["tilts left out"] = str(int(self.bad.sum()))
+        if self.beam_drifts:
+            found["beam drift"] = f"{self.drift:.1%}"
+        return found
 
     def as_dict(self) -> dict[str, list[Any]]:
         """All of it, tilt by tilt, for programs."""

@@ -82,8 +82,8 @@ class TiltSeries:
         """(tilt, y, u), True for the pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
-    def select(self, tilts: NDArray[Any]) -> TiltSeries:
-        """The series of some of its tilts, by index or boolean mask."""
+    def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
+        """The series of some of its tilts, by index, boolean mask or slice."""
         mask = None if self.mask is None else self.mask[tilts]
         beam = None if self.beam is None else self.beam[tilts]
         return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
