@@ -20,13 +20,12 @@ fuzz: export NOISEFLOW_FUZZ_EXAMPLES ?= 5000
 fuzz: .venv/test-ready
 	$(BIN)/python -m pytest tests/fuzz
 
-check: .venv/test-ready
+check: docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 docs: .venv/test-ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[docs]"
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 

@@ -1,0 +1,57 @@
+"""Reader and writer of the napari plugin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from noiseflow import io
+
+LayerData = tuple[Any, dict[str, Any], str]
+
+
+def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerData]] | None:
+    """The reader of a path, or None where noiseflow does not read it; one path at a time."""
+    if not isinstance(path, str) or Path(path).suffix.lower() not in io.SUFFIXES:
+        return None
+    return read_layers
+
+
+def read_layers(path: str | list[str]) -> list[LayerData]:
+    """Read an image, tilt series or volume as one layer, with its voxel size in Å.
+
+    A stack with tilt angles in or beside the file keeps them in the layer's metadata as ``tilt_angles``, degrees; its first
+    axis has no length.
+
+    Raises:
+        FileNotFoundError, ValueError: as `noiseflow.io.read`.
+    """
+    source = path if isinstance(path, str) else path[0]
+    image = io.read(source)
+    metadata: dict[str, Any] = {"source": source}
+    scale = [1.0] * image.data.ndim if image.voxel_size is None else list(image.voxel_size[-image.data.ndim :])
+    if image.data.ndim == 3:
+        try:
+            metadata["tilt_angles"] = io.tilt_angles_of(source, image)
+        except FileNotFoundError:
+            pass
+        else:
+            scale[0] = 1.0
+    if image.voxel_size is not None:
+        metadata["voxel_size"] = image.voxel_size
+    return [(image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")]
+
+
+def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:
+    """Write one layer as MRC, TIFF, NumPy or OME-Zarr; returns the path written.
+
+    Raises:
+        ValueError: an unknown suffix, or pixels the format cannot hold.
+    """
+    pixels = np.asarray(data)
+    size = attributes.get("metadata", {}).get("voxel_size")
+    io.write(path, pixels, voxel_size=None if size is None else tuple(size))
+    return [path]

@@ -1,0 +1,137 @@
+"""The widget of the napari plugin: reconstructs the chosen layer without blocking the viewer.
+
+Annotations are evaluated here, because magicgui makes the form from them.
+"""
+
+from collections.abc import Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from noiseflow import io
+from recon.napari.files import LayerData
+
+if TYPE_CHECKING:
+    from recon.methods import Progress
+
+_STEPS = 150
+
+
+def reconstruct_layer(
+    images: Any,
+    metadata: dict[str, Any],
+    *,
+    angles: Path | None = None,
+    mode: str = "linear",
+    method: str = "auto",
+    thickness: int = 0,
+    num_steps: int = _STEPS,
+    invert_tilt: bool = False,
+    progress: "Progress | None" = None,
+) -> LayerData:
+    """Reconstruct a tilt series to a layer (z, y, x).
+
+    Args:
+        images: (tilt, y, x), tilt axis along y.
+        metadata: of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used where they are there.
+        angles: angle file, in place of the layer's own.
+        mode: ``linear`` or ``transmission``.
+        method: one of `recon.methods.METHODS`.
+        thickness: voxels along the beam; 0 for the image width.
+        num_steps: of the fit.
+        invert_tilt: flip the sign of the angles.
+        progress: called with the steps done and a note.
+
+    Raises:
+        ValueError: no angles are known, or the series cannot be reconstructed so.
+    """
+    import numpy as np
+
+    from recon.methods import reconstruct
+    from recon.tilt_series import TiltSeries, VolumeGrid
+
+    known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
+    if known is None:
+        raise ValueError("this layer has no tilt angles; choose an angle file")
+    size = metadata.get("voxel_size")
+    pixel_size = None if size is None else float(size[-1])
+    sign = -1.0 if invert_tilt else 1.0
+    series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, mode)  # type: ignore[arg-type]
+    grid = VolumeGrid.of(series, thickness or None)
+    outcome = reconstruct(series, grid, method=method, num_steps=num_steps, progress=progress)
+    scale = [pixel_size or 1.0] * 3
+    result = {"voxel_size": tuple(scale)} if pixel_size else {}
+    return (
+        outcome.volume.attenuation,
+        {"name": f"volume ({outcome.method})", "scale": scale, "metadata": result},
+        "image",
+    )
+
+
+def reconstruct_widget() -> Any:
+    """A form with a button; the volume becomes a new layer, and napari shows the progress."""
+    from magicgui import magicgui
+    from napari.layers import Image
+    from napari.viewer import Viewer
+
+    from recon.methods import METHODS
+
+    def start(
+        viewer: Viewer,
+        tilts: Image,
+        angles: Path | None = None,
+        mode: str = "linear",
+        method: str = "auto",
+        thickness: int = 0,
+        num_steps: int = _STEPS,
+        invert_tilt: bool = False,
+    ) -> None:
+        options = {"angles": angles, "mode": mode, "method": method, "thickness": thickness, "invert_tilt": invert_tilt}
+        worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
+        form.call_button.enabled = False
+        worker.returned.connect(lambda layer: viewer.add_image(layer[0], **layer[1]))
+        worker.finished.connect(lambda: setattr(form.call_button, "enabled", True))
+        worker.start()
+
+    form: Any = magicgui(
+        start,
+        call_button="Reconstruct",
+        angles={"mode": "r", "nullable": True, "label": "angle file"},
+        mode={"choices": ["linear", "transmission"]},
+        method={"choices": [name for name in METHODS if name != "joint-supervised"]},
+        thickness={"min": 0, "max": 10_000, "tooltip": "voxels along the beam; 0 for the image width"},
+        num_steps={"min": 1, "max": 10_000, "label": "steps"},
+    )
+    return form
+
+
+def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:
+    """A worker that fits in a thread of its own and yields at every step, which moves napari's progress bar."""
+    import queue
+    import threading
+
+    from napari.qt.threading import create_worker
+
+    def run() -> Generator[int, None, LayerData]:
+        steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+        found: list[LayerData | Exception] = []
+
+        def fit() -> None:
+            try:
+                found.append(
+                    reconstruct_layer(
+                        images, metadata, num_steps=num_steps, progress=lambda done, note: steps.put(done), **options
+                    )
+                )
+            except Exception as error:  # handed on to the viewer, which shows it
+                found.append(error)
+            finally:
+                steps.put(None)
+
+        threading.Thread(target=fit, daemon=True).start()
+        while (done := steps.get()) is not None:
+            yield done
+        if isinstance(found[0], Exception):
+            raise found[0]
+        return found[0]
+
+    return create_worker(run, _progress={"total": num_steps, "desc": "Reconstruct"})

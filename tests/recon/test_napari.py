@@ -1,0 +1,107 @@
+"""The napari plugin without a viewer: manifest, reader, writer, and the widget under an offscreen Qt."""
+
+import time
+
+import numpy as np
+import pytest
+
+from noiseflow import io
+from recon.napari import get_reader, write_image
+from recon.napari.widget import reconstruct_layer
+
+
+@pytest.fixture
+def needle(data, tmp_path):
+    """A few rows of the shipped needle, as a layer."""
+    whole = io.read(data / "tilt_needle" / "needle_aligned.mrc")
+    path = tmp_path / "needle.mrc"
+    io.write(path, whole.data[::6, 28:34], voxel_size=whole.voxel_size)
+    angles = io.read_angles(data / "tilt_needle" / "needle_aligned.rawtlt")[::6]
+    path.with_suffix(".rawtlt").write_text("\n".join(map(str, angles)))
+    return path
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_manifest_is_valid_and_its_functions_exist():
+    npe2 = pytest.importorskip("npe2", reason="needs the extra [napari]")
+    manifest = npe2.PluginManifest.from_distribution("noiseflow")
+    manifest.validate_imports()
+    (reader,), (writer,) = manifest.contributions.readers, manifest.contributions.writers
+    assert set(reader.filename_patterns) == {f"*{suffix}" for suffix in io.SUFFIXES}
+    assert set(writer.filename_extensions) <= io.SUFFIXES
+    assert {command.python_name.split(":")[1] for command in manifest.contributions.commands} == {
+        "get_reader",
+        "write_image",
+        "reconstruct_widget",
+    }
+
+
+def test_reader_gives_pixels_angles_and_scale(needle):
+    (pixels, attributes, kind), *rest = get_reader(str(needle))(str(needle))
+    assert not rest
+    assert kind == "image"
+    assert len(attributes["metadata"]["tilt_angles"]) == len(pixels)
+    assert attributes["scale"][0] == 1.0
+    assert attributes["scale"][1] == pytest.approx(attributes["metadata"]["voxel_size"][1])
+
+
+def test_reader_declines_what_is_not_its_own():
+    assert get_reader("notes.txt") is None
+    assert get_reader(["a.mrc", "b.mrc"]) is None
+
+
+def test_written_volume_comes_back_with_its_voxel_size(tmp_path):
+    path, volume = str(tmp_path / "volume.mrc"), np.random.default_rng(0).random((4, 5, 6), dtype=np.float32)
+    assert write_image(path, volume, {"metadata": {"voxel_size": (7.0, 7.0, 7.0)}}) == [path]
+    ((pixels, attributes, _),) = get_reader(path)(path)
+    np.testing.assert_array_equal(pixels, volume)
+    assert attributes["scale"] == pytest.approx([7.0, 7.0, 7.0])
+
+
+def test_layer_is_reconstructed_with_progress(needle):
+    ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
+    steps = []
+    volume, result, _ = reconstruct_layer(
+        pixels,
+        attributes["metadata"],
+        method="tv",
+        thickness=16,
+        num_steps=8,
+        progress=lambda done, note: steps.append(done),
+    )
+    assert volume.shape == (16, 6, 64)
+    assert result["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][-1]] * 3)
+    assert steps[-1] == 8
+
+
+def test_layer_without_angles_is_refused_with_the_fix():
+    with pytest.raises(ValueError, match="angle file"):
+        reconstruct_layer(np.zeros((3, 4, 4)), {})
+
+
+@pytest.mark.slow
+def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
+    monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
+    npe2 = pytest.importorskip("npe2", reason="needs the extra [napari]")
+    pytest.importorskip("napari", reason="needs the extra [napari]")
+    pytest.importorskip("PyQt6", reason="needs a Qt binding")
+    from napari.components import ViewerModel
+    from qtpy.QtWidgets import QApplication
+
+    from recon.napari import reconstruct_widget
+
+    application = QApplication.instance() or QApplication([])
+    npe2.PluginManager.instance().discover()
+    viewer = ViewerModel()
+    (layer,) = viewer.open(str(needle), plugin="noiseflow")
+    form = reconstruct_widget()
+    form.tilts.choices = [layer]
+    form(viewer=viewer, tilts=layer, method="tv", thickness=16, num_steps=8)
+    deadline = time.monotonic() + 120
+    while len(viewer.layers) < 2 and time.monotonic() < deadline:
+        application.processEvents()
+        time.sleep(0.02)
+    volume = viewer.layers[1]
+    assert volume.data.shape == (16, 6, 64)
+    (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin="noiseflow")
+    np.testing.assert_array_equal(io.read(written).data, volume.data)
