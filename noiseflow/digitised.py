@@ -71,6 +71,20 @@ class Digitised(nn.Module):
                 clear[group] = False
         return clear
 
+    def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
+        """What of the likelihood of (N,) pixels does not change while the model inside learns; None where everything may."""
+        if self.step == 0 or not hasattr(self.model, "fixed_interval_part"):
+            return None
+        low = torch.where(observation <= self.low, -math.inf, observation - self.step / 2)
+        high = torch.where(observation >= self.high, math.inf, observation + self.step / 2)
+        fixed: Tensor = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
+        return fixed
+
+    def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
+        """Log-likelihood of pixels by their `fixed_part`."""
+        found: Tensor = self.model.log_interval_prob_from(signal, fixed_part)  # type: ignore[operator]
+        return found
+
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""
         rails = {"low": self.low, "high": self.high}
@@ -96,10 +110,9 @@ class DigitisedDistribution(NoiseDistribution):
         return DigitisedDistribution(self._detector, self.base.rescaled(scale, shift))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        if self._signal is not None and tabulated.is_large(self._detector, self._signal, value):
-            found = tabulated.log_prob(self._detector, self._signal, value)
-            if found is not None:
-                return found
+        found = None if self._signal is None else tabulated.automatic_log_prob(self._detector, self._signal, value)
+        if found is not None:
+            return found
         result = self._log_cell(value) if self.step > 0 else self.base.log_prob(value)
         # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
         infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)

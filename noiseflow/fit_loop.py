@@ -22,6 +22,7 @@ Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
 _LOOK_COUNT = 20_000
+_FIXED_COUNT = 2**20
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 
@@ -72,6 +73,7 @@ class FitLoop:
         self.done = 0
         self.table: ObservationTable | None = None
         self.resumed_table: dict[str, Any] | None = None
+        self.fixed_part: Tensor | None = None
 
     def prepare(self, num_steps: int, learning_rate: float, standardise: bool) -> None:
         """Scale the noise model to the data and set up the optimisers."""
@@ -96,6 +98,8 @@ class FitLoop:
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
             self.table = self._make_table()
+        if not joint and self.pixels.train.ndim == 1:
+            self.fixed_part = self._compute_fixed_part()
         check_every = max(1, num_steps // 20)
         good = self._models()
         if self.done == 0:
@@ -115,6 +119,8 @@ class FitLoop:
                 if checkpoint is not None and due:
                     checkpoint(self.state())
                     saved = time.perf_counter()
+                if not joint and self._never_improves(schedule):
+                    break
                 if progress is not None:
                     progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
         except KeyboardInterrupt:
@@ -124,7 +130,7 @@ class FitLoop:
         if self.best is not None:
             self._load_models(self.best)
             self.result.held_out_nll = self.held_out_nll()
-        self.result.num_steps, self.result.seconds = num_steps, time.perf_counter() - started
+        self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
         return self.result
 
     def _take_step(self, step: int, schedule: Schedule) -> bool:
@@ -147,6 +153,11 @@ class FitLoop:
             self.best, self.result.held_out_nll = state, nll
         self.result.history[step] = nll
         return state
+
+    def _never_improves(self, schedule: Schedule) -> bool:
+        """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""
+        history = self.result.history
+        return self.done >= 0.4 * schedule.num_steps and history.get(0, math.inf) <= min(history.values(), default=0.0)
 
     def _check_table(self, *, rarely: bool) -> None:
         """A model that learns may outgrow its table; that is slow, and seen in every fifth look."""
@@ -173,6 +184,22 @@ class FitLoop:
 
         return self.signal_optimiser is None or _step(self.signal_optimiser, loss)
 
+    @torch.no_grad()
+    def _compute_fixed_part(self) -> Tensor | None:
+        """What of every pixel's likelihood no step can change, where the noise model knows such a thing."""
+        pixels = torch.cat([self.pixels.train, self.pixels.judge])
+        if not hasattr(self.noise_model, "fixed_part") or pixels.numel() > _FIXED_COUNT:
+            return None
+        fixed: Tensor | None = None
+        for part in torch.split(pixels, 32768):
+            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[operator]
+            if found is None:
+                return None
+            if fixed is None:
+                fixed = found.new_zeros((self.pixels.observation.numel(), found.shape[-1]))
+            fixed[part] = found
+        return fixed
+
     def _full_batch_loss(self) -> Tensor:
         signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
         observation = self.pixels.observation
@@ -189,6 +216,8 @@ class FitLoop:
         """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
+        if self.fixed_part is not None:
+            return -self.noise_model.log_prob_from(signal, self.fixed_part[pixels]).mean()  # type: ignore[operator, no-any-return]
         observation = self.pixels.observation[pixels]
         if pixels.ndim == 1:
             return -self.noise_model(signal).log_prob(observation).mean()  # type: ignore[no-any-return]

@@ -244,11 +244,8 @@ class FlowDistribution(LatentDistribution):
         return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        if self._flow.tabulate and tabulated.is_large(self._flow, self._signal, value):
-            found = tabulated.log_prob(self._flow, self._signal, value)
-            if found is not None:
-                return found
-        return super().log_prob(value)
+        found = tabulated.automatic_log_prob(self._flow, self._signal, value)
+        return super().log_prob(value) if found is None else found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self._signal.expand((*sample_shape, *self.batch_shape))

@@ -140,9 +140,17 @@ _likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Column
 _quantiles: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Tensor]]] = weakref.WeakKeyDictionary()
 
 
-def _state(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
+def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
+    """What tells whether a model, and the range of its inputs, are still those that something was computed for."""
     tensors = [*noise_model.parameters(), *noise_model.buffers()]
     return (*limits, *((tensor.data_ptr(), tensor._version) for tensor in tensors))
+
+
+def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
+    """`log_prob` where the input is large, the model allows it (its ``tabulate``) and a table is accurate enough; else None."""
+    if not (getattr(noise_model, "tabulate", True) and is_large(noise_model, signal, observation)):
+        return None
+    return log_prob(noise_model, signal, observation)
 
 
 @torch.no_grad()
@@ -153,7 +161,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tol
     """
     flat_signal, flat = signal.reshape(-1), observation.reshape(-1)
     limits = tuple(float(bound) for tensor in (flat_signal, flat) for bound in torch.aminmax(tensor))
-    state = _state(noise_model, *limits)
+    state = state_of(noise_model, *limits)
     kept = _likelihoods.get(noise_model)
     if kept is None or kept[0] != state:
         made = _make_likelihood(noise_model, flat_signal, flat, limits, tolerance)
@@ -212,7 +220,7 @@ def sample(
     """
     flat = signal.reshape(-1)
     limits = tuple(float(bound) for bound in torch.aminmax(flat))
-    state = _state(flow, *limits)
+    state = state_of(flow, *limits)
     kept = _quantiles.get(flow)
     if kept is None or kept[0] != state:
         made = _make_quantiles(flow, flat, limits, tolerance)
