@@ -107,7 +107,7 @@ class Results:
 
     def __init__(self, path: Path, title: str) -> None:
         self.path = path
-        self.content: dict[str, Any] = {"benchmark": title, "machine": machine(), "cells": {}}
+        self.content: dict[str, Any] = {"benchmark": title, "machines": [], "cells": {}}
         if path.exists():
             try:
                 kept = json.loads(path.read_text(encoding="utf-8"))
@@ -117,7 +117,7 @@ class Results:
                 raise ValueError(
                     f"{path} holds results of something else; remove it, or name another folder with --out"
                 )
-            self.content["cells"] = kept["cells"]
+            self.content |= {name: kept[name] for name in ("machines", "cells") if name in kept}
 
     @property
     def cells(self) -> dict[str, Cell]:
@@ -125,12 +125,20 @@ class Results:
         cells: dict[str, Cell] = self.content["cells"]
         return cells
 
+    def forget(self, part: str) -> None:
+        """Leave out the cells whose name contains `part`: they are computed anew."""
+        for key in [key for key in self.cells if part in key]:
+            del self.cells[key]
+
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
-        """The cell of a name, computed and saved if it is not there."""
+        """The cell of a name, computed and saved if it is not there, with the machine's number and its load before."""
         if key not in self.cells:
-            load = os.getloadavg()[0]
+            load, here = os.getloadavg()[0], machine()
             found = compute()
-            self.cells[key] = plain(found | {"load": round(load, 1)})
+            if here not in self.content["machines"]:
+                self.content["machines"].append(here)
+            place = {"load": round(load, 1), "machine": self.content["machines"].index(here)}
+            self.cells[key] = plain(found | place)
             with io.atomic_path(self.path) as partial:
                 partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
         return self.cells[key]

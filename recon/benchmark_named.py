@@ -9,7 +9,7 @@ from typing import Any
 
 from noiseflow import io
 from noiseflow.console import Output
-from recon import benchmark_rivals
+from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals
 from recon.benchmark import Results, make_scene
 from recon.benchmark_rivals import Effort
 from recon.classical import part_of
@@ -25,6 +25,7 @@ class Options:
         size: voxels along each edge.
         scene: further arguments of `make_scene`.
         effort: how much to spend.
+        again: cells whose name contains this are computed anew; none if empty.
         out: folder of results and figures.
         output: tells people what is going on.
     """
@@ -32,14 +33,29 @@ class Options:
     size: int
     scene: dict[str, Any]
     effort: Effort
+    again: str
     out: Path
     output: Output
 
     def results(self, name: str) -> Results:
         """The kept results of a benchmark on this scene; another scene or effort has another file."""
-        spent = "quick" if self.effort is benchmark_rivals.QUICK else "full"
-        words = [name, str(self.size), *(str(value).replace(":", "_") for value in self.scene.values()), spent]
-        return Results(self.out / f"{'-'.join(words)}.json", name)
+        return self._kept(name, str(self.size), *(str(value).replace(":", "_") for value in self.scene.values()))
+
+    @property
+    def quick(self) -> bool:
+        """Whether few settings and a small scene shall do."""
+        return self.effort is benchmark_rivals.QUICK
+
+    def _kept(self, name: str, *words: str) -> Results:
+        spent = "quick" if self.quick else "full"
+        results = Results(self.out / f"{'-'.join([name, *words, spent])}.json", name)
+        if self.again:
+            results.forget(self.again)
+        return results
+
+    def results_on_real_data(self, name: str) -> Results:
+        """The kept results of a benchmark that has data of its own."""
+        return self._kept(name, str(self.scene["seed"]))
 
 
 def rivals(options: Options) -> dict[str, Any]:
@@ -63,13 +79,13 @@ def _shown(options: Options, results: Results) -> dict[str, Any]:
     with io.atomic_path(picture) as partial:
         benchmark_rivals.draw(found, make_scene(options.size, **options.scene).name).savefig(partial, dpi=120)
     options.output.line(f"results: {results.path}\nfigure: {picture}")
-    return {"results": results.path, "figure": picture, "machine": results.content["machine"], "curves": found}
+    return {"results": results.path, "figure": picture, "machines": results.content["machines"], "curves": found}
 
 
 def even_odd(options: Options) -> dict[str, Any]:
     """Fourier shell correlation of volumes from even and from odd tilts, and of each method's volume with the truth."""
     scene, results = make_scene(options.size, **options.scene), options.results("resolution")
-    steps = None if options.effort is not benchmark_rivals.QUICK else 60
+    steps = 60 if options.quick else None
 
     def cell(method: str) -> dict[str, Any]:
         whole, even, odd = (
@@ -88,9 +104,42 @@ def even_odd(options: Options) -> dict[str, Any]:
     return {"results": results.path, "cells": results.cells}
 
 
+def paper_table(options: Options) -> dict[str, Any]:
+    """The main table of Kniesel et al. (CVPR 2022) beside the published figures."""
+    scene, results = make_scene(options.size, **options.scene), options.results("paper-table")
+    options.output.line(f"{scene.name}: rivals' settings are searched by looking at the truth")
+    benchmark_paper.run(scene, results, options.output.line)
+    return _told(options, results, benchmark_paper.table(results.cells))
+
+
+def ablations(options: Options) -> dict[str, Any]:
+    """What each part of the reconstruction is worth."""
+    scene, results = make_scene(options.size, **options.scene), options.results("ablations")
+    small = benchmark_ablations.small_scene(options.size, options.scene)
+    options.output.line(scene.name)
+    benchmark_ablations.run(scene, results, options.output.line, quick=options.quick, small=small)
+    return _told(options, results, benchmark_ablations.table(results.cells))
+
+
+def needle(options: Options) -> dict[str, Any]:
+    """Every method on a real tilt series, judged by tilts left out."""
+    results = options.results_on_real_data("needle")
+    benchmark_needle.run(results, options.output.line, quick=options.quick, seed=options.scene["seed"])
+    return _told(options, results, benchmark_needle.table(results.cells))
+
+
+def _told(options: Options, results: Results, table: tuple[tuple[str, ...], list[tuple[str, ...]]]) -> dict[str, Any]:
+    options.output.table(*table)
+    options.output.line(f"results: {results.path}")
+    return {"results": results.path, "machines": results.content["machines"], "cells": results.cells}
+
+
 BENCHMARKS: dict[str, Callable[[Options], dict[str, Any]]] = {
     "rivals": rivals,
     "slow-rivals": slow_rivals,
     "resolution": even_odd,
+    "paper-table": paper_table,
+    "ablations": ablations,
+    "needle": needle,
 }
 """Benchmarks by name."""

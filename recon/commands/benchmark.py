@@ -13,7 +13,9 @@ from noiseflow.console import JsonOption, Output, SeedOption
 def benchmark(
     names: Annotated[
         list[str] | None,
-        typer.Argument(help="rivals, slow-rivals, resolution; the first alone if not given."),
+        typer.Argument(
+            help="rivals, slow-rivals, resolution, paper-table, ablations, needle; the first alone if not given."
+        ),
     ] = None,
     size: Annotated[int | None, typer.Option(help="Voxels along each edge; 64, or 48 with --quick.")] = None,
     noise: Annotated[str, typer.Option(help="Noise of the scene, as in `noiseflow simulate`.")] = "clipped",
@@ -23,6 +25,7 @@ def benchmark(
     ] = False,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are told.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow rivals.")] = 600.0,
+    again: Annotated[str, typer.Option(help="Compute anew the kept results whose name contains this.")] = "",
     out: Annotated[
         Path, typer.Option("--out", help="Folder for results and figures; a stopped run goes on there.")
     ] = Path("noiseflow-benchmark"),
@@ -49,5 +52,5 @@ def benchmark(
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, out, output)
+    options = Options(size or (48 if quick else 64), scene, effort, again, out, output)
     output.result({name: BENCHMARKS[name](options) for name in names})

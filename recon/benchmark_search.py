@@ -1,0 +1,94 @@
+"""Rivals at every setting worth trying, and the best of them by whatever judge a benchmark has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.classical import LineIntegralProblem
+from recon.denoise import find_denoiser
+from recon.joint import JointReconstructor
+from recon.sirt import sirt
+from recon.tilt_series import TiltSeries, VolumeGrid
+from recon.wbp import WINDOWS, wbp
+
+Array = NDArray[Any]
+Candidate = tuple[str, Array]
+CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128)
+WEIGHTS = (0.05, 0.1, 0.2, 0.4, 0.8)
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best of some candidates.
+
+    Attributes:
+        setting: its name.
+        volume: (z, y, x).
+        tried: setting → score.
+    """
+
+    setting: str
+    volume: Array
+    tried: dict[str, float]
+
+    @property
+    def at_an_end(self) -> bool:
+        """Whether the best is the first or last tried, so that a wider search might find a better one."""
+        return len(self.tried) > 1 and self.setting in (next(iter(self.tried)), list(self.tried)[-1])
+
+
+def best(candidates: Iterable[Candidate], score: Callable[[Array], float]) -> Best:
+    """The candidate of the highest score; the first of equals."""
+    found: Best | None = None
+    tried: dict[str, float] = {}
+    for setting, volume in candidates:
+        tried[setting] = score(volume)
+        if found is None or tried[setting] > tried[found.setting]:
+            found = Best(setting, volume, tried)
+    if found is None:
+        raise ValueError("there is nothing to choose from")
+    return found
+
+
+def back_projections(
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Sequence[str] = tuple(WINDOWS)
+) -> Iterator[Candidate]:
+    """Back-projections by window and cutoff."""
+    problem = LineIntegralProblem.of(tilt_series, grid)
+    for window in windows:
+        for cutoff in CUTOFFS:
+            volume = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
+            yield f"{window}, cutoff {cutoff:g}", volume.numpy()
+
+
+def sirts(tilt_series: TiltSeries, grid: VolumeGrid) -> Iterator[Candidate]:
+    """SIRT by numbers of iterations."""
+    problem, volume, done = LineIntegralProblem.of(tilt_series, grid), None, 0
+    for count in ITERATIONS:
+        volume = sirt(problem.line_integrals, problem.projector, num_iterations=count - done, start=volume)
+        done = count
+        yield f"{count} iterations", volume.numpy()
+
+
+def fits(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    reconstructor: JointReconstructor,
+    weights: Sequence[float] = WEIGHTS,
+) -> Iterator[Candidate]:
+    """Fits by weight of the total variation."""
+    for weight in weights:
+        result = replace(reconstructor, weight=weight)(tilt_series, grid)
+        yield f"weight {weight:g}", result.volume.attenuation
+
+
+def denoised(tilt_series: TiltSeries, denoiser: str) -> TiltSeries:
+    """The series with every image denoised by itself."""
+    denoise = find_denoiser(denoiser, tilt_series.images)
+    return replace(tilt_series, images=np.stack([denoise(image) for image in tilt_series.images]))
