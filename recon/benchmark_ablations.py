@@ -47,14 +47,14 @@ def run(scene: Scene, results: Results, line: Callable[[str], None], *, quick: b
         quick: the first groups only.
         small: the scene of the coordinate networks, which are slow.
     """
-    groups = [_likelihoods, _denoisers, _fields, _layers, _parts, _weights]
-    for group in groups[:1] if quick else groups:
-        _fill(group(scene), results, line)
+    for group in GROUPS[:1] if quick else GROUPS:
+        fill(group(scene), results, line)
     if not quick:
-        _fill(_networks(small), results, line)
+        fill(_networks(small), results, line)
 
 
-def _fill(variants: list[Variant], results: Results, line: Callable[[str], None]) -> None:
+def fill(variants: list[Variant], results: Results, line: Callable[[str], None]) -> None:
+    """One cell for each of these variants."""
     for variant in variants:
         cell = results.cell(f"{variant.group}/{variant.name}", lambda v=variant: _judged(v))  # type: ignore[misc]
         line(f"  {variant.group}: {variant.name}: {cell['psnr raw']:.2f} dB, 2D {cell['2d psnr raw']:.2f} dB")
@@ -160,6 +160,10 @@ def _weights(scene: Scene) -> list[Variant]:
         Variant("weight", f"{weight:g}", partial(_once, scene, weight=weight), scene)
         for weight in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2)
     ]
+
+
+GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers)
+"""What changes, on one scene."""
 
 
 def _networks(scene: Scene) -> list[Variant]:

@@ -140,7 +140,7 @@ def held_out_nll(predicted: Array, observed: Array) -> float:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             generator = torch.Generator().manual_seed(0)
-            fit(model, signals[first::2], readings[first::2], digitise=False, num_steps=300, generator=generator)
+            fit(model, signals[first::2], readings[first::2], digitise=False, num_steps=200, generator=generator)
         with torch.no_grad():
             found.append(-model(signals[1 - first :: 2]).log_prob(readings[1 - first :: 2]).double().mean())
     return float(sum(found) / 2)

@@ -20,7 +20,8 @@ from recon.tilt_series import TiltSeries, VolumeGrid
 
 WIDTHS = (32, 64, 128, 256)
 _DENSITY_SCALE = 7.0
-_RATE, _STEPS = 5e-3, 300
+_STEPS = 300
+_HIGHEST_RATE, _RATE_TIMES_WIDTH = 0.02, 1.28
 _EMPTY = -4.0
 
 
@@ -70,7 +71,8 @@ def fit_network(
         torch.manual_seed(seed)
         start = JointReconstructor(noise_model=Gaussian, seed=seed).prepare(tilt_series, grid)
         field = NetworkField(grid.shape, layer_width=width, scale=float(start.field.scale))
-        model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=_RATE)
+        rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
+        model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)
         images = torch.from_numpy(np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32))
         generator = torch.Generator().manual_seed(seed)
         held_out = block_mask(images.shape, generator=generator)

@@ -22,6 +22,23 @@ def parse_mode(text: str) -> Mode:
     return "linear" if text == "linear" else "transmission"
 
 
+def method_of(method: str, preset: str | None) -> str:
+    """The method that `--method` or `--preset` names.
+
+    Raises:
+        ValueError: no preset of that name, or a method beside it.
+    """
+    if preset is None:
+        return method
+    from recon.presets import PRESETS
+
+    if preset not in PRESETS:
+        raise ValueError(f"--preset {preset}: choose {' or '.join(PRESETS)}")
+    if method not in ("auto", preset):
+        raise ValueError(f"--preset {preset} is a method of its own; leave --method {method} out")
+    return preset
+
+
 def load_noise_model(path: Path | None) -> nn.Module | None:
     """The noise model in a file, or None without a file. Raises as `noiseflow.load`."""
     if path is None:

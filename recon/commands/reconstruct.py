@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, step_report
-from recon.commands.options import load_noise_model
+from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import memory_line, open_journal, stoppable, warnings_as_lines
 
 if TYPE_CHECKING:
@@ -37,6 +37,10 @@ def reconstruct(
             help="auto, joint, joint-supervised, l2, l1, tv, explicit, l2-denoised, wbp-denoised, sirt or wbp."
         ),
     ] = "auto",
+    preset: Annotated[
+        str | None,
+        typer.Option(help="A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
+    ] = None,
     mode: Annotated[str, typer.Option(help="transmission (bright field) or linear (HAADF, EDX).")] = "transmission",
     thickness: Annotated[
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
@@ -97,7 +101,7 @@ def reconstruct(
             mask_nan=mask_nan,
         )
         tilt_series, screening = screened(tilt_series, keep_tilts=keep_tilts)
-        grid = VolumeGrid.of(tilt_series, thickness)
+        grid, method = VolumeGrid.of(tilt_series, thickness), method_of(method, preset)
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
         options |= {"window": window, "denoiser": denoiser}

@@ -1,6 +1,8 @@
 """Benchmarks: cells are computed once and kept, settings are searched, timing is in turn, rivals stand the right way round."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +10,16 @@ import typer
 from typer.testing import CliRunner
 
 from noiseflow import Gaussian
-from recon import benchmark_rivals
+from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals
 from recon.benchmark import Results, in_turn, make_scene, plain
+from recon.benchmark_network import fit_network
 from recon.benchmark_rivals import Effort, best_cutoff, curves, own_sirt, summary, table
+from recon.benchmark_search import best
 from recon.commands.benchmark import benchmark
+from recon.comparison import project
 from recon.external import _oriented, astra_sirt, missing
 from recon.joint import JointReconstructor
+from recon.tilt_series import Volume
 
 TINY = {"tilts": "-60:60:12"}
 
@@ -125,10 +131,110 @@ def test_command_writes_results_and_a_figure(tmp_path, monkeypatch):
     app.command()(benchmark)
     result = CliRunner().invoke(app, ["--quick", "--size", "16", "--out", str(tmp_path), "--json"])
     found = json.loads(result.stdout.splitlines()[-1])["rivals"]
-    assert found["machine"]["versions"]["torch"]
+    assert found["machines"][0]["versions"]["torch"]
     assert set(found["curves"]) >= {"SIRT", "WBP ramp"}
     assert len(list(tmp_path.glob("*.png"))) == 1
 
 
 def test_plain_values_are_json():
     assert plain({"a": (np.float64(1 / 3), np.arange(2))}) == {"a": [0.33333, [0, 1]]}
+
+
+def test_cells_are_computed_anew_where_that_is_asked_for(tmp_path):
+    results = Results(tmp_path / "r.json", "test")
+    for key in ("a/joint", "b/wbp"):
+        results.cell(key, lambda: {"x": 1})
+    results.forget("joint")
+    assert results.cell("a/joint", lambda: {"x": 2})["x"] == 2
+    assert results.cell("b/wbp", lambda: {"x": 2})["x"] == 1
+    assert results.cells["a/joint"]["machine"] == 0
+    assert results.content["machines"][0]["cores"] >= 1
+
+
+def test_the_best_candidate_is_found_and_says_where_it_lies():
+    found = best(((str(value), np.full(3, value)) for value in (1, 3, 2)), lambda volume: float(volume.sum()))
+    assert (found.setting, found.volume[0], found.at_an_end) == ("3", 3, False)
+    assert found.tried == {"1": 3.0, "3": 9.0, "2": 6.0}
+    with pytest.raises(ValueError, match="nothing to choose"):
+        best([], np.sum)
+
+
+def test_published_errors_agree_with_their_decibels():
+    for psnr_2d, mse_2d, dssim, psnr, mse in benchmark_paper.PUBLISHED.values():
+        assert -10 * np.log10(mse_2d / 100) == pytest.approx(psnr_2d, abs=0.2)
+        assert -10 * np.log10(mse / 100) == pytest.approx(psnr, abs=0.02)
+        assert dssim < 5
+
+
+class Perfect:
+    """A reconstructor that knows the answer."""
+
+    def __init__(self, **options):
+        self.scene = make_scene(16, **TINY)
+
+    def __call__(self, tilt_series, grid=None):
+        volume = Volume(self.scene.truth * np.float32(0.9), None)
+        return SimpleNamespace(volume=volume, signal_model=SimpleNamespace(weight=0.2))
+
+
+def test_paper_table_has_every_method(tmp_path, monkeypatch):
+    scene, results = make_scene(16, **TINY), Results(tmp_path / "r.json", "paper-table")
+    monkeypatch.setattr(benchmark_paper, "fits", lambda *_: [("any", scene.truth * 0.9)])
+    monkeypatch.setattr(benchmark_paper, "denoised", lambda series, name: series)
+    monkeypatch.setattr(benchmark_paper, "JointReconstructor", Perfect)
+    benchmark_paper.run(scene, results, lambda text: None)
+    header, rows = benchmark_paper.table(results.cells)
+    assert [row[0] for row in rows] == list(benchmark_paper.METHODS)
+    assert all(len(row) == len(header) for row in rows)
+    assert results.cells["joint"]["psnr affine"] > 60 > results.cells["WBP"]["psnr affine"]
+
+
+def test_left_out_tilts_are_predicted_with_the_gain_that_suits_the_given_ones():
+    scene = make_scene(16, **TINY)
+    given = replace(scene.noisy, images=2.5 * project(scene.truth, scene.noisy.tilt_angles) + 0.4, mode="linear")
+    predicted = benchmark_needle.predict(given, scene.truth, scene.test_angles)
+    np.testing.assert_allclose(predicted, 2.5 * project(scene.truth, scene.test_angles) + 0.4, atol=1e-4)
+
+
+def test_a_better_prediction_is_more_likely():
+    generator = np.random.default_rng(0)
+    signal = generator.random((2, 24, 24)).astype(np.float32)
+    observed = signal + 0.1 * generator.standard_normal(signal.shape).astype(np.float32)
+    good, bad = (benchmark_needle.held_out_nll(each, observed) for each in (signal, np.roll(signal, 1, axis=2)))
+    assert good == pytest.approx(np.log(0.1 * np.sqrt(2 * np.pi * np.e)), abs=0.05)
+    assert bad > good + 0.3
+
+
+def test_real_series_is_split_without_loss():
+    series = benchmark_needle.load()
+    for noise in benchmark_needle.NOISES:
+        for gap in benchmark_needle.GAPS:
+            parts = benchmark_needle.split(series, noise, gap, seed=0)
+            assert parts.given.num_tilts + parts.left_out.num_tilts == series.num_tilts
+            assert not set(parts.given.tilt_angles) & set(parts.left_out.tilt_angles)
+    assert parts.target.max() <= 10.0001
+    assert 0.4 < float(np.std(parts.left_out.images - parts.target)) < 3.5
+
+
+def test_every_ablation_is_named_once_and_runs(tmp_path, monkeypatch):
+    scene = make_scene(16, **TINY)
+    made = [variant for group in benchmark_ablations.GROUPS for variant in group(scene)]
+    names = [(variant.group, variant.name) for variant in made]
+    assert len(set(names)) == len(names)
+    results = Results(tmp_path / "r.json", "ablations")
+    monkeypatch.setattr(benchmark_ablations, "JointReconstructor", Perfect)
+    chosen = {("field", "voxels, L2, no TV"), ("parts", "clipping ignored"), ("denoiser, then WBP", "wiener")}
+    benchmark_ablations.fill([v for v in made if (v.group, v.name) in chosen], results, lambda text: None)
+    header, rows = benchmark_ablations.table(results.cells)
+    assert {row[:2] for row in rows} == chosen
+    assert all(len(row) == len(header) for row in rows)
+
+
+def test_network_on_the_lattice_learns():
+    scene = make_scene(16, **TINY)
+    few, more = (fit_network(scene.clean, scene.grid, width=16, num_steps=steps) for steps in (2, 60))
+    errors = [
+        np.mean((project(volume, scene.test_angles) - project(scene.truth, scene.test_angles)) ** 2)
+        for volume in (few, more)
+    ]
+    assert errors[1] < 0.5 * errors[0]

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from recon import methods
+from recon.commands.options import method_of
 from recon.metrics import compare
 from recon.paper_network import CoordinateDensity, PaperFlow, by_density
 from recon.presets import PRESETS, Kniesel2022, PresetState
@@ -113,3 +114,12 @@ def test_noise_model_learns_after_the_field():
 
 def test_presets_are_methods():
     assert set(PRESETS) <= set(methods.METHODS)
+
+
+def test_command_line_takes_a_preset_or_a_method():
+    assert method_of("auto", "kniesel2022") == method_of("kniesel2022", None) == "kniesel2022"
+    assert method_of("tv", None) == "tv"
+    with pytest.raises(ValueError, match="choose kniesel2022 or kniesel2022-as-published"):
+        method_of("auto", "nerf")
+    with pytest.raises(ValueError, match="leave --method tv out"):
+        method_of("tv", "kniesel2022")

@@ -1,0 +1,49 @@
+"""The results pages of the methods say what their JSON says, and tell what is missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
+NAMES = ("run_time.md", "paper_table.md", "ablations.md", "needle.md")
+
+
+@pytest.fixture(autouse=True)
+def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_page_agrees_with_its_json(name: str) -> None:
+    import rivals
+
+    assert (BENCHMARKS / name).read_text(encoding="utf-8") == rivals.PAGES[name](rivals.RESULTS)
+
+
+def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:
+    import rivals
+
+    assert "64³, 96³, 128³ on a CPU are not measured" in rivals.run_time(tmp_path)
+    assert set(rivals.PAGES) == set(NAMES)
+
+
+def test_a_page_shows_a_changed_figure_and_the_rows_that_are_missing(tmp_path: Path) -> None:
+    import rivals
+
+    figures = {
+        f"{kind}{figure} {scaling}": 0.25
+        for kind in ("", "2d ")
+        for figure in ("psnr", "mse", "dssim")
+        for scaling in ("raw", "affine", "min-max")
+    }
+    machine = {"processor": "P", "cores": 2, "threads": 1, "python": "3", "versions": {"noiseflow": "1"}}
+    cell = figures | {"setting": "hann", "psnr min-max": 12.3456}
+    content = {"machines": [machine], "cells": {"WBP": cell}}
+    (tmp_path / "paper-table-16-clipped-cell-0-full.json").write_text(json.dumps(content), encoding="utf-8")
+    page = rivals.paper_table(tmp_path)
+    assert "| WBP | 0.25 | 25.000 | 2.500 | 12.35 |" in page
+    assert "Not measured yet: SIRT, L2, noisy images" in page
+    assert "cell, clipped noise, 16³, seed 0" in page
