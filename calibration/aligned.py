@@ -15,6 +15,9 @@ from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling, ow
 LARGEST_SHARE = 0.5
 """Share of the residual's variance above which the 'long' exposure is the noisier of the two."""
 
+LARGEST_RATIO_ERROR = 0.25
+"""Departure, in the logarithm, of the exposures' scale from their ratio that a change of dose may explain."""
+
 MINIMUM_PIXELS = 500
 """Pixels below which a noise model cannot be told from another."""
 
@@ -53,6 +56,13 @@ class AlignedPair:
     def observation(self) -> Image:
         """(y, x) the short exposure with its scatter about the signal shrunk to the short exposure's own."""
         return self.signal + np.sqrt(1 - self.share) * (self.short - self.signal)
+
+    @property
+    def one_setting(self) -> bool:
+        """Whether one detector setting took both exposures: a ratio was given, and their scale agrees with it."""
+        if self.exposure_ratio is None or self.scaling.slope <= 0:
+            return False
+        return bool(abs(np.log(self.scaling.slope * self.exposure_ratio)) < LARGEST_RATIO_ERROR)
 
     @property
     def share(self) -> Image:

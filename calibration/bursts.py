@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from calibration.align import Registration, register
 from calibration.aligned import MINIMUM_PIXELS, AlignedPair
@@ -15,6 +16,9 @@ from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling
 
 LEAST_DRIFT = 0.1
 """Pixels below which a burst counts as still: warping would cost more than it mends."""
+
+LARGEST_CHANGE = 0.05
+"""Share of the pixels that may lie in places which change."""
 
 LEAST_DOSE_CHANGE = 0.005
 """Relative dose change below which a burst counts as steady."""
@@ -67,8 +71,12 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     registrations = [_registered(frames, index) for index in range(len(frames))]
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
     drift, drifting = _drift(shift, registrations)
-    references = [_others_on(frames, shift if drifting else np.zeros_like(shift), i) for i in range(len(frames))]
-    moving = _restless(frames, references, trusted)
+    references, moving = _compared(frames, np.zeros_like(shift), trusted)
+    if drifting:
+        moved, moving_then = _compared(frames, shift, trusted)
+        drifting = bool(moving_then.sum() <= moving.sum())  # else what changes in the scene looked like a drift
+        references, moving = (moved, moving_then) if drifting else (references, moving)
+    _require_still(moving, trusted, burst.name)
     pairs = []
     for frame, (others, covered), registration in zip(frames, references, registrations, strict=True):
         lost = (~covered, ~trusted & ~hot & ~dead, hot, dead, moving)
@@ -100,15 +108,32 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
     return drift, drift > max(LEAST_DRIFT, 5 * error) and len(known) == len(registrations)
 
 
-def _restless(frames: Image, references: list[tuple[Image, Mask]], trusted: Mask) -> Mask:
-    """Where the scene itself changes between frames; nowhere if there are too few frames to tell."""
-    if len(frames) < 4:
-        return np.zeros(frames[0].shape, bool)
+def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Image, Mask]], Mask]:
+    """The mean of the others, moved onto each frame, with what it covers; and where the scene changes between frames."""
+    references = [_others_on(frames, shift, index) for index in range(len(frames))]
     covered = np.logical_and.reduce([mask for _, mask in references]) & trusted
-    residual = np.stack([frame - others for frame, (others, _) in zip(frames, references, strict=True)])
-    residual -= residual[:, covered].mean(axis=1)[:, None, None]
-    moving = restless(residual, frames.mean(0), covered)
-    return moving if (covered & ~moving).sum() >= MINIMUM_PIXELS else np.zeros_like(moving)
+    residual = np.stack(
+        [_residual(frame, others, covered) for frame, (others, _) in zip(frames, references, strict=True)]
+    )
+    return references, restless(residual, frames.mean(axis=0), covered)
+
+
+def _residual(frame: Image, others: Image, mask: Mask) -> Image:
+    """A frame less the mean of the others at the frame's own dose."""
+    first, second = (ndimage.gaussian_filter(image, 2.0)[mask] for image in (frame, others))
+    slope = np.cov(first, second)[0, 1] / max(np.var(second), np.finfo(float).tiny)
+    if np.std(second) < 0.1 * np.std((frame - others)[mask]):  # a flat scene has no slope
+        slope = 1.0
+    return np.asarray(frame - slope * others - (frame - slope * others)[mask].mean())
+
+
+def _require_still(moving: Mask, trusted: Mask, name: str) -> None:
+    share = float(moving.sum() / trusted.sum())
+    if share > LARGEST_CHANGE:
+        raise ValueError(
+            f"{name}: the scene changes between frames at {share:.0%} of its pixels (blinking, moving or bleaching objects), "
+            "so that its change passes for noise; give frames of a scene that stands still, or crop to a part that does"
+        )
 
 
 def _others_on(frames: Image, shift: Image, index: int) -> tuple[Image, Mask]:

@@ -67,9 +67,9 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
         regressed = {
             "own": noise,
             "shift": first / mass + offset - mean,
-            "excess": (second / mass - (first / mass) ** 2 - about) / noise if noise > 0 else 0.0,
+            "excess": (second / mass - (first / mass) ** 2 - about) / noise,
         }
-        rows.append(row | regressed)
+        rows.append(row | (regressed if noise > 0 else {}))
     return rows
 
 

@@ -140,7 +140,11 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
 def _registration(pair: AlignedPair) -> dict[str, Any]:
     found = pair.registration
     names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
-    scaling = {"slope": pair.scaling.slope, "intercept": pair.scaling.intercept}
+    scaling = {
+        "slope": pair.scaling.slope,
+        "intercept": pair.scaling.intercept,
+        "exposure_ratio": 1 / pair.scaling.slope,
+    }
     values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
     return values | scaling | {"masked": vars(pair.counts)}
 

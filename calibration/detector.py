@@ -114,7 +114,7 @@ def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
         variance = float(line(np.array(signal))) / share
         gain = max(line.rate / share, 1e-2 * variance / max(abs(signal), 1.0))
         lowest = signal - variance / gain
-        offset = max(pair.scaling.common_offset()[0], lowest) if pair.exposure_ratio else lowest
+        offset = max(pair.scaling.common_offset()[0], lowest) if pair.one_setting else lowest
         read = max(variance - gain * (signal - offset), 0.05 * gain**2)
         found.append((gain, offset, float(np.sqrt(read)) / gain))
     gain, offset, read_noise = (float(np.median(column)) for column in zip(*found, strict=True))
@@ -158,7 +158,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
     centre = float(pair.signal[pair.mask].mean())
-    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.exposure_ratio is not None)
+    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting)
     weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
     shares = _shares(pair)
 
@@ -192,7 +192,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     One detector setting at a known exposure ratio makes them 1/ratio and 1/ratio², less what the interpolation smooths
     away; otherwise the measured share stands for both.
     """
-    if pair.exposure_ratio is not None:
+    if pair.exposure_ratio is not None and pair.one_setting:
         noise = np.random.default_rng(0).standard_normal(pair.long.shape)
         kept = float(np.var(pair.registration.warp(noise)[0][pair.mask]))
         return kept / pair.exposure_ratio, kept / pair.exposure_ratio**2

@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures import Image, rails, saturation_level
+from calibration.scaling import spread_by_level
 
 Mask = NDArray[np.bool_]
 
 DEFECT_DEVIATIONS = 8.0
 """Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
+
+
+CUT = 2.5
+"""Robust standard deviations at which residuals are cut before neighbours are compared."""
 
 
 @dataclass(frozen=True)
@@ -74,30 +79,41 @@ def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float 
     return clear
 
 
-def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, num_levels: int = 24) -> Mask:
-    """Places where a burst does not stand still: they vary by far more than others of like brightness.
+def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0) -> Mask:
+    """Places where a burst does not stand still: neighbouring pixels there rise and fall together.
 
-    Judged by the variance over blocks of pixels and all frames, each square capped at four deviations so that a single
-    outlier, which is noise, condemns nothing.
+    Noise, however uneven or heavy-tailed, is independent between pixels, or correlated alike everywhere; what moves or
+    blinks spreads over neighbours through the optics. Residuals are cut at some deviations, so that two outliers side
+    by side condemn nothing.
 
     Args:
-        residual: (frame, y, x) each frame less the mean of the others, four frames or more.
+        residual: (frame, y, x) each of two frames or more, less the mean of the others.
         level: (y, x) mean of the frames.
         mask: (y, x) pixels to judge.
-        side: of the neighbourhood, pixels.
-        num_levels: of like brightness.
+        side: of the neighbourhood judged as one, and condemned as one, pixels.
+        deviations: standard deviations by which the neighbours' covariance exceeds the frame's usual one.
     """
-    smooth = ndimage.uniform_filter(level, side)
-    quiet = mask.copy()
-    expected = np.full(level.shape, np.mean(residual[:, mask] ** 2))
-    for _ in range(6):
-        squares = np.minimum(residual**2, 16 * expected).mean(axis=0)
-        local = ndimage.uniform_filter(squares, side)
-        groups = np.array_split(np.argsort(smooth[quiet]), num_levels)
-        levels = [float(smooth[quiet][group].mean()) for group in groups]
-        expected = np.interp(smooth, levels, [float(np.median(local[quiet][group])) for group in groups])
-        quiet = mask & (local < expected * (1 + 4 * np.sqrt(2 / (side**2 * (len(residual) - 1)))))
-    return mask & ~quiet
+    residual = residual - np.median(residual, axis=0)  # an outlier of one frame shifts the mean that others are held to
+    spread = np.ones(level.shape)
+    levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
+    spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
+    cut = np.clip(residual / spread, -CUT, CUT)
+    square = (cut**2).sum(axis=0)
+    covariance, power, scatter = np.zeros((3, *mask.shape))
+    for axis in (0, 1):
+        both = mask & np.roll(mask, -1, axis)
+        both[(slice(None),) * axis + (-1,)] = False
+        squares = np.where(both, square * np.roll(square, -1, axis), 0.0)
+        covariance += np.where(both, (cut * np.roll(cut, -1, axis + 1)).sum(axis=0), 0.0)
+        power += np.sqrt(squares)
+        scatter += squares / (len(residual) - 1)
+    total, usual, variance = (side**2 * ndimage.uniform_filter(image, side) for image in (covariance, power, scatter))
+    judged = mask & (usual > 0)
+    if not judged.any():
+        return np.zeros_like(mask)
+    excess = total - np.median(total[judged] / usual[judged]) * usual
+    moving = judged & (excess > deviations * np.sqrt(np.maximum(variance, 0.0)))
+    return np.asarray(mask & ndimage.binary_dilation(moving, np.ones((side, side), bool)))
 
 
 def _deviation(frame: Image) -> Image:

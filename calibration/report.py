@@ -122,9 +122,15 @@ def describe_registration(pair: AlignedPair) -> str:
     x, y = found.shift(pair.short.shape)
     method = f"SIFT, {found.inliers} of {found.matches} matches" if found.method == "sift" else "phase correlation"
     counts = pair.counts
+    ratio = f"long over short {1 / pair.scaling.slope:.4g} by their scale"
+    if pair.exposure_ratio is not None and not pair.one_setting:
+        ratio += (
+            f", not {pair.exposure_ratio:.4g} as given: one detector setting did not take both as they are, so that their "
+            "scale tells no offset"
+        )
     return (
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
-        f"{found.scale:.5f}, standard error {found.error_px:.3f} px, matches' rms {found.rms_px:.2f} px. Left out: "
+        f"{found.scale:.5f}, standard error {found.error_px:.3f} px, matches' rms {found.rms_px:.2f} px; {ratio}. Left out: "
         f"{counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
         f"{counts.dead} dead" + (f", {counts.restless} in places that change." if counts.restless else ".")
     )

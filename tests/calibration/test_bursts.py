@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from calibration.bursts import align_burst
 from calibration.exposures import Burst
@@ -60,3 +61,44 @@ def test_flat_frames_have_no_drift_to_tell():
     assert np.isnan(report.drift)
     assert not report.drifting
     assert np.mean([np.var((p.observation - p.signal)[p.mask]) for p in pairs]) == pytest.approx(500, rel=0.05)
+
+
+def blinking(generator, number, size=SIZE):
+    """Emitters that light up in one frame or another, blurred over some pixels by the optics."""
+    frames = []
+    for _ in range(number):
+        lit = np.where(generator.random((size, size)) < 1e-3, 2500.0, 0.0)
+        frames.append(generator.poisson(20 + ndimage.gaussian_filter(lit, 1.3)))
+    return Burst(np.stack(frames).astype(float))
+
+
+def test_a_scene_that_blinks_is_refused():
+    with pytest.raises(ValueError, match="changes between frames at"):
+        align_burst(blinking(np.random.default_rng(0), 6))
+
+
+def test_a_corner_that_moves_is_left_out_and_the_rest_kept():
+    frames, _ = burst([(0, 0)] * 6, [1.0, 0.9, 1.0, 0.95, 1.0, 1.0])
+    moved = frames.frames.copy()
+    for number, frame in enumerate(moved):
+        frame[10:22, 10 + 2 * number : 22 + 2 * number] += 60
+    pairs, _ = align_burst(Burst(moved))
+    assert not pairs[0].mask[12:20, 14:28].any()
+    assert pairs[0].mask[40:-4, 4:-4].mean() > 0.97
+
+
+@pytest.mark.parametrize("noise", ["uneven", "outliers", "correlated"])
+def test_uneven_heavy_tailed_and_correlated_noise_is_no_change_of_the_scene(noise):
+    generator = np.random.default_rng(1)
+    clean = np.broadcast_to(50 + 20 * np.sin(np.arange(SIZE) / 9), (8, SIZE, SIZE))
+    frames = (
+        clean
+        + {
+            "uneven": np.exp(generator.standard_normal((SIZE, SIZE))) * generator.standard_normal(clean.shape),
+            "outliers": generator.standard_normal(clean.shape)
+            + (generator.random(clean.shape) < 0.01) * generator.exponential(200, clean.shape),
+            "correlated": ndimage.gaussian_filter(generator.standard_normal(clean.shape), (0, 0.5, 0.5)),
+        }[noise]
+    )
+    pairs, _ = align_burst(Burst(frames))
+    assert pairs[0].counts.restless < 0.02 * SIZE**2

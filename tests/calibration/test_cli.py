@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import noiseflow
 from calibration.models import KINDS
 from noiseflow.cli import main
 from noiseflow.io import write
+
+from .conftest import textured_scene
 
 RANDOM = np.random.default_rng(1)
 
@@ -30,9 +33,13 @@ def folder(tmp_path, exposures):
         "noise": RANDOM.poisson(50, exposures.short.shape),
         "saturated": np.where(RANDOM.random(exposures.short.shape) < 0.8, 4095, exposures.short),
         "stack3": np.stack([exposures.short] * 5),
+        "copy": exposures.short,
+        "scaled": 3 * exposures.short + 7,
+        "elsewhere": 200 + 400 * textured_scene(np.random.default_rng(77), 192)(*np.mgrid[:192, :192].astype(float)),
     }
     for name, data in files.items():
         write(tmp_path / f"{name}.tif", data.astype(np.float32))
+    write(tmp_path / "white.tif", np.full(exposures.short.shape, 65535, np.uint16))
     write(tmp_path / "rgb.tif", np.stack([exposures.short.clip(0, 255)] * 3, -1).astype(np.uint8))
     whole = (tmp_path / "short.tif").read_bytes()
     (tmp_path / "truncated.tif").write_bytes(whole[: len(whole) // 2])
@@ -56,7 +63,13 @@ def run(*arguments: str) -> int:
         ("nan", "long", "NaN"),
         ("flat", "long", "flat"),
         ("saturated", "long", "saturated"),
+        ("white", "long", "saturated"),
+        ("short", "white", "saturated"),
         ("rgb", "long", "colour"),
+        ("short", "rgb", "colour"),
+        ("copy", "short", "identical pixels"),
+        ("short", "scaled", "copy"),
+        ("short", "elsewhere", "cannot be registered"),
         ("stack3", "long", "one 2D frame"),
         ("short", "short", "short and as long"),
         ("long", "short", "swap"),
@@ -78,6 +91,8 @@ def test_bad_exposures_give_one_line_and_no_file(folder, capsys, short, long, me
     ("extra", "message"),
     [
         (("--exposure-ratio", "0.5"), "above 1"),
+        (("--exposure-ratio", "1"), "above 1"),
+        (("--exposure-ratio", "-2"), "above 1"),
         (("--kind", "gauss"), "unknown kind"),
         (("--device", "tpu"), "choose auto"),
     ],
@@ -145,6 +160,31 @@ def test_burst_with_dark_frames(folder, capsys, monkeypatch, exposures):
 def test_one_frame_alone_is_refused(folder, capsys):
     assert run("--short", f"{folder}/short.tif", "-o", f"{folder}/out/m.safetensors") == 1
     assert "one frame only" in capsys.readouterr().err
+    assert list((folder / "out").iterdir()) == []
+
+
+def test_a_burst_that_blinks_is_refused_in_one_line(folder, capsys):
+    frames = []
+    for _ in range(5):
+        lit = np.where(RANDOM.random((128, 128)) < 1e-3, 2500.0, 0.0)
+        frames.append(RANDOM.poisson(20 + ndimage.gaussian_filter(lit, 1.3)))
+    write(folder / "blinking.tif", np.stack(frames).astype(np.uint16))
+    assert run("--short", f"{folder}/blinking.tif", "-o", f"{folder}/out/m.safetensors") == 1
+    error = capsys.readouterr().err.strip()
+    assert "blinking.tif: the scene changes between frames" in error
+    assert "\n" not in error
+    assert list((folder / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("part", ["measure_detector", "fit_models"])
+def test_interrupt_leaves_no_file_and_says_so(folder, capsys, monkeypatch, part):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"calibration.pipeline.{part}", interrupted)
+    files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/out/m.safetensors")
+    assert run(*files, "--report", f"{folder}/out/report") == 130
+    assert "no unfinished output was left" in capsys.readouterr().err
     assert list((folder / "out").iterdir()) == []
 
 

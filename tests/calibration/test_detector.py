@@ -194,3 +194,24 @@ def test_clipped_readings_count_as_clipped():
     for interval, truth in ((found.gain, 2.0), (found.offset, 0.0), (found.read_noise, 8.0)):
         deviation = (interval.q95 - interval.q05) / 3.29
         assert abs(interval.median - truth) < 3 * deviation
+
+
+def test_a_mean_of_frames_as_the_long_exposure_tells_no_offset_but_the_gain():
+    generator = np.random.default_rng(8)
+    dose = 40 * np.exp(0.6 * ndimage.gaussian_filter(generator.standard_normal((160, 160)), 3) * 10)
+    read = [
+        np.round(100 + 2.0 * (generator.poisson(dose) + 3 * generator.standard_normal(dose.shape))) for _ in range(17)
+    ]
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    pair = align_with(ExposurePair(read[0], np.mean(read[1:], axis=0), 16.0), still)
+    assert not pair.one_setting
+    assert measure_detector([pair]).posterior.gain.median == pytest.approx(2.0, rel=0.06)
+
+
+def test_exposures_without_a_trace_of_the_long_ones_noise_are_measured():
+    generator = np.random.default_rng(9)
+    dose = 10 * np.exp(0.6 * ndimage.gaussian_filter(generator.standard_normal((160, 160)), 3) * 10)
+    short = np.round(100 + 2.0 * (generator.poisson(dose) + generator.standard_normal(dose.shape)))
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    found = measure_detector([align_with(ExposurePair(short, 1000 * dose), still)])
+    assert found.posterior.gain.median == pytest.approx(2.0, rel=0.05)
