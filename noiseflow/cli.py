@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import errno
 import logging
+import signal
 import sys
+import threading
 import warnings
 from importlib.metadata import entry_points, version
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
-from noiseflow.console import Invocation, invoked
+from noiseflow.console import START_AGAIN, Invocation, end_stopped, invoked
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
 _TYPED = "noiseflow.typed"
@@ -26,6 +28,7 @@ def build_app() -> typer.Typer:
     """The command-line application with every installed command."""
     app = typer.Typer(
         name="noiseflow",
+        cls=_Group,
         help="Learn a microscope's noise, sample it, and reconstruct clean volumes from noisy tilt series.",
         no_args_is_help=True,
         add_completion=True,
@@ -39,21 +42,33 @@ def build_app() -> typer.Typer:
     return app
 
 
+class _Group(TyperGroup):
+    """The program itself: Ctrl-C ends whatever it runs with one line and exit code 130."""
+
+    def make_context(self, *words: Any, **more: Any) -> Any:
+        try:
+            return super().make_context(*words, **more)
+        except KeyboardInterrupt:
+            end_stopped(f"stopped; {START_AGAIN}")
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            end_stopped(f"{ctx.invoked_subcommand} stopped; {str(stop) or START_AGAIN}")
+
+
 class _ListCommand(TyperCommand):
     """A command that remembers how it was called, and whose list options take several values.
 
-    ``--short a b c`` stands for ``--short a --short b --short c``; Ctrl-C ends it with one line.
+    ``--short a b c`` stands for ``--short a --short b --short c``.
     """
 
     def invoke(self, ctx: Any) -> Any:
         given = {name: ctx.get_parameter_source(name).name not in _UNASKED for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
-        try:
-            with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
-                return super().invoke(ctx)
-        except KeyboardInterrupt:
-            print(f"noiseflow: {self.name} stopped; no unfinished output was left", file=sys.stderr)
-            raise typer.Exit(130) from None
+        with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = tuple(args)
@@ -95,7 +110,11 @@ def main(arguments: list[str] | None = None) -> None:
         warnings.showwarning = _show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
     try:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop leaves nothing half done
         build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
+    except KeyboardInterrupt:
+        end_stopped(f"stopped; {START_AGAIN}")
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -22,7 +24,17 @@ Progress = Callable[[int, str], None]
 """``progress(done, note)``: steps done so far, and a few words such as the current likelihood."""
 StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)``: the same for several pieces of work one after the other."""
+START_AGAIN = "nothing was left behind; the same command starts again"
+"""What is told of stopped work that keeps no state."""
 _LOG_SECONDS = 10.0
+
+
+def end_stopped(text: str) -> NoReturn:
+    """End a program that was stopped, with one line and exit code 130; Ctrl-C again has no effect any more."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    print(f"noiseflow: {text}", file=sys.stderr, flush=True)
+    sys.exit(130)  # not typer.Exit, which a command that runs others would not notice
 
 
 class Output:

@@ -188,7 +188,7 @@ def _trained(scene: Scene, preset: Kniesel2022, budget: float) -> Iterator[Point
     for state in preset.train(scene.noisy):
         now = seconds + time.perf_counter() - started
         if now >= due or now >= budget:
-            yield f"{state.steps} of {preset.num_steps} steps", now, state.volume(scene.grid).attenuation
+            yield f"{state.done} of {preset.num_steps} steps", now, state.volume(scene.grid).attenuation
             seconds, due, started = now, 1.5 * now, time.perf_counter()
         if now >= budget:
             return

@@ -7,6 +7,7 @@ code from it.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import fields
 from importlib.metadata import version
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.io import atomic_path
+from recon.stages import Stage
 
 StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)`` after every step of every fit."""
@@ -28,20 +30,21 @@ _RESULT = [field.name for field in fields(FitResult) if field.name not in ("nois
 
 
 class Journal:
-    """Runs the fits of one reconstruction in order, and keeps what each has reached.
+    """Runs the fits and other stages of one reconstruction in order, and keeps what each has reached.
 
-    All else in a reconstruction follows from its settings, its seed and the results of its fits, in order. So a run that goes
-    on repeats the rest, takes the finished fits from the journal, and continues the one that was stopped.
+    All else in a reconstruction follows from its settings, its seed and the results of its stages, in order. So a run that
+    goes on repeats the rest, takes the finished stages from the journal, and continues the one that was stopped.
 
     Args:
         folder: of the journal; made when there is something to write.
         settings: all that decides the result, by name, as JSON can hold it. Another run's journal is refused.
         resume: go on with what the folder holds; otherwise the first thing written replaces it.
-        interval: seconds between checkpoints within a fit; one more is written when a fit ends, and when it is stopped.
+        interval: seconds between checkpoints within a stage; one more is written when it ends, and when it is stopped.
         report: told of every step. It may raise KeyboardInterrupt: the step is whole by then, and is saved.
 
     Attributes:
-        in_fit: whether a fit is running.
+        in_fit: whether a fit or another stage is running.
+        stop_requested: set it to have KeyboardInterrupt raised after the running step, its state saved.
         abandoned: set it to have nothing more written.
 
     Raises:
@@ -59,7 +62,7 @@ class Journal:
     ) -> None:
         self.folder, self.interval, self.report = Path(folder), interval, report
         self.settings = json.loads(json.dumps(settings))
-        self.abandoned = self.in_fit = False
+        self.stop_requested = self.abandoned = self.in_fit = False
         self._num_fits = 0
         self._fresh = not (resume and self.exists)
         if not self._fresh:
@@ -96,6 +99,31 @@ class Journal:
         )
         (self.folder / _CURRENT).unlink(missing_ok=True)
         return result
+
+    def run_stage(self, title: str, stage: Stage) -> None:
+        """Take the steps of a stage that are left, told of and kept as those of a fit."""
+        self._num_fits += 1
+        finished, report = self._finished(self._num_fits), self._progress(title, stage.num_steps)
+        if not self._fresh and finished.exists():
+            stage.load_state(read_state(finished))
+            return
+        current = self._current()
+        if current is not None:
+            stage.load_state(current)
+        self.in_fit, saved = True, time.perf_counter()
+        try:
+            while stage.done < stage.num_steps:
+                note = stage.step()
+                if time.perf_counter() - saved >= self.interval:
+                    self._write_current(stage.state())
+                    saved = time.perf_counter()
+                report(stage.done, note)
+        except KeyboardInterrupt:
+            self._write_current(stage.state())
+            raise
+        self.in_fit = False
+        self._write(finished, stage.state())
+        (self.folder / _CURRENT).unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
@@ -138,6 +166,8 @@ class Journal:
         def progress(done: int, note: str) -> None:
             if self.report is not None:
                 self.report(title, done, total, note)
+            if self.stop_requested:
+                raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
 
         return progress
 

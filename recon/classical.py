@@ -15,6 +15,7 @@ from recon.first_guess import contrast_slab, estimate_response
 from recon.image_formation import Linear, Transmission
 from recon.projector import SliceProjector
 from recon.sirt import sirt
+from recon.stages import RunStage, run_stage
 from recon.tilt_series import TiltSeries, VolumeGrid
 from recon.wbp import WINDOWS, wbp
 
@@ -74,22 +75,51 @@ def best_window(
     return max(tried, key=lambda setting: tried[setting])
 
 
-def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid) -> int:
+def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
     """The number of SIRT iterations after which tilts left out are predicted best; later ones fit the noise.
 
     With few tilts, 32.
     """
     if tilt_series.num_tilts < _FEWEST:
         return 32
-    rest, score = _left_out(tilt_series, grid)
-    volume, done, tried = None, 0, dict[int, float]()
-    for count in _ITERATIONS:
-        volume = sirt(rest.line_integrals, rest.projector, num_iterations=count - done, start=volume)
-        done, tried[count] = count, score(volume)
-        best = max(tried, key=lambda number: tried[number])
-        if len([number for number in tried if number > best]) >= _PATIENCE:
-            break
-    return best
+    choice = _IterationChoice(*_left_out(tilt_series, grid))
+    run_stage("choosing the number of iterations", choice)
+    return choice.best
+
+
+class _IterationChoice:
+    """A stage that tries more and more iterations, until the last few numbers were no better than the best."""
+
+    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float]) -> None:
+        self.rest, self.score = rest, score
+        self.volume: Tensor | None = None
+        self.tried: dict[int, float] = {}
+        self.done, self.num_steps = 0, len(_ITERATIONS)
+
+    @property
+    def best(self) -> int:
+        """The best number so far."""
+        return max(self.tried, key=lambda number: self.tried[number])
+
+    def step(self) -> str:
+        """Try the next number."""
+        count, before = _ITERATIONS[self.done], max(self.tried, default=0)
+        lines = self.rest.line_integrals
+        self.volume = sirt(lines, self.rest.projector, num_iterations=count - before, start=self.volume)
+        self.tried[count] = self.score(self.volume)
+        self.done += 1
+        if len([number for number in self.tried if number > self.best]) >= _PATIENCE:
+            self.num_steps = self.done
+        return f"best {self.best}"
+
+    def state(self) -> dict[str, Any]:
+        """Where it is."""
+        return {"volume": self.volume, "tried": self.tried, "done": self.done, "num_steps": self.num_steps}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.volume, self.tried = state["volume"], state["tried"]
+        self.done, self.num_steps = state["done"], state["num_steps"]
 
 
 def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:

@@ -18,6 +18,7 @@ from recon.joint import JointReconstructor, Reconstruction
 from recon.laplace import Laplace
 from recon.presets import PRESETS
 from recon.sirt import sirt
+from recon.stages import Repeated, RunStage, run_stage
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.wbp import WINDOWS, wbp
 
@@ -60,7 +61,7 @@ class Settings:
         seed: of every random choice.
         device: where to compute.
         progress: called with the steps done and a note.
-        run_fit: runs every fit; `Journal.fit` keeps what each has reached.
+        run_fit, run_stage: run every fit and every other long piece of work; a `Journal` keeps what each has reached.
 
     Raises:
         ValueError: a negative weight, no steps, or an unknown window.
@@ -75,6 +76,7 @@ class Settings:
     device: torch.device | str = "cpu"
     progress: Progress | None = None
     run_fit: Callable[..., FitResult] = fit
+    run_stage: RunStage = run_stage
 
     def __post_init__(self) -> None:
         if self.weight is not None and not 0 <= self.weight < np.inf:
@@ -180,10 +182,16 @@ def _wbp_denoised(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings)
 @method("sirt")
 def _sirt(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
     """SIRT; the number of iterations is chosen by tilts left out."""
-    count = settings.num_steps or best_num_iterations(tilt_series, grid)
+    count = settings.num_steps or best_num_iterations(tilt_series, grid, run_stage=settings.run_stage)
     problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
-    volume = sirt(problem.line_integrals, problem.projector, num_iterations=count)
-    return _classical("sirt", problem, volume, grid, {"iterations": count})
+    measured, projector = problem.line_integrals, problem.projector
+    iterations = Repeated(
+        measured.new_zeros(grid.shape),
+        lambda volume, _: sirt(measured, projector, num_iterations=1, start=volume),
+        count,
+    )
+    settings.run_stage("SIRT", iterations)
+    return _classical("sirt", problem, iterations.value, grid, {"iterations": count})
 
 
 @method("wbp")
@@ -199,10 +207,12 @@ def _wbp(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outco
 def _of_preset(name: str) -> Method:
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Outcome:
         preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)
-        volume, state = preset(tilt_series, grid, max_steps=settings.num_steps, progress=settings.progress)
+        state = preset.start(tilt_series, max_steps=settings.num_steps)
+        settings.run_stage(name, state)
+        volume = state.volume(grid)
         problem = LineIntegralProblem.of(tilt_series, grid)
         predicted = problem.predict(torch.from_numpy(volume.attenuation))
-        choices: dict[str, float | str] = {"steps": state.steps, "loss": state.loss}
+        choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
         return Outcome(volume, predicted, name, None, state.noise_model, choices)
 
     return run
@@ -222,7 +232,14 @@ def _after_denoising(
     name: str, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
 ) -> Outcome:
     denoise = find_denoiser(settings.denoiser, tilt_series.images, noise_model=settings.noise_model)
-    clean = replace(tilt_series, images=np.stack([denoise(image) for image in tilt_series.images]))
+
+    def clean_next(images: torch.Tensor, number: int) -> torch.Tensor:
+        images[number] = torch.from_numpy(np.asarray(denoise(tilt_series.images[number]), dtype=np.float32))
+        return images
+
+    cleaned = Repeated(torch.zeros(tilt_series.images.shape), clean_next, tilt_series.num_tilts)
+    settings.run_stage("denoising", cleaned)
+    clean = replace(tilt_series, images=cleaned.value.numpy())
     outcome = method(clean, grid, settings)
     choices: dict[str, float | str] = {"denoiser": settings.denoiser, **outcome.choices}
     return replace(outcome, method=name, choices=choices)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,6 @@ from recon.image_formation import Transmission
 from recon.paper_network import CoordinateDensity, PaperFlow, by_density, stratified
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 
-Progress = Callable[[int, str], None]
 _POINTS_TOGETHER = 2**16
 
 
@@ -59,8 +57,8 @@ class Kniesel2022:
     seed: int = 0
     device: torch.device | str = "cpu"
 
-    def train(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> Iterator[PresetState]:
-        """Train step by step; each yields the state as it is.
+    def start(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> PresetState:
+        """Networks as they are before the first step.
 
         Args:
             tilt_series: the data.
@@ -71,35 +69,26 @@ class Kniesel2022:
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            state = PresetState(self, tilt_series)
-        for step in range(1, min(self.num_steps, max_steps or self.num_steps) + 1):
-            state.step(step)
+            return PresetState(self, tilt_series, min(self.num_steps, max_steps or self.num_steps))
+
+    def train(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> Iterator[PresetState]:
+        """Train step by step, as `start` says; each step yields the state as it is."""
+        state = self.start(tilt_series, max_steps=max_steps)
+        while state.done < state.num_steps:
+            state.step()
             yield state
 
-    def __call__(
-        self,
-        tilt_series: TiltSeries,
-        grid: VolumeGrid,
-        *,
-        max_steps: int | None = None,
-        budget: float = math.inf,
-        progress: Progress | None = None,
-    ) -> tuple[Volume, PresetState]:
-        """Train until done, or for so many steps or seconds, and evaluate the field on the grid."""
-        started = time.perf_counter()
-        for state in self.train(tilt_series, max_steps=max_steps):
-            if progress is not None:
-                progress(state.steps, f"loss {state.loss:.4f}")
-            if time.perf_counter() - started > budget:
-                break
-        return state.volume(grid), state
+    def __call__(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Volume:
+        """Train to the end and evaluate the field on the grid."""
+        *_, state = self.train(tilt_series)
+        return state.volume(grid)
 
 
 class PresetState:
-    """Networks, noise model and optimisers of a running preset."""
+    """Networks, noise model and optimisers of a running preset: a `Stage` of a reconstruction."""
 
-    def __init__(self, preset: Kniesel2022, tilt_series: TiltSeries) -> None:
-        self.preset, self.steps, self.loss = preset, 0, math.nan
+    def __init__(self, preset: Kniesel2022, tilt_series: TiltSeries, num_steps: int) -> None:
+        self.preset, self.done, self.num_steps, self.loss = preset, 0, num_steps, math.nan
         width = preset.width
         self.coarse = CoordinateDensity(frequencies=5, layers=3, width=width, skip=0).to(preset.device)
         self.fine = CoordinateDensity(frequencies=10, layers=9, width=width, skip=5).to(preset.device)
@@ -119,9 +108,31 @@ class PresetState:
         self.images = torch.from_numpy(images).to(preset.device)
         self.theta = torch.from_numpy(np.deg2rad(tilt_series.tilt_angles)).float().to(preset.device)
 
-    def step(self, step: int) -> None:
+    @property
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "coarse": self.coarse,
+            "fine": self.fine,
+            "noise model": self.noise_model,
+            "field optimiser": self.field_optimiser,
+            "noise optimiser": self.noise_optimiser,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """All that the steps to come depend on."""
+        kept = {name: part.state_dict() for name, part in self._parts.items()}
+        return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave."""
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        self.generator.set_state(state["generator"])
+        self.done, self.loss = state["done"], state["loss"]
+
+    def step(self) -> str:
         """One iteration: the coarse network, then the fine one, then all optimisers."""
-        preset = self.preset
+        preset, step = self.preset, self.done + 1
         likelihood = step > preset.l2_steps
         for optimiser, rate in ((self.field_optimiser, preset.field_rate), (self.noise_optimiser, preset.noise_rate)):
             optimiser.param_groups[0]["lr"] = rate * self._decay(step)
@@ -136,7 +147,8 @@ class PresetState:
         if likelihood:
             nn.utils.clip_grad_norm_(self.noise_model.parameters(), 100.0)
             self.noise_optimiser.step()
-        self.steps = step
+        self.done = step
+        return f"loss {self.loss:.4f}"
 
     def _decay(self, step: int) -> float:
         start, stop = self.preset.decay_start, self.preset.num_steps

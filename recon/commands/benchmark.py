@@ -53,4 +53,8 @@ def benchmark(
     if quick:
         scene["tilts"] = "-60:60:4"
     options = Options(size or (48 if quick else 64), scene, effort, again, out, output)
-    output.result({name: BENCHMARKS[name](options) for name in names})
+    try:
+        output.result({name: BENCHMARKS[name](options) for name in names})
+    except KeyboardInterrupt:
+        kept = f"what is finished is kept in {out}; the same command goes on from there"
+        raise KeyboardInterrupt(kept) from None

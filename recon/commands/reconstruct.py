@@ -109,27 +109,23 @@ def reconstruct(
         fixed = load_noise_model(noise_model)
         options |= {"noise_model": fixed, "device": choose_device(device)}
         output.line(memory_line(tilt_series, grid, method, options["device"]))
-        with step_report(json_mode=json) as progress:
-            journal = open_journal(
-                out, settings, resume=resume, interval=checkpoint_interval, report=progress, output=output
-            )
-            started = time.perf_counter()
-            with stoppable(journal, context):
+        journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
+        started = time.perf_counter()
+        with stoppable(journal, context):
+            with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc and report is not None)
-            seconds = time.perf_counter() - started
-        inputs = [path for path in (tilts, angles, noise_model) if path is not None]
-        targets.write(
-            output,
-            tilt_series,
-            outcome,
-            seconds=seconds,
-            inputs=inputs,
-            seed=seed,
-            screening=screening,
-            halves=halves,
-            reference=truth,
-            warned=warned,
-        )
+            targets.write(
+                output,
+                tilt_series,
+                outcome,
+                seconds=time.perf_counter() - started,
+                inputs=[path for path in (tilts, angles, noise_model) if path is not None],
+                seed=seed,
+                screening=screening,
+                halves=halves,
+                reference=truth,
+                warned=warned,
+            )
     journal.discard()
 
 
@@ -140,7 +136,7 @@ def _solve(
     from recon.methods import reconstruct
     from recon.report import even_odd
 
-    options = {**options, "run_fit": journal.fit}
+    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
     outcome = reconstruct(tilt_series, grid, **options, progress=lambda done, note: None)
     if not fsc:
         return outcome, None

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from noiseflow.console import START_AGAIN, end_stopped
+
 if TYPE_CHECKING:
-    from noiseflow.console import Output, StepReport
+    from noiseflow.console import Output
     from recon.checkpoint import Journal
     from recon.tilt_series import TiltSeries, VolumeGrid
 
@@ -28,11 +30,9 @@ class StopSignal:
     """
 
     def __init__(self, journal: Journal) -> None:
-        self._journal, self._report = journal, journal.report
-        self.requested = False
+        self._journal = journal
 
     def __enter__(self) -> StopSignal:
-        self._journal.report = self.report
         self._before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -41,20 +41,15 @@ class StopSignal:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def report(self, title: str, done: int, total: int, note: str) -> None:
-        """Pass the step on; stop here if that was asked for."""
-        if self._report is not None:
-            self._report(title, done, total, note)
-        if self.requested:
-            raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, handler)
 
     def _handle(self, number: int, frame: Any) -> None:
-        if self.requested or not self._journal.in_fit:
-            self._journal.abandoned = True
+        journal = self._journal
+        if journal.stop_requested or not journal.in_fit:
+            journal.abandoned = True
             raise KeyboardInterrupt("stopped at once")
-        self.requested = True
+        journal.stop_requested = True
         print("noiseflow: finishing this step; Ctrl-C again stops at once", file=sys.stderr, flush=True)
 
 
@@ -63,16 +58,14 @@ def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
     """Run fits that can be stopped; says how to go on, and ends with exit code 130.
 
     Raises:
-        typer.Exit: the run was stopped.
+        SystemExit: the run was stopped.
     """
-    try:
-        with StopSignal(journal):
+    with StopSignal(journal):
+        try:
             yield
-    except KeyboardInterrupt as stop:
-        reason = str(stop) or "stopped"
-        advice = f"go on with: {resume_command(context)}" if journal.resumed else "before the first checkpoint"
-        print(f"noiseflow: {reason}; {advice}", file=sys.stderr)
-        raise typer.Exit(130) from None
+        except KeyboardInterrupt as stop:
+            advice = f"go on with: {resume_command(context)}" if journal.resumed else START_AGAIN
+            end_stopped(f"{str(stop) or 'stopped'}; {advice}")
 
 
 def resume_command(context: typer.Context) -> str:
@@ -118,14 +111,12 @@ def memory_line(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: 
     return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
 
 
-def open_journal(
-    out: Path, settings: dict[str, Any], *, resume: bool, interval: float, report: StepReport, output: Output
-) -> Journal:
+def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
     """The journal of the run that makes `out`, beside it. Raises as `Journal`."""
     from recon.checkpoint import Journal
 
     folder = out.with_name(f"{out.name}.checkpoint")
-    journal = Journal(folder, settings, resume=resume, interval=interval, report=report)
+    journal = Journal(folder, settings, resume=resume, interval=interval)
     if resume and not journal.resumed:
         output.line(f"no checkpoint {folder}: starting from the beginning")
     elif journal.exists and not resume:

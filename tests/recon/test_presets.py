@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from recon import methods
+from recon.checkpoint import read_state, write_state
 from recon.commands.options import method_of
 from recon.metrics import compare
 from recon.paper_network import CoordinateDensity, PaperFlow, by_density
 from recon.presets import PRESETS, Kniesel2022, PresetState
 from recon.projector import SliceProjector
 from recon.simulation import Acquisition, clean_tilt_series
+from recon.stages import run_stage
 from recon.tilt_series import TiltSeries, VolumeGrid
 
 SMALL = Kniesel2022(
@@ -72,7 +74,7 @@ def test_rays_see_what_the_projector_projects():
     images = (
         SliceProjector(tilt_angles=angles, depth=size, width=size)(torch.from_numpy(density)).numpy() * 7 * 2 / size
     )
-    state = PresetState(replace(SMALL, rays=400, coarse_samples=400), TiltSeries(np.exp(-images), angles))
+    state = PresetState(replace(SMALL, rays=400, coarse_samples=400), TiltSeries(np.exp(-images), angles), 1)
     state.images = torch.from_numpy(np.exp(-images))
 
     class Blob(torch.nn.Module):
@@ -91,10 +93,9 @@ def test_preset_trains():
     density = (x**2 + y**2 + (z - 0.2) ** 2 < 0.3).astype(np.float32)
     acquisition = Acquisition(None, peak=1.5, intensity=3.0)
     series, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
-    volume, state = SMALL(series, VolumeGrid.of(series))
+    volume = SMALL(series, VolumeGrid.of(series))
     empty = compare(np.zeros_like(density), density).psnr
     assert compare(volume.attenuation / unit, density).psnr > empty + 2
-    assert state.steps == 200
 
 
 def test_a_linear_series_is_refused():
@@ -109,7 +110,21 @@ def test_noise_model_learns_after_the_field():
     before = [parameter.clone() for parameter in next(states).noise_model.parameters()]
     *_, last = states
     assert any(not torch.equal(one, other) for one, other in zip(before, last.noise_model.parameters(), strict=True))
-    assert last.steps == 4
+    assert last.done == 4
+
+
+def test_a_state_goes_on_as_if_never_stopped(tmp_path):
+    series, _ = clean_tilt_series(np.ones((12,) * 3, np.float32), np.arange(-60, 61, 12.0))
+    preset = replace(SMALL, l2_steps=2)
+    *_, whole = preset.train(series, max_steps=6)
+    *_, first = preset.train(series, max_steps=3)
+    write_state(tmp_path / "state.safetensors", first.state())
+    second = preset.start(series, max_steps=6)
+    second.load_state(read_state(tmp_path / "state.safetensors"))
+    run_stage("", second)
+    for part in ("fine", "noise_model"):
+        for one, other in zip(getattr(second, part).parameters(), getattr(whole, part).parameters(), strict=True):
+            torch.testing.assert_close(one, other)
 
 
 def test_presets_are_methods():

@@ -1,11 +1,10 @@
 """A reconstruction that was stopped, by Ctrl-C or by kill -9, goes on and ends in the same volume."""
 
 import json
-import multiprocessing
 import os
 import random
+import re
 import signal
-import sys
 import time
 
 import numpy as np
@@ -14,39 +13,10 @@ import torch
 
 import noiseflow
 import recon.commands.results  # noqa: F401  or every child process would import it again
-from noiseflow.cli import main
+from noiseflow import io
 from recon.checkpoint import Journal, read_state, write_state
-
-FORK = multiprocessing.get_context("fork")
-
-
-def child(arguments, log):
-    """In a process of its own: the command, with all it prints in a file."""
-    torch.set_num_threads(1)
-    with open(log, "w", buffering=1) as stream:
-        sys.stdout = sys.stderr = stream
-        main([str(argument) for argument in arguments])
-
-
-def start(arguments, log):
-    process = FORK.Process(target=child, args=(arguments, log))
-    process.start()
-    return process
-
-
-def finish(arguments, log):
-    process = start(arguments, log)
-    process.join(300)
-    assert process.exitcode == 0, log.read_text()
-    return log.read_text()
-
-
-def wait_for(condition, process, seconds=120):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.is_alive(), "the command ended before it could be stopped"
-        assert time.monotonic() < end, "the command never got there"
-        time.sleep(0.005)
+from recon.stages import Repeated
+from tests.processes import finish, start, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -74,19 +44,32 @@ def assert_same(found, expected):
     assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
 
 
+def kill(process):
+    if process.is_alive():
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+
+
+def require_whole(*outputs):
+    """Outputs are whole or not there."""
+    for path in outputs:
+        if path.exists():
+            noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
+
+
 def kill_and_resume(series, whole, folder, kills, randomness):
     """Kill at random moments; at most one interval is lost each time, so every run gets further than the last."""
     expected, seconds = whole
-    out, more = folder / "volume.npy", []
+    out, model, more = folder / "volume.npy", folder / "model.safetensors", []
     for _ in range(kills):
-        process = start(command(series, out, *more), folder / "log")
+        process = start(command(series, out, "--save-noise-model", model, *more), folder / "log")
         process.join(randomness.uniform(0, 1.1 * seconds / max(1, kills / 3)))
-        if process.is_alive():
-            os.kill(process.pid, signal.SIGKILL)
-            process.join()
+        kill(process)
+        require_whole(out, model)
         more = ["--resume"]
-    finish(command(series, out, *more), folder / "log")
+    finish(command(series, out, "--save-noise-model", model, *more), folder / "log")
     assert_same(np.load(out), expected)
+    require_whole(model)
     assert not (folder / "volume.npy.checkpoint").exists()
 
 
@@ -99,6 +82,40 @@ def test_thirty_kills_at_random_moments_lose_nothing(series, whole, tmp_path):
     for seed in range(6):
         (tmp_path / str(seed)).mkdir()
         kill_and_resume(series, whole, tmp_path / str(seed), 5, random.Random(seed))
+
+
+def steps_told(log):
+    """(title, step, steps) of every line of progress."""
+    found = re.findall(r"^(.*): (\d+)/(\d+), ", log.read_text(), re.MULTILINE)
+    return [(title, int(done), int(total)) for title, done, total in found]
+
+
+@pytest.mark.parametrize("method", ["l2", "sirt", "wbp-denoised"])
+def test_a_kill_loses_no_saved_step(series, tmp_path, method):
+    """With no time between checkpoints, a run goes on with the step after the last one that was told."""
+    out, log = tmp_path / "volume.npy", tmp_path / "log"
+    fast = ["reconstruct", series, "-o", out, "--method", method, "--checkpoint-interval", 0, "--steps", 40]
+    fast += ["--denoiser", "tv"] if method == "wbp-denoised" else []
+    process = start(fast, log)
+    wait_for(lambda: len(steps_told(log)) >= 4, process)
+    kill(process)
+    title, last, total = steps_told(log)[-1]
+    process = start([*fast, "--resume"], tmp_path / "second")
+    wait_for(lambda: len(steps_told(tmp_path / "second")) >= 1, process)
+    kill(process)
+    next_title, first, _ = steps_told(tmp_path / "second")[0]
+    assert last < first <= last + 3 if next_title == title else last >= total - 2
+
+
+def test_sirt_goes_on(series, tmp_path):
+    options = ["--method", "sirt", "--steps", 12, "--checkpoint-interval", 0]
+    finish(["reconstruct", series, "-o", tmp_path / "whole.npy", *options], tmp_path / "log")
+    out = tmp_path / "volume.npy"
+    process = start(["reconstruct", series, "-o", out, *options], tmp_path / "log")
+    wait_for(lambda: len(steps_told(tmp_path / "log")) >= 2, process)
+    kill(process)
+    finish(["reconstruct", series, "-o", out, *options, "--resume"], tmp_path / "log")
+    assert_same(np.load(out), np.load(tmp_path / "whole.npy"))
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
@@ -168,6 +185,23 @@ def test_journal_ends_where_an_unbroken_run_does_wherever_it_stopped(tmp_path):
         found = fits(Journal(tmp_path / str(stop), {}, resume=True))
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_a_stage_that_was_stopped_goes_on(tmp_path):
+    def growing(num_steps):
+        return Repeated(torch.ones(3), lambda value, done: 2 * value + done, num_steps)
+
+    journal = Journal(tmp_path / "run", {})
+    journal.report = lambda title, done, total, note: setattr(journal, "stop_requested", done == 4)
+    with pytest.raises(KeyboardInterrupt, match="after step 4 of 9"):
+        journal.run_stage("growing", growing(9))
+    told = []
+    again, stage = Journal(tmp_path / "run", {}, resume=True, report=lambda *words: told.append(words[1])), growing(9)
+    again.run_stage("growing", stage)
+    assert told == [5, 6, 7, 8, 9]
+    whole = growing(9)
+    Journal(tmp_path / "other", {}).run_stage("growing", whole)
+    assert torch.equal(stage.value, whole.value)
 
 
 def test_first_write_of_a_new_run_replaces_the_old_journal(tmp_path):

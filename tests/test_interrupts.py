@@ -1,0 +1,128 @@
+"""Ctrl-C at any moment of any command: one line, exit code 130, and every file whole or not there."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibration.report
+import noiseflow
+import recon.benchmark_named
+import recon.commands.results
+import recon.streaming
+from noiseflow import io
+from tests.bad_files import make_good_files
+from tests.processes import finish, start
+
+COMMANDS = {
+    "calibrate": "--short {good}/050ms.tif --long {good}/long.tif -o {out}/m.safetensors --report {out}/report",
+    "sample": "{good}/model.safetensors {good}/large.npy -o {out}/noisy.tif",
+    "evaluate": "{good}/model.safetensors --signal {good}/large.npy --observation {good}/noisy.npy --baselines",
+    "simulate": "{out}/new --size 64",
+    "reconstruct": "{good}/series/tilts.mrc -o {out}/v.mrc --method l2 --steps 60 --report {out}/report --fsc",
+    "compare": "{good}/series/truth.mrc {good}/series/truth.mrc --angles {good}/series/tilts.rawtlt --report {out}/report",
+    "benchmark": "--quick --size 12 --out {out}/benchmark",
+    "demo": "--out {out}/demo",
+}
+LOADED = (calibration.report, recon.benchmark_named, recon.commands.results, recon.streaming)
+SPAN = {"sample": 0.3, "simulate": 0.8, "compare": 2.0, "evaluate": 4.0, "reconstruct": 6.0}
+"""Seconds to stop within; about as long as the command takes, or some of the longer ones' many."""
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    assert LOADED  # in this process, so that a forked one need not import them
+    folder = tmp_path_factory.mktemp("good")
+    make_good_files(folder)
+    np.save(folder / "large.npy", np.random.default_rng(0).random((700, 700)))
+    np.save(folder / "noisy.npy", np.random.default_rng(1).random((700, 700)))
+    finish(["simulate", folder / "series", "--size", 24, "--tilts=-60:60:6"], folder / "log")
+    return folder
+
+
+def words(name: str, good: Path, out: Path) -> list[str]:
+    return COMMANDS[name].format(good=good, out=out).split()
+
+
+def require_whole(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        assert not path.name.startswith("."), path
+        if path.suffix == ".safetensors" and "checkpoint" not in str(path):
+            noiseflow.load(path)
+        elif path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".html":
+            assert path.read_text().rstrip().endswith("</html>")
+        elif path.suffix in io.SUFFIXES:
+            io.read(path)
+
+
+def stop(name: str, good: Path, out: Path, moment: float, times: int = 1) -> None:
+    log = out.with_suffix(".log")
+    process = start([name, *words(name, good, out)], log)
+    process.join(0.02 + moment)
+    for _ in range(times):
+        if process.is_alive():
+            os.kill(process.pid, signal.SIGINT)
+            time.sleep(0.001)
+    process.join(60)
+    printed = log.read_text()
+    assert process.exitcode in (0, 130), f"{process.exitcode}: {printed}"
+    assert "Traceback" not in printed
+    if process.exitcode == 130:
+        last = (printed.strip().splitlines() or [""])[-1]
+        assert re.match(r"noiseflow: .*(starts again|goes on from there|go on with: noiseflow .* --resume)$", last), (
+            printed
+        )
+    require_whole(out)
+
+
+def stops(name: str, good: Path, folder: Path, count: int, times: int, randomness: random.Random) -> None:
+    for number in range(count):
+        out = folder / str(number)
+        out.mkdir()
+        stop(name, good, out, randomness.uniform(0, SPAN.get(name, 10.0)), times)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_ctrl_c_leaves_whole_files_and_one_line(name: str, good: Path, tmp_path: Path) -> None:
+    stops(name, good, tmp_path, 1, 1, random.Random(name))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_ctrl_c_at_any_moment(name: str, times: int, good: Path, tmp_path: Path) -> None:
+    stops(name, good, tmp_path, 10, times, random.Random(times))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_program_that_is_stopped_ends_with_130(number: signal.Signals, good: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "noiseflow.cli",
+        "reconstruct",
+        good / "series" / "tilts.mrc",
+        "-o",
+        tmp_path / "v.mrc",
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "memory: about" in process.stdout.readline()
+        process.send_signal(number)
+        _, printed = process.communicate(timeout=60)
+    assert process.returncode == 130, printed
+    assert printed.strip().splitlines()[-1].startswith("noiseflow: ")
+    assert "Traceback" not in printed
+    assert not (tmp_path / "v.mrc").exists()
