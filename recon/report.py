@@ -115,6 +115,8 @@ def _evidence(name: str, outcome: Outcome) -> str:
         return "estimated from the images, then learnt in the fit"
     if name in ("tilts left out", "beam drift"):
         return "each tilt against a coarse volume of the others"
+    if name in ("tilt axis (°)", "axis offset (pixels)", "largest shift (pixels)"):
+        return "where volumes explain tilts left out of them best"
     return "set by the method" if outcome.method != "joint" else "found from the data"
 
 

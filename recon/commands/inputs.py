@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
+from noiseflow.console import Output, StepReport
+from recon.alignment import Alignment
+from recon.alignment_search import find_alignment
 from recon.commands.options import parse_mode
 from recon.contrast import check_contrast
 from recon.contrast import invert_contrast as inverted
@@ -55,13 +58,64 @@ def load_tilt_series(
     return series
 
 
-def screened(tilt_series: TiltSeries, *, keep_tilts: bool) -> tuple[TiltSeries, Screening]:
-    """The tilts that belong to the series, with their beam where it drifts; a warning names those left out.
+@dataclass(frozen=True)
+class Prepared:
+    """A tilt series ready to reconstruct, and what was found on the way.
+
+    Attributes:
+        tilt_series: aligned, without the tilts that do not belong.
+        screening: how well every tilt fits the others.
+        alignment: of the raw images, where they were moved.
+    """
+
+    tilt_series: TiltSeries
+    screening: Screening
+    alignment: Alignment | None
+
+    @property
+    def choices(self) -> dict[str, float | str]:
+        """What a table of results shows."""
+        return ({} if self.alignment is None else self.alignment.choices()) | self.screening.choices()
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, tilt by tilt, for programs."""
+        return {
+            "screening": self.screening.as_dict(),
+            "alignment": None if self.alignment is None else self.alignment.as_dict(),
+        }
+
+
+def prepare(
+    tilt_series: TiltSeries,
+    *,
+    tilt_axis: float | None,
+    refine_alignment: bool,
+    keep_tilts: bool,
+    device: str,
+    output: Output,
+    report: StepReport | None = None,
+) -> Prepared:
+    """Align the images as asked for, and judge every tilt by the others; a warning names those left out.
 
     Args:
-        tilt_series: the series.
-        keep_tilts: only warn, and leave none out.
+        tilt_series: as read.
+        tilt_axis: direction of the tilt axis in the images, degrees; None for y, or to have it found.
+        refine_alignment: find axis and shifts.
+        keep_tilts: only warn of tilts that do not belong.
+        device: where to compute.
+        output: told what was found.
+        report: told of the progress.
     """
+    alignment = None
+    if refine_alignment:
+        alignment = find_alignment(tilt_series, tilt_axis=tilt_axis, device=device, progress=report)
+        output.line(alignment.in_words())
+    elif tilt_axis is not None:
+        if not np.isfinite(tilt_axis):
+            raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")
+        alignment = Alignment(tilt_axis, np.zeros((tilt_series.num_tilts, 2)), tilt_series.tilt_angles)
+    if alignment is not None:
+        tilt_series = alignment.apply(tilt_series)
     found = screen(tilt_series)
     if found.bad.any():
         angles = tilt_series.tilt_angles[found.bad]
@@ -69,7 +123,7 @@ def screened(tilt_series: TiltSeries, *, keep_tilts: bool) -> tuple[TiltSeries, 
         what = f"{len(angles)} of {tilt_series.num_tilts} tilts do not fit the volume of the others: {named}"
         advice = "kept (--keep-tilts)" if keep_tilts else "left out (--keep-tilts keeps them)"
         warnings.warn(f"{what}; {advice}", stacklevel=2)
-    return found.passed(tilt_series, keep=keep_tilts), found
+    return Prepared(found.passed(tilt_series, keep=keep_tilts), found, alignment)
 
 
 def _read_mask(path: Path) -> NDArray[Any]:

@@ -62,6 +62,15 @@ def reconstruct(
     ] = False,
     mask: Annotated[Path | None, typer.Option(help="Image or stack, 0 at the pixels to leave out of the fit.")] = None,
     mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave NaN and infinite pixels out.")] = False,
+    refine_alignment: Annotated[
+        bool, typer.Option("--refine-alignment", help="Find the tilt axis and the shift of every image first.")
+    ] = False,
+    tilt_axis: Annotated[
+        float | None,
+        typer.Option(
+            help="Direction of the tilt axis in the images, degrees from y (up) anticlockwise; with --refine-alignment, roughly."
+        ),
+    ] = None,
     keep_tilts: Annotated[
         bool, typer.Option("--keep-tilts", help="Leave no tilt out, though it does not fit the others.")
     ] = False,
@@ -83,7 +92,7 @@ def reconstruct(
 
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
-    from recon.commands.inputs import load_tilt_series, screened
+    from recon.commands.inputs import load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.report import read_reference
     from recon.tilt_series import VolumeGrid
@@ -100,7 +109,17 @@ def reconstruct(
             mask=mask,
             mask_nan=mask_nan,
         )
-        tilt_series, screening = screened(tilt_series, keep_tilts=keep_tilts)
+        with step_report(json_mode=json) as progress:
+            prepared = prepare(
+                tilt_series,
+                tilt_axis=tilt_axis,
+                refine_alignment=refine_alignment,
+                keep_tilts=keep_tilts,
+                device=choose_device(device),
+                output=output,
+                report=progress,
+            )
+        tilt_series = prepared.tilt_series
         grid, method = VolumeGrid.of(tilt_series, thickness), method_of(method, preset)
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
@@ -121,7 +140,7 @@ def reconstruct(
                 seconds=time.perf_counter() - started,
                 inputs=[path for path in (tilts, angles, noise_model) if path is not None],
                 seed=seed,
-                screening=screening,
+                prepared=prepared,
                 halves=halves,
                 reference=truth,
                 warned=warned,

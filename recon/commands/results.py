@@ -12,9 +12,9 @@ import noiseflow
 from noiseflow import io
 from noiseflow.console import Output
 from noiseflow.model_files import MODEL_SUFFIXES
+from recon.commands.inputs import Prepared
 from recon.methods import Outcome
 from recon.report import reconstruction_report
-from recon.screening import Screening
 from recon.tilt_series import TiltSeries, Volume
 
 
@@ -51,13 +51,13 @@ class Targets:
         seconds: float,
         inputs: Sequence[Path],
         seed: int,
-        screening: Screening,
+        prepared: Prepared,
         halves: tuple[Volume, Volume] | None = None,
         reference: Volume | None = None,
         warned: Sequence[str] = (),
     ) -> None:
         """Write what was asked for and tell what was found."""
-        outcome = replace(outcome, choices=outcome.choices | screening.choices())
+        outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
         outcome.volume.write(self.volume)
         if self.noise_model is not None:
@@ -76,7 +76,7 @@ class Targets:
         output.result(
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
-            | {"screening": screening.as_dict()}
+            | prepared.as_dict()
             | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
         )
 
