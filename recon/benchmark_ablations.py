@@ -13,7 +13,7 @@ from torch import nn
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation, fit
 from recon.benchmark import Cell, Results, Scene, make_scene
 from recon.benchmark_network import WIDTHS, fit_network
-from recon.benchmark_search import Array, Best, back_projections, best, denoised, fits
+from recon.benchmark_search import Array, Best, back_projections, best, best_fit, denoised
 from recon.external import missing
 from recon.fields import MultiresolutionField, VoxelField
 from recon.joint import JointReconstructor
@@ -24,7 +24,6 @@ WEIGHT = 0.4
 """Of the total variation, where it is the same for all variants."""
 
 DENOISERS = ("nlm", "tv", "wavelet", "wiener", "bm3d")
-_LADDER = (0.1, 0.2, 0.4, 0.8)
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def _score(scene: Scene) -> Callable[[Array], float]:
 
 
 def _searched(scene: Scene, **options: Any) -> Best:
-    return best(fits(scene.noisy, scene.grid, JointReconstructor(**options), _LADDER), _score(scene))
+    return best_fit(scene.noisy, scene.grid, JointReconstructor(**options), _score(scene))
 
 
 def _once(scene: Scene, **options: Any) -> Best:
@@ -106,8 +105,7 @@ def _denoisers(scene: Scene) -> list[Variant]:
             )
 
         def least_squares(series: Callable[[], Any] = series) -> Best:
-            reconstructor = JointReconstructor(noise_model=Gaussian)
-            return best(fits(series(), scene.grid, reconstructor, _LADDER), _score(scene))
+            return best_fit(series(), scene.grid, JointReconstructor(noise_model=Gaussian), _score(scene))
 
         found.append(Variant("denoiser, then WBP", denoiser, back_projected, scene))
         found.append(Variant("denoiser, then L2", denoiser, least_squares, scene))

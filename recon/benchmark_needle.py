@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ import torch
 import noiseflow
 from noiseflow import Gaussian, SignalDependentGaussian, fit
 from recon.benchmark import Cell, Results
-from recon.benchmark_search import Array, Candidate, back_projections, best, denoised, fits, sirts
+from recon.benchmark_search import Array, Best, back_projections, best, best_fit, denoised, sirts
 from recon.comparison import project
 from recon.fields import VoxelField
 from recon.joint import JointReconstructor
@@ -68,27 +68,27 @@ def split(series: TiltSeries, noise: str, gap: str, *, seed: int) -> Split:
     return Split(whole.select(~out), whole.select(out), target[out])
 
 
-def methods(given: TiltSeries) -> dict[str, Callable[[], Iterator[Candidate]]]:
-    """Candidates by method; the joint fits choose by themselves and come last."""
+def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Callable[[], Best]]:
+    """The best volume by method and score; the joint fits choose by themselves and come last."""
     grid = VolumeGrid.of(given)
-
-    def joint(**options: Any) -> Iterator[Candidate]:
-        result = JointReconstructor(**options)(given, grid)
-        yield f"chose weight {result.signal_model.weight:.3g}", result.volume.attenuation
-
     least_squares = JointReconstructor(noise_model=Gaussian)
     voxels = replace(least_squares, make_field=VoxelField)
+
+    def once(reconstructor: JointReconstructor, words: str) -> Best:
+        result = reconstructor(given, grid)
+        return Best(f"{words}weight {result.signal_model.weight:.3g}", result.volume.attenuation, {})
+
     return {
-        "WBP": lambda: back_projections(given, grid),
-        "SIRT": lambda: sirts(given, grid),
-        "WBP, denoised (nlm)": lambda: back_projections(denoised(given, "nlm"), grid),
-        "L2, voxels, no TV": lambda: fits(given, grid, voxels, (0.0,)),
-        "L2 + TV, voxels": lambda: fits(given, grid, voxels),
-        "L2 + TV": lambda: fits(given, grid, least_squares),
-        "L1 + TV": lambda: fits(given, grid, JointReconstructor(noise_model=Laplace)),
-        "L2 + TV, denoised (nlm)": lambda: fits(denoised(given, "nlm"), grid, least_squares),
-        "joint, voxels": lambda: joint(make_field=VoxelField),
-        "joint": joint,
+        "WBP": lambda: best(back_projections(given, grid), score),
+        "SIRT": lambda: best(sirts(given, grid), score),
+        "WBP, denoised (nlm)": lambda: best(back_projections(denoised(given, "nlm"), grid), score),
+        "L2, voxels, no TV": lambda: once(replace(voxels, weight=0.0), ""),
+        "L2 + TV, voxels": lambda: best_fit(given, grid, voxels, score),
+        "L2 + TV": lambda: best_fit(given, grid, least_squares, score),
+        "L1 + TV": lambda: best_fit(given, grid, JointReconstructor(noise_model=Laplace), score),
+        "L2 + TV, denoised (nlm)": lambda: best_fit(denoised(given, "nlm"), grid, least_squares, score),
+        "joint, voxels": lambda: once(JointReconstructor(make_field=VoxelField), "chose "),
+        "joint": lambda: once(JointReconstructor(), "chose "),
     }
 
 
@@ -99,15 +99,14 @@ def run(results: Results, line: Callable[[str], None], *, quick: bool, seed: int
         for gap in list(GAPS)[:1] if quick else GAPS:
             parts = split(series, noise, gap, seed=seed)
             line(f"needle, {noise}, tilts left out: {gap}; {parts.given.num_tilts} tilts given")
-            for name, candidates in methods(parts.given).items():
+            for name, make in methods(parts.given, partial(_psnr, parts)).items():
                 if quick and "TV" in name:
                     continue
-                cell = results.cell(f"{noise}/{gap}/{name}", lambda p=parts, c=candidates: _judged(p, c()))  # type: ignore[misc]
+                cell = results.cell(f"{noise}/{gap}/{name}", lambda p=parts, m=make: _judged(p, m()))  # type: ignore[misc]
                 line(f"  {name}: {cell['psnr']:.2f} dB, {cell['nll']:.4f} nats per pixel ({cell['setting']})")
 
 
-def _judged(parts: Split, candidates: Iterator[Candidate]) -> Cell:
-    found = best(candidates, lambda volume: _psnr(parts, volume))
+def _judged(parts: Split, found: Best) -> Cell:
     predicted = predict(parts.given, found.volume, parts.left_out.tilt_angles)
     return {
         "setting": found.setting,

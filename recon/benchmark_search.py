@@ -15,12 +15,13 @@ from recon.joint import JointReconstructor
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries, VolumeGrid
 from recon.wbp import WINDOWS, wbp
+from recon.weight import choose_weight
 
 Array = NDArray[Any]
 Candidate = tuple[str, Array]
 CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
-ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128)
-WEIGHTS = (0.05, 0.1, 0.2, 0.4, 0.8)
+ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+FIRST_WEIGHT = 0.2
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,35 @@ def sirts(tilt_series: TiltSeries, grid: VolumeGrid) -> Iterator[Candidate]:
         yield f"{count} iterations", volume.numpy()
 
 
-def fits(
+def best_fit(
     tilt_series: TiltSeries,
     grid: VolumeGrid,
     reconstructor: JointReconstructor,
-    weights: Sequence[float] = WEIGHTS,
-) -> Iterator[Candidate]:
-    """Fits by weight of the total variation."""
-    for weight in weights:
-        result = replace(reconstructor, weight=weight)(tilt_series, grid)
-        yield f"weight {weight:g}", result.volume.attenuation
+    score: Callable[[Array], float],
+    *,
+    first: float = FIRST_WEIGHT,
+) -> Best:
+    """The fit at the weight of the total variation of the highest score: bracketed in steps of two, then interpolated.
+
+    Args:
+        tilt_series: the data.
+        grid: the lattice.
+        reconstructor: whose weight is searched.
+        score: of a volume.
+        first: where to begin.
+    """
+    found: dict[float, Array] = {}
+    scores: dict[float, float] = {}
+
+    def loss(weight: float) -> float:
+        found[weight] = replace(reconstructor, weight=weight)(tilt_series, grid).volume.attenuation
+        scores[weight] = score(found[weight])
+        return -scores[weight]
+
+    loss(choose_weight(loss, first).weight)
+    weight = max(scores, key=lambda each: scores[each])
+    tried = {f"weight {each:.3g}": scores[each] for each in sorted(scores)}
+    return Best(f"weight {weight:.3g}", found[weight], tried)
 
 
 def denoised(tilt_series: TiltSeries, denoiser: str) -> TiltSeries:

@@ -1,7 +1,7 @@
 """Benchmarks: cells are computed once and kept, settings are searched, timing is in turn, rivals stand the right way round."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +14,7 @@ from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchm
 from recon.benchmark import Results, in_turn, make_scene, plain
 from recon.benchmark_network import fit_network
 from recon.benchmark_rivals import Effort, best_cutoff, curves, own_sirt, summary, table
-from recon.benchmark_search import best
+from recon.benchmark_search import Best, best, best_fit
 from recon.commands.benchmark import benchmark
 from recon.comparison import project
 from recon.external import _oriented, astra_sirt, missing
@@ -179,7 +179,7 @@ class Perfect:
 
 def test_paper_table_has_every_method(tmp_path, monkeypatch):
     scene, results = make_scene(16, **TINY), Results(tmp_path / "r.json", "paper-table")
-    monkeypatch.setattr(benchmark_paper, "fits", lambda *_: [("any", scene.truth * 0.9)])
+    monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("any", scene.truth * 0.9, {}))
     monkeypatch.setattr(benchmark_paper, "denoised", lambda series, name: series)
     monkeypatch.setattr(benchmark_paper, "JointReconstructor", Perfect)
     benchmark_paper.run(scene, results, lambda text: None)
@@ -238,3 +238,19 @@ def test_network_on_the_lattice_learns():
         for volume in (few, more)
     ]
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_weight_of_the_highest_score_is_bracketed():
+    def score(volume):
+        return -(np.log(float(volume.mean()) / 0.9) ** 2)
+
+    @dataclass(frozen=True)
+    class Constant:
+        weight: float = 0.0
+
+        def __call__(self, series, grid):
+            return SimpleNamespace(volume=Volume(np.full((2, 2, 2), self.weight), None))
+
+    found = best_fit(None, None, Constant(), score)
+    assert found.volume[0, 0, 0] == pytest.approx(0.9, rel=0.05)
+    assert not found.at_an_end
