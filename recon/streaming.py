@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from recon.defocus import defocused
 from recon.phantoms import make_phantom
 from recon.projector import SliceProjector
 from recon.simulation import Acquisition, draw_noise, stored_type
@@ -36,6 +37,7 @@ class Simulation:
         acquisition: how images are formed.
         noise_model: the noise on the ``clean`` stack, or None.
         seed: of the phantom and of the noise.
+        defocus: blur of the ``clean`` stack away from the tilt axis, see `recon.defocus.defocus_widths`; the others stay sharp.
     """
 
     phantom: str
@@ -44,6 +46,7 @@ class Simulation:
     acquisition: Acquisition
     noise_model: nn.Module | None = None
     seed: int = 0
+    defocus: float = 0.0
 
     @property
     def num_steps(self) -> int:
@@ -124,8 +127,10 @@ class _Writer:
     def _read_out(self, name: str, factor: float) -> None:
         plan = self.simulation
         with mrcfile.mmap(self.folder / f"{name}.mrc", "r+") as clean:
-            for image in clean.data:
+            for image, angle in zip(clean.data, plan.angles[name], strict=True):
                 image[:] = plan.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
+                if name == "clean":
+                    image[:] = defocused(image, float(angle), plan.defocus)
                 self._step("reading out")
             if name == "clean":
                 self._add_noise(clean.data)

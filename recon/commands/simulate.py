@@ -34,6 +34,12 @@ def simulate(
     clip: Annotated[
         bool, typer.Option("--clip", help="Clip readings to the range from zero to the brightest signal there can be.")
     ] = False,
+    defocus: Annotated[
+        float,
+        typer.Option(
+            help="Blur of the tilts, growing with tilt and distance from the axis: pixels per pixel out of focus, such as 0.02."
+        ),
+    ] = 0.0,
     mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
@@ -46,6 +52,8 @@ def simulate(
     output = Output(json)
     if size < 4:
         raise ValueError(f"--size {size}: give at least 4 voxels")
+    if not 0 <= defocus <= 1:
+        raise ValueError(f"--defocus {defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
     angles = tilt_range(tilts)
     if len(angles) < 2:
         raise ValueError(f"--tilts {tilts}: a tilt series needs at least two tilts")
@@ -59,7 +67,7 @@ def simulate(
     }
     num_images = sum(map(len, stacks.values())) + len(angles)
     io.check_folder(folder, num_bytes=4 * size**2 * (size + num_images))
-    simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed)
+    simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
     with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
         simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import noiseflow
 from recon import streaming
 from recon.commands.simulate import simulate
+from recon.defocus import defocused
 from recon.phantoms import make_phantom
 from recon.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range
 from recon.streaming import Simulation
@@ -98,6 +99,8 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path):
         (["--noise", "none", "--clip"], "choose a --noise"),
         (["--noise", "8-bit", "--clip"], "rails of its own"),
         (["--tilts=0:0:1"], "two tilts"),
+        (["--defocus", -0.1], "0 to 1"),
+        (["--defocus", "nan"], "0 to 1"),
         (["--size", 4], "too small"),
     ],
 )
@@ -115,3 +118,14 @@ def test_angles_between_tilts_are_spread_evenly():
     assert between[-1] == 59
     assert np.diff(between).max() < 1.5 * np.diff(between).min()
     assert len(angles_between(np.array([0.0, 1.0, 2.0]), 10, share=0.5)) == 2
+
+
+def test_defocus_blurs_the_tilts_and_not_the_images_to_judge_by(tmp_path):
+    for name, options in (("sharp", []), ("blurred", ["--defocus", 0.2])):
+        run(tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options, "--json")
+    sharp, blurred = (data(tmp_path / name / "clean.mrc") for name in ("sharp", "blurred"))
+    np.testing.assert_array_equal(blurred[2], sharp[2])
+    np.testing.assert_allclose(blurred[0], defocused(sharp[0], -60.0, 0.2), rtol=1e-5)
+    assert np.abs(blurred[0] - sharp[0]).max() > 0.05
+    np.testing.assert_array_equal(data(tmp_path / "blurred" / "test.mrc"), data(tmp_path / "sharp" / "test.mrc"))
+    np.testing.assert_array_equal(data(tmp_path / "blurred" / "tilts.mrc"), blurred)
