@@ -40,6 +40,8 @@ Progress = Callable[[int, str], None]
 _FIRST_WEIGHT = 0.4
 _CLIPPED = 0.02
 _TOLERATED = 0.003
+_FIRST_TURN, _SECOND_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the first turn's
+_EXACT_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,10 @@ class JointReconstructor:
 
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None]:
         """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
-        rows = contrast_slab(tilt_series, self.slab)
         given = None if self.noise_model is None else self.noise_model().to(self.device)
+        if given is not None and self.weight is not None and not _learns(given):
+            return given, None
+        rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
         field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
         field.start_from(whole.field.volume()[:, rows])
@@ -210,7 +214,8 @@ class _Task:
     ) -> FitResult:
         """Fit the signal to the noise model as it is, twice, and the noise model to the signal as it is in between.
 
-        Each turn ends at a small learning rate. Learning both at once from a rough start lets the mean of a heavy-tailed noise
+        Each turn ends at a small learning rate, and the second starts at a smaller one: the incident intensity would overshoot
+        again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
         wander with the few outliers of each batch, and drags the signal along.
 
         Args:
@@ -222,16 +227,32 @@ class _Task:
         if standardise:
             self.refine(noise_model, standardise=True)
         with _frozen(noise_model):
-            first = self.fit(noise_model, num_steps=num_steps // 2, standardise=False, progress=progress)
+            first = self.fit(
+                noise_model, num_steps=round(_FIRST_TURN * num_steps), standardise=False, progress=progress
+            )
         self.refine(noise_model)
         later = None if progress is None else lambda step, note: progress(first.num_steps + step, note)
+        rate = self.signal_model.learning_rate
+        self.signal_model.learning_rate = rate * _SECOND_TURN
         with _frozen(noise_model):
-            return self.fit(noise_model, num_steps=num_steps - num_steps // 2, standardise=False, progress=later)
+            second = self.fit(noise_model, num_steps=num_steps - first.num_steps, standardise=False, progress=later)
+        self.signal_model.learning_rate = rate
+        return second
 
     def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
         """Fit a noise model that learns to the signal as it is."""
-        if any(parameter.requires_grad for parameter in noise_model.parameters()):
-            self.fit(noise_model, known=True, num_steps=60, standardise=standardise)
+        if _learns(noise_model):
+            self.fit(noise_model, known=True, num_steps=_num_steps(noise_model, 60), standardise=standardise)
+
+
+def _learns(noise_model: nn.Module) -> bool:
+    return any(parameter.requires_grad for parameter in noise_model.parameters())
+
+
+def _num_steps(noise_model: nn.Module, usual: int) -> int:
+    """The exact sum over electrons takes long, but it starts at its most likely parameters."""
+    exact = any(isinstance(module, PoissonGaussian) for module in noise_model.modules())
+    return min(usual, _EXACT_STEPS) if exact else usual
 
 
 def _learning_rate(noise_model: nn.Module) -> float:
@@ -243,7 +264,10 @@ def _learning_rate(noise_model: nn.Module) -> float:
 def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
     """The simplest that predicts held-out pixels nearly as well as the best: what a richer one gains beyond may be a bias of the
     signal that it took for noise."""
-    nll = [task.fit(model.to(task.observation.device), known=True, num_steps=100).held_out_nll for model in candidates]
+    device = task.observation.device
+    nll = [
+        task.fit(model.to(device), known=True, num_steps=_num_steps(model, 100)).held_out_nll for model in candidates
+    ]
     return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
 
 

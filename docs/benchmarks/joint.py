@@ -1,132 +1,79 @@
-"""Joint fit against least squares at its best weight, and against the oracle that is told the true noise.
+"""The joint reconstruction: its accuracy against the oracle and least squares, the choice of its field, and its speed.
 
-    python docs/benchmarks/joint.py                              # the 96³ scene of the README
-    python docs/benchmarks/joint.py --size 64 --seeds 0 1 2      # others
+    python docs/benchmarks/joint.py accuracy [--phantom shells] [--noise clipped]     # 25 rows; those already there are kept
+    python docs/benchmarks/joint.py fields [--phantom shells]         # which field is best when the true noise is known
+    python docs/benchmarks/joint.py speed [--row joint]               # ratios in one run; wants a quiet machine
+    python docs/benchmarks/joint.py page                              # joint.md from the JSON
+    python docs/benchmarks/joint.py accuracy --size 64 --tilts=-58.5:58.5:3 --out FILE      # other scenes
 
-For each scene: least squares + total variation at the best of many weights, with the incident intensity learnt and
-known (the better one counts); the oracle, the same field and regulariser with the true noise, at its best weight; and
-the joint fit as a user gets it, with no knowledge of either. Best weights are found by looking at the truth, which only
-the rivals may do. PSNR is over the range of the truth, without any rescaling.
+Each row is saved when it is done, in results/joint.json beside this file, and is not computed again: remove it there, or name
+another file with --out. PSNR is over the range of the truth, without any rescaling. Best weights are found by looking at the
+truth, which only the rivals may do. ASTRA comes with the extra: python -m pip install 'noiseflow[benchmark]'.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-import numpy as np
+import joint_page
+import joint_speed
 import torch
-from torch import nn
+from joint_accuracy import NOISES, PHANTOMS, accuracy, fields
 
-from noiseflow import Gaussian
 from noiseflow.console import Output
-from recon.joint import JointReconstructor
-from recon.metrics import compare
-from recon.phantoms import PHANTOMS, make_phantom
-from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series, tilt_range
-from recon.tilt_series import TiltSeries
+from recon.benchmark import Results
 
-HEADER = ("method", "weight", "volume PSNR", "projection PSNR", "seconds")
-
-
-@dataclass(frozen=True)
-class Scene:
-    truth: np.ndarray
-    clean: TiltSeries
-    noisy: TiltSeries
-
-
-@dataclass(frozen=True)
-class Score:
-    weight: float
-    volume: float
-    projections: float
-    seconds: float
-
-    def row(self, name: str) -> tuple[str, ...]:
-        return name, f"{self.weight:.3g}", f"{self.volume:.2f}", f"{self.projections:.2f}", f"{self.seconds:.1f}"
-
-
-def make_scene(phantom: str, noise: str, size: int, tilts: str, seed: int) -> Scene:
-    density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
-    acquisition = ACQUISITIONS[noise]
-    clean, unit = clean_tilt_series(density, tilt_range(tilts), acquisition=acquisition)
-    return Scene(density * unit, clean, add_noise(clean, true_noise(noise), seed=seed + 1))
-
-
-def true_noise(name: str) -> nn.Module:
-    make = ACQUISITIONS[name].noise
-    if make is None:
-        raise ValueError(f"{name} has no noise to learn")
-    return make()
-
-
-def score(reconstructor: JointReconstructor, scene: Scene) -> Score:
-    started = time.perf_counter()
-    result = reconstructor(scene.noisy)
-    seconds = time.perf_counter() - started
-    volume = compare(result.volume.attenuation, scene.truth).psnr
-    return Score(result.signal_model.weight, volume, compare(result.projections, scene.clean.images).psnr, seconds)
-
-
-def best_weight(reconstructor: JointReconstructor, scene: Scene) -> Score:
-    """The highest volume PSNR over weights, from a coarse ladder refined twice around its best rung."""
-    scores: dict[float, Score] = {}
-
-    def visit(weights: Iterable[float]) -> float:
-        for weight in weights:
-            if weight not in scores:
-                scores[weight] = score(replace(reconstructor, weight=weight), scene)
-        return max(scores, key=lambda weight: scores[weight].volume)
-
-    best = visit([0.03, 0.1, 0.3, 1.0])
-    for step in (math.sqrt(10 / 3), (10 / 3) ** 0.25):
-        best = visit([best / step, best, best * step])
-    return scores[best]
-
-
-def rivals(noise: str) -> dict[str, Callable[[Scene], Score]]:
-    least_squares = JointReconstructor(noise_model=Gaussian)
-    oracle = JointReconstructor(noise_model=lambda: true_noise(noise))
-
-    def of_two(reconstructor: JointReconstructor) -> Callable[[Scene], Score]:
-        def run(scene: Scene) -> Score:
-            variants = (replace(reconstructor, estimate_response=estimate) for estimate in (True, False))
-            return max((best_weight(variant, scene) for variant in variants), key=lambda found: found.volume)
-
-        return run
-
-    return {
-        "least squares, best weight": of_two(least_squares),
-        "joint": lambda scene: score(JointReconstructor(), scene),
-        "oracle, best weight": lambda scene: best_weight(oracle, scene),
-    }
+RESULTS = Path(__file__).parent / "results" / "joint.json"
+SPEED: dict[str, Callable[[], dict[str, Any]]] = {
+    "joint": lambda: joint_speed.joint(96),
+    "scaling": lambda: joint_speed.scaling([64, 96, 128, 192]),
+    "scaling-quick": lambda: joint_speed.scaling([64, 96, 128]),
+    "projector-128": lambda: joint_speed.projector(128),
+    "projector-256": lambda: joint_speed.projector(256),
+}
 
 
 def main() -> None:
+    """Run the chosen rows, save each, and draw the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("accuracy", "fields", "speed", "page"))
+    parser.add_argument("--phantom", action="append", choices=PHANTOMS)
+    parser.add_argument("--noise", action="append", choices=NOISES)
+    parser.add_argument("--row", action="append", choices=SPEED, help="of the speed rows; all by default")
     parser.add_argument("--size", type=int, default=96)
-    parser.add_argument("--tilts", default="-59.5:58:1.5", help="START:STOP:STEP in degrees; 79 tilts by default")
-    parser.add_argument("--phantoms", nargs="+", default=["shells"], choices=list(PHANTOMS))
-    parser.add_argument(
-        "--noises", nargs="+", default=["clipped"], choices=[name for name in ACQUISITIONS if name != "none"]
-    )
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--tilts", default=joint_speed.TILTS, help="START:STOP:STEP in degrees; 79 tilts by default")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    output = Output(json_mode=False)
-    for phantom in arguments.phantoms:
-        for noise in arguments.noises:
-            for seed in arguments.seeds:
-                scene = make_scene(phantom, noise, arguments.size, arguments.tilts, seed)
-                psnr = compare(scene.noisy.images, scene.clean.images).psnr
-                output.line(f"\n{phantom}, {noise} noise (images {psnr:.1f} dB), {arguments.size}³, seed {seed}")
-                output.table(HEADER, [run(scene).row(name) for name, run in rivals(noise).items()])
+    parser.add_argument("--out", type=Path, default=RESULTS, help="JSON file; by default the one of the page")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    results, output = Results(options.out, "joint reconstruction"), Output(json_mode=False)
+    scene = {"size": options.size, "tilts": options.tilts, "seed": options.seed}
+    name = f"{options.size}/{options.tilts}/{options.seed}"
+    if options.part == "accuracy":
+        for phantom in options.phantom or PHANTOMS:
+            for noise in options.noise or NOISES:
+                row = results.cell(
+                    f"accuracy/{phantom}/{noise}/{name}", lambda p=phantom, n=noise: accuracy(p, n, **scene)
+                )
+                output.line(joint_page.accuracy_line(row))
+    if options.part == "fields":
+        for phantom in options.phantom or PHANTOMS:
+            row = results.cell(f"fields/{phantom}/{name}", lambda p=phantom: fields(p, **scene))
+            output.line(str(row))
+    if options.part == "speed":
+        for which in options.row or SPEED:
+            output.line(f"{which}: {results.cell(f'speed/{which}', SPEED[which])}")
+    if options.part == "page":
+        joint_page.write(results.content)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"joint.py: {error}")

@@ -1,0 +1,119 @@
+"""Accuracy of the joint fit: against the oracle that is told the true noise, and least squares + TV at its best weight."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from torch import nn
+
+from noiseflow import Digitised, Gaussian
+from recon.benchmark import Scene, make_scene
+from recon.fields import Field, MultiresolutionField, VoxelField
+from recon.first_guess import contrast_slab
+from recon.joint import JointReconstructor
+from recon.metrics import compare
+from recon.simulation import ACQUISITIONS
+from recon.tilt_series import TiltSeries
+
+PHANTOMS = ("shells", "virions", "filaments", "particles", "slab")
+NOISES = ("clipped", "skewed", "outliers", "low-dose", "8-bit")
+_LOWEST, _HIGHEST, _SEARCHES, _SLAB = 0.05, 2.0, 6, 24
+Row = dict[str, Any]
+
+
+def true_noise(name: str) -> nn.Module:
+    """The noise model that a series was drawn from."""
+    make = ACQUISITIONS[name].noise
+    if make is None:
+        raise ValueError(f"{name} has no noise to learn")
+    return make()
+
+
+def score(reconstructor: JointReconstructor, scene: Scene) -> Row:
+    """Reconstruct, and compare volume and projections with the truth, raw, dB."""
+    started = time.perf_counter()
+    result = reconstructor(scene.noisy)
+    seconds = time.perf_counter() - started
+    response = result.signal_model.image_formation
+    level = response.offset if scene.noisy.mode == "linear" else response.intensity
+    return {
+        "weight": float(result.signal_model.weight),
+        "volume": compare(result.volume.attenuation, scene.truth).psnr,
+        "projections": compare(result.projections, scene.clean.images).psnr,
+        "noise model": _name(result.noise_model),
+        "offset" if scene.noisy.mode == "linear" else "intensity": float(level.mean()),
+        "seconds": seconds,
+    }
+
+
+def _name(noise_model: nn.Module) -> str:
+    return type(noise_model.model if isinstance(noise_model, Digitised) else noise_model).__name__
+
+
+def best_weight(reconstructor: JointReconstructor, scene: Scene) -> float:
+    """The weight of the highest volume PSNR, by golden section on the slices that vary most: only a rival may look there."""
+    slab = _slab(scene)
+
+    def loss(log_weight: float) -> float:
+        return -float(score(replace(reconstructor, weight=math.exp(log_weight)), slab)["volume"])
+
+    return math.exp(golden_section(loss, math.log(_LOWEST), math.log(_HIGHEST), _SEARCHES))
+
+
+def golden_section(loss: Callable[[float], float], low: float, high: float, count: int) -> float:
+    """The place of the lowest of `count` values of a function with one minimum (Kiefer 1953)."""
+    share = (math.sqrt(5) - 1) / 2
+    left, right = high - share * (high - low), low + share * (high - low)
+    seen = {left: loss(left), right: loss(right)}
+    for _ in range(count - 2):
+        if seen[left] <= seen[right]:
+            high, right = right, left
+            left = high - share * (high - low)
+        else:
+            low, left = left, right
+            right = low + share * (high - low)
+        for place in (left, right):
+            if place not in seen:
+                seen[place] = loss(place)
+    return min(seen, key=lambda place: seen[place])
+
+
+def _slab(scene: Scene) -> Scene:
+    rows = contrast_slab(scene.noisy, _SLAB)
+
+    def cut(series: TiltSeries) -> TiltSeries:
+        return TiltSeries(series.images[:, rows], series.tilt_angles, series.pixel_size, series.mode)
+
+    return replace(scene, truth=scene.truth[:, rows], clean=cut(scene.clean), noisy=cut(scene.noisy))
+
+
+def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int) -> Row:
+    """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares + TV at its best weight."""
+    scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
+    row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
+    row["images"] = compare(scene.noisy.images, scene.clean.images).psnr
+    row["joint"] = score(JointReconstructor(), scene)
+    oracle = JointReconstructor(noise_model=lambda: true_noise(noise))
+    row["oracle"] = score(replace(oracle, weight=best_weight(oracle, scene)), scene)
+    least_squares = JointReconstructor(noise_model=Gaussian)
+    least_squares = replace(least_squares, weight=best_weight(least_squares, scene))
+    variants = [score(replace(least_squares, estimate_response=estimate), scene) for estimate in (True, False)]
+    row["least squares"] = max(variants, key=lambda found: found["volume"])
+    return row
+
+
+FIELDS: dict[str, Callable[..., Field]] = {"voxels": VoxelField, "sum of grids": MultiresolutionField}
+
+
+def fields(phantom: str, *, size: int, tilts: str, seed: int, noise: str = "clipped") -> Row:
+    """One row: every field at its own best weight of total variation, told the true noise."""
+    scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
+    row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
+    for name, make in FIELDS.items():
+        oracle = JointReconstructor(noise_model=lambda: true_noise(noise), make_field=make)
+        row[name] = score(replace(oracle, weight=best_weight(oracle, scene)), scene)
+    return row

@@ -1,0 +1,141 @@
+"""The results page of the joint reconstruction, joint.md, from results/joint.json alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from joint_accuracy import FIELDS, NOISES, PHANTOMS
+
+from noiseflow.io import atomic_path
+
+PAGE = Path(__file__).parent / "joint.md"
+_METHODS = ("joint", "oracle", "least squares")
+_VOLUME_GOAL, _PROJECTION_GOAL, _LEAST_SQUARES_GOAL = 0.15, 0.5, 0.05
+_COUNT = len(PHANTOMS) * len(NOISES)
+Row = dict[str, Any]
+
+
+def write(content: Row) -> None:
+    """Write the page."""
+    with atomic_path(PAGE) as partial:
+        partial.write_text(page(content), encoding="utf-8")
+
+
+def accuracy_line(row: Row) -> str:
+    """One row in words."""
+    scores = ", ".join(f"{name} {_pair(row[name])}" for name in _METHODS)
+    return f"{row['phantom']}, {row['noise']}: {scores} dB; {row['joint']['seconds']:.0f} s"
+
+
+def page(content: Row) -> str:
+    """The page as Markdown."""
+    cells = content["cells"]
+    accuracy = _rows(cells, "accuracy/")
+    fields = _rows(cells, "fields/")
+    speed = {key.removeprefix("speed/"): row for key, row in cells.items() if key.startswith("speed/")}
+    parts = [_head(content), _accuracy(accuracy), _fields(fields), _speed(speed)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _rows(cells: Row, start: str) -> list[Row]:
+    found = [row for key, row in cells.items() if key.startswith(start)]
+    return sorted(found, key=lambda row: (PHANTOMS.index(row["phantom"]), NOISES.index(row["noise"])))
+
+
+def _head(content: Row) -> str:
+    machine = content["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    return (
+        "# Joint reconstruction: accuracy and speed\n\n"
+        "Written by `python docs/benchmarks/joint.py page` from `results/joint.json`; each row is one command.\n\n"
+        f"Measured on {machine['processor']}, {machine['cores']} cores; Python {machine['python']}, {versions}."
+    )
+
+
+def _accuracy(rows: list[Row]) -> str:
+    if not rows:
+        return ""
+    text = (
+        "PSNR of the volume / of the clean projections, dB, over the range of the truth, without rescaling. **Joint**: "
+        "`noiseflow reconstruct` without options. **Oracle**: the same field and regulariser, told the true noise, at its best "
+        "weight. **Least squares**: the same field with least squares + total variation at its best weight, incident intensity "
+        "or offset learnt or not, whichever is better. Best weights are found by looking at the truth, by golden section on the "
+        "24 slices of most contrast. One row:\n\n"
+        "```sh\npython docs/benchmarks/joint.py accuracy --phantom shells --noise clipped\n```"
+    )
+    body = [
+        [row["phantom"], row["noise"], f"{row['images']:.1f}", *(_pair(row[name]) for name in _METHODS), *_gaps(row)]
+        for row in rows
+    ]
+    header = ["phantom", "noise", "images", *_METHODS, "oracle − joint", "joint − least squares", "noise model"]
+    return "\n\n".join(["## Accuracy", text, _summary(rows), table(header, body)])
+
+
+def _pair(score: Row) -> str:
+    return f"{score['volume']:.2f} / {score['projections']:.2f}"
+
+
+def _gaps(row: Row) -> list[str]:
+    volume, projections = (row["oracle"][key] - row["joint"][key] for key in ("volume", "projections"))
+    ahead = row["joint"]["volume"] - row["least squares"]["volume"]
+    return [f"{volume:.2f} / {projections:.2f}", f"{ahead:+.2f}", row["joint"]["noise model"]]
+
+
+def _summary(rows: list[Row]) -> str:
+    volume = [row["oracle"]["volume"] - row["joint"]["volume"] for row in rows]
+    projections = [row["oracle"]["projections"] - row["joint"]["projections"] for row in rows]
+    ahead = [row["joint"]["volume"] - row["least squares"]["volume"] for row in rows]
+    lines = [
+        _met("volume within {} dB of the oracle", volume, _VOLUME_GOAL),
+        _met("projections within {} dB of the oracle", projections, _PROJECTION_GOAL),
+        _met("volume not below least squares by more than {} dB", [-gain for gain in ahead], _LEAST_SQUARES_GOAL),
+        f"- joint above least squares by {min(ahead):.2f} to {max(ahead):.2f} dB in the volume.",
+    ]
+    if len(rows) < _COUNT:
+        lines.append(f"- {_COUNT - len(rows)} of {_COUNT} rows are not measured yet: `accuracy` runs them.")
+    return "\n".join(lines)
+
+
+def _met(what: str, values: list[float], goal: float) -> str:
+    met = sum(value <= goal for value in values)
+    return f"- {what.format(goal)}: {met} of {len(values)} rows; largest gap {max(values):.2f} dB."
+
+
+def _fields(rows: list[Row]) -> str:
+    if not rows:
+        return ""
+    text = (
+        "Each field at its own best weight of total variation, told the true noise (clipped); PSNR of volume / clean "
+        "projections, dB, and seconds of one fit. Command: `python docs/benchmarks/joint.py fields`."
+    )
+    body = [
+        [row["phantom"], *(f"{_pair(row[name])} ({row[name]['seconds']:.0f} s)" for name in FIELDS)] for row in rows
+    ]
+    return "\n\n".join(["## Fields", text, table(["phantom", *FIELDS], body)])
+
+
+def _speed(rows: dict[str, Row]) -> str:
+    if not rows:
+        return ""
+    lines = [
+        "## Speed",
+        "Ratios of things timed in turn in one run: `python docs/benchmarks/joint.py speed [--row NAME]`.",
+    ]
+    for name, row in rows.items():
+        figures = [[key, _figure(value)] for key, value in row.items() if key != "load"]
+        lines += [f"### {name}", f"Load average at the start: {row['load']}.", table(["what", "figure"], figures)]
+    return "\n\n".join(lines)
+
+
+def _figure(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_figure(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in body])

@@ -1,0 +1,134 @@
+"""Speed of the joint fit and its parts: every row is a ratio of two things timed in turn in one run."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from noiseflow import Gaussian
+from recon.benchmark import in_turn, make_scene
+from recon.joint import JointReconstructor
+from recon.projector import SliceProjector
+
+TILTS = "-59.5:58:1.5"
+_EIGHTY = np.linspace(-60, 60, 80)
+_WEIGHT = 0.3
+Row = dict[str, Any]
+
+
+def joint(size: int, repeats: int = 3) -> Row:
+    """The joint fit and the same field with least squares, weight given; and the joint fit that chooses everything."""
+    scene = make_scene(size, tilts=TILTS)
+    fits = [
+        JointReconstructor(weight=_WEIGHT),
+        JointReconstructor(weight=_WEIGHT, noise_model=Gaussian),
+        JointReconstructor(),
+    ]
+    given, least_squares, chosen = (
+        seconds for seconds, _ in in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=repeats)
+    )
+    row = {"scene": scene.name, "joint, weight given": given, "least squares, weight given": least_squares}
+    return row | {"ratio": given / least_squares, "joint, everything chosen": chosen}
+
+
+def scaling(sizes: list[int]) -> Row:
+    """Seconds of the whole joint fit, everything chosen, against voxels × tilts, and the exponent of their power law."""
+    seconds, work = [], []
+    for size in sizes:
+        scene = make_scene(size, tilts=TILTS)
+        started = time.perf_counter()
+        JointReconstructor()(scene.noisy)
+        seconds.append(time.perf_counter() - started)
+        work.append(size**3 * scene.noisy.num_tilts)
+    exponent = float(np.polyfit(np.log(work), np.log(seconds), 1)[0])
+    return {"sizes": sizes, "seconds": seconds, "exponent": exponent}
+
+
+def projector(size: int, repeats: int = 5) -> Row:
+    """Forward and back projection of a cube at 80 tilts, against ASTRA's CPU projector slice by slice, and memory bandwidth."""
+    generator = torch.Generator().manual_seed(0)
+    ours = SliceProjector(tilt_angles=_EIGHTY, depth=size, width=size)
+    columns = torch.rand(size * size, size, generator=generator)
+    rays = torch.rand(len(_EIGHTY) * size, size, generator=generator)
+    theirs = _Astra(size)
+    volume = columns.view(size, size, size).transpose(1, 2).contiguous().numpy()
+    images = rays.view(len(_EIGHTY), size, size).transpose(1, 2).contiguous().numpy()
+    slices = max(1, min(size, 2**21 // size**2))  # enough to time; every slice costs ASTRA the same
+    (forward, found), (back, _), (their_forward, expected), (their_back, _) = in_turn(
+        [
+            lambda: ours.project(columns),
+            lambda: ours.backproject(rays),
+            lambda: theirs.forward(volume, slices),
+            lambda: theirs.back(images, slices),
+        ],
+        repeats=repeats,
+    )
+    share = size / slices
+    row = {"size": size, "tilts": len(_EIGHTY), "forward": forward, "back": back}
+    row |= {"ASTRA forward": their_forward * share, "ASTRA back": their_back * share}
+    row["ratio"] = (row["ASTRA forward"] + row["ASTRA back"]) / (forward + back)
+    row["difference"] = _difference(found.view(len(_EIGHTY), size, size).transpose(1, 2)[:, :slices].numpy(), expected)
+    return row | _bandwidth(ours, columns, rays, forward + back)
+
+
+def _difference(found: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> float:
+    return float(np.sqrt(np.mean((found - expected) ** 2) / np.mean(expected**2)))
+
+
+def _bandwidth(ours: SliceProjector, columns: torch.Tensor, rays: torch.Tensor, seconds: float) -> Row:
+    """Bytes that must move at least (matrix, input and output once, both ways) against what copying a large array moves."""
+    entries = ours.matrix.values().numel()
+    least = 2 * (entries * 8 + (columns.numel() + rays.numel()) * 4)
+    gathered = 2 * entries * columns.shape[1] * 4
+    big = torch.rand(2**26)
+    target = torch.empty_like(big)
+    copying, _ = in_turn([lambda: target.copy_(big)], repeats=5)[0]
+    bandwidth = 2 * big.numel() * 4 / copying
+    return {
+        "bandwidth": bandwidth,
+        "bandwidth share": least / seconds / bandwidth,
+        "gathered share": gathered / seconds / bandwidth,
+    }
+
+
+class _Astra:
+    """ASTRA's CPU projector of one slice (Joseph's interpolation), as in `recon.external`."""
+
+    def __init__(self, size: int) -> None:
+        import astra
+
+        self.astra = astra
+        self.volume_geometry = astra.create_vol_geom(size, size)
+        self.geometry = astra.create_proj_geom("parallel", 1.0, size, -np.deg2rad(_EIGHTY))
+        self.projector = astra.create_projector("linear", self.geometry, self.volume_geometry)
+        self.image = astra.data2d.create("-vol", self.volume_geometry, 0)
+        self.sinogram = astra.data2d.create("-sino", self.geometry, 0)
+
+    def forward(self, volume: np.ndarray[Any, Any], slices: int) -> np.ndarray[Any, Any]:
+        """(z, y, x) to (tilt, slices, u)."""
+        algorithm = self._algorithm("FP", VolumeDataId=self.image)
+        images = []
+        for row in range(slices):
+            self.astra.data2d.store(self.image, np.ascontiguousarray(volume[:, row]))
+            self.astra.algorithm.run(algorithm)
+            images.append(self.astra.data2d.get(self.sinogram))
+        self.astra.algorithm.delete(algorithm)
+        return np.stack(images, axis=1)
+
+    def back(self, images: np.ndarray[Any, Any], slices: int) -> np.ndarray[Any, Any]:
+        """(tilt, y, u) to (z, slices, x)."""
+        algorithm = self._algorithm("BP", ReconstructionDataId=self.image)
+        volumes = []
+        for row in range(slices):
+            self.astra.data2d.store(self.sinogram, np.ascontiguousarray(images[:, row]))
+            self.astra.algorithm.run(algorithm)
+            volumes.append(self.astra.data2d.get(self.image))
+        self.astra.algorithm.delete(algorithm)
+        return np.stack(volumes, axis=1)
+
+    def _algorithm(self, name: str, **data: int) -> Any:
+        options = self.astra.astra_dict(name) | {"ProjectorId": self.projector, "ProjectionDataId": self.sinogram}
+        return self.astra.algorithm.create(options | data)
