@@ -1,3 +1,4 @@
+from .coordinate_network import CoordinateNetwork as CoordinateNetwork
 from .fields import Field as Field
 from .fields import MultiresolutionField as MultiresolutionField
 from .fields import VoxelField as VoxelField

@@ -23,6 +23,8 @@ class Field(nn.Module):
     """
 
     scale: Tensor
+    relative_rate = 1.0
+    """Learning rate that suits the field, relative to what suits a free number per voxel."""
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__()
@@ -35,8 +37,8 @@ class Field(nn.Module):
         self.depth, self.height, self.width = shape
         self.register_buffer("scale", torch.tensor(float(scale)))
 
-    def raw(self) -> Tensor:
-        """Unconstrained values, (depth, width, height)."""
+    def units(self) -> Tensor:
+        """Attenuation in units of the scale, not negative, (depth, width, height)."""
         raise NotImplementedError
 
     def start_from(self, volume: Tensor) -> None:
@@ -51,7 +53,7 @@ class Field(nn.Module):
 
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""
-        values: Tensor = functional.softplus(self.raw()) * self.scale
+        values = self.units() * self.scale
         return values.reshape(self.depth * self.width, self.height)
 
     def volume(self) -> Tensor:
@@ -72,8 +74,8 @@ class VoxelField(Field):
         with torch.no_grad():
             self.values.copy_(self._raw_of(volume, self.values.shape))
 
-    def raw(self) -> Tensor:
-        return self.values
+    def units(self) -> Tensor:
+        return functional.softplus(self.values)
 
 
 class MultiresolutionField(Field):
@@ -103,11 +105,11 @@ class MultiresolutionField(Field):
             grid = self.grids[max(0, len(self.grids) - 3)]
             grid.copy_(self._raw_of(volume, grid.shape))
 
-    def raw(self) -> Tensor:
+    def units(self) -> Tensor:
         total: Tensor = self.grids[0]
         for grid in list(self.grids)[1:]:
             total = upsample(total, grid.shape) + grid
-        return total
+        return functional.softplus(total)
 
 
 def upsample(grid: Tensor, shape: Sequence[int]) -> Tensor:

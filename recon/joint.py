@@ -25,12 +25,14 @@ from noiseflow import (
     fit,
 )
 from recon.coarse_start import coarse_start, learning_rate
+from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field, MultiresolutionField
 from recon.first_guess import (
     attenuation_scale,
     contrast_slab,
     estimate_response,
 )
+from recon.occupancy import Occupancy
 from recon.projector import SliceProjector, from_rays
 from recon.signal_model import TomographySignal
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -79,6 +81,7 @@ class JointReconstructor:
         make_field: makes the field from shape and scale.
         num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
+        skip_vacuum: whether a `CoordinateNetwork` is evaluated only where there may be something.
         slab: slices used to choose.
         seed: of every random choice.
         device: where to compute.
@@ -90,6 +93,7 @@ class JointReconstructor:
     make_field: Callable[..., Field] = MultiresolutionField
     num_steps: int = 120
     estimate_response: bool = True
+    skip_vacuum: bool = True
     slab: int = 24
     seed: int = 0
     device: torch.device | str = "cpu"
@@ -136,7 +140,10 @@ class JointReconstructor:
         field.start_from(rough)
         weight = _FIRST_WEIGHT if self.weight is None else self.weight
         rate = learning_rate(rough, field)
-        return TomographySignal(field, projector, response, weight=weight, learning_rate=rate)
+        occupancy = None
+        if self.skip_vacuum and isinstance(field, CoordinateNetwork):
+            occupancy = Occupancy(rough / field.scale, grid.shape).to(self.device)
+        return TomographySignal(field, projector, response, weight=weight, learning_rate=rate, occupancy=occupancy)
 
     def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> _Task:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
@@ -153,6 +160,7 @@ class JointReconstructor:
         field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
         field.start_from(whole.field.volume()[:, rows])
         part = whole.with_field(field)
+        part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
         task.fit(Gaussian().to(self.device), num_steps=40)
         noise_model = (
@@ -305,7 +313,7 @@ def _finished(
     model: TomographySignal, noise_model: nn.Module, result: FitResult, grid: VolumeGrid, choice: WeightChoice | None
 ) -> Reconstruction:
     with torch.no_grad():
-        volume = Volume(model.field.volume().cpu().numpy(), grid.voxel_size)
+        volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
         shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
         projections = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
     return Reconstruction(volume, projections, noise_model, model, result, choice)

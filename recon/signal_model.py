@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field
-from recon.projector import SliceProjector
+from recon.occupancy import Occupancy
+from recon.projector import SliceProjector, from_columns
 from recon.regularisers import total_variation
 
 
@@ -25,7 +27,8 @@ class TomographySignal(nn.Module):
         weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
             voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
-        learning_rate: of the field; the detector's response learns at a twentieth of it.
+        learning_rate: of a field of voxels; the detector's response learns at a twentieth of it.
+        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For fields with a method ``at``.
     """
 
     def __init__(
@@ -37,10 +40,12 @@ class TomographySignal(nn.Module):
         weight: float = 1.0,
         smoothing: float = 0.02,
         learning_rate: float = 0.2,
+        occupancy: Occupancy | None = None,
     ) -> None:
         super().__init__()
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
+        self.occupancy = occupancy
         self._columns: Tensor | None = None
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
 
@@ -51,11 +56,30 @@ class TomographySignal(nn.Module):
 
     def signal(self) -> Tensor:
         """The signal of all pixels, flat."""
-        self._columns, self._seen = self.field(), None
+        self._columns, self._seen = self._evaluate(), None
         rays = self.projector.project(self._columns)
         shape = (self.projector.num_tilts, self.projector.detector_width, self.field.height)
         signal: Tensor = self.image_formation(rays.view(shape))
         return signal.reshape(-1)
+
+    def _evaluate(self) -> Tensor:
+        """The field where it is occupied, and vacuum elsewhere; what the data wants there is tested as gradients pass."""
+        occupancy, field = self.occupancy, self.field
+        if occupancy is None or not isinstance(field, CoordinateNetwork):
+            everywhere: Tensor = field()
+            return everywhere
+        places = occupancy.indices()
+        empty = torch.zeros(occupancy.mask.numel(), dtype=field.scale.dtype, device=field.scale.device)
+        columns = empty.index_put((places,), field.at(places) * field.scale).view(-1, field.height)
+        if columns.requires_grad:
+            cost = self.weight / (float(field.scale) * self.num_pixels)
+            columns.register_hook(lambda gradient: occupancy.retest(gradient, cost))  # type: ignore[no-untyped-call]
+        return columns
+
+    def volume(self) -> Tensor:
+        """The attenuation that the signal is made of, (z, y, x), detached."""
+        with torch.no_grad():
+            return from_columns(self._evaluate(), self.field.depth).contiguous()
 
     def forward(self, pixels: Tensor) -> Tensor:
         """The signal of some pixels; without gradients, all are projected once for each state of the parameters."""
@@ -70,7 +94,7 @@ class TomographySignal(nn.Module):
 
     def penalty(self) -> Tensor:
         """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""
-        columns = self.field() if self._columns is None else self._columns
+        columns = self._evaluate() if self._columns is None else self._columns
         self._columns = None
         scale = float(self.field.scale)
         lattice = columns.view(self.field.depth, self.field.width, self.field.height)
@@ -81,12 +105,16 @@ class TomographySignal(nn.Module):
         """The same detector and response, copied, in front of another field of as many voxels along z and x."""
         response = copy.deepcopy(self.image_formation)
         options = {"weight": self.weight, "smoothing": self.smoothing, "learning_rate": self.learning_rate}
-        return TomographySignal(field, self.projector, response, **options)
+        return TomographySignal(field, self.projector, response, occupancy=None, **options)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam."""
         response = [parameter for parameter in self.image_formation.parameters() if parameter.requires_grad]
         groups: list[dict[str, Any]] = [
-            {"params": list(self.field.parameters()), "lr": self.learning_rate, "eps": 1e-15}
+            {
+                "params": list(self.field.parameters()),
+                "lr": self.learning_rate * self.field.relative_rate,
+                "eps": 1e-15,
+            }
         ]
         return groups + ([{"params": response, "lr": self.learning_rate / 20}] if response else [])

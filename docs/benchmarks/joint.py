@@ -6,8 +6,7 @@
     python docs/benchmarks/joint.py page                              # joint.md from the JSON
     python docs/benchmarks/joint.py accuracy --size 64 --tilts=-58.5:58.5:3 --out FILE      # other scenes
 
-Each row is saved when it is done, in results/joint.json beside this file, and is not computed again: remove it there, or name
-another file with --out. PSNR is over the range of the truth, without any rescaling. Best weights are found by looking at the
+Each row is saved when it is done, in results/joint.json beside this file, and is not computed again without --again. PSNR is over the range of the truth, without any rescaling. Best weights are found by looking at the
 truth, which only the rivals may do. ASTRA comes with the extra: python -m pip install 'noiseflow[benchmark]'.
 """
 
@@ -32,6 +31,9 @@ SPEED: dict[str, Callable[[], dict[str, Any]]] = {
     "joint": lambda: joint_speed.joint(96),
     "scaling": lambda: joint_speed.scaling([64, 96, 128, 192]),
     "scaling-quick": lambda: joint_speed.scaling([64, 96, 128]),
+    "skipping-shells": lambda: joint_speed.skipping("shells"),
+    "skipping-slab": lambda: joint_speed.skipping("slab"),
+    "network": joint_speed.network,
     "projector-128": lambda: joint_speed.projector(128),
     "projector-256": lambda: joint_speed.projector(256),
 }
@@ -44,6 +46,7 @@ def main() -> None:
     parser.add_argument("--phantom", action="append", choices=PHANTOMS)
     parser.add_argument("--noise", action="append", choices=NOISES)
     parser.add_argument("--row", action="append", choices=SPEED, help="of the speed rows; all by default")
+    parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--tilts", default=joint_speed.TILTS, help="START:STOP:STEP in degrees; 79 tilts by default")
     parser.add_argument("--seed", type=int, default=0)
@@ -52,22 +55,26 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     results, output = Results(options.out, "joint reconstruction"), Output(json_mode=False)
+
+    def cell(key: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        if options.again:
+            results.cells.pop(key, None)
+        return results.cell(key, compute)
+
     scene = {"size": options.size, "tilts": options.tilts, "seed": options.seed}
     name = f"{options.size}/{options.tilts}/{options.seed}"
     if options.part == "accuracy":
         for phantom in options.phantom or PHANTOMS:
             for noise in options.noise or NOISES:
-                row = results.cell(
-                    f"accuracy/{phantom}/{noise}/{name}", lambda p=phantom, n=noise: accuracy(p, n, **scene)
-                )
+                row = cell(f"accuracy/{phantom}/{noise}/{name}", lambda p=phantom, n=noise: accuracy(p, n, **scene))
                 output.line(joint_page.accuracy_line(row))
     if options.part == "fields":
         for phantom in options.phantom or PHANTOMS:
-            row = results.cell(f"fields/{phantom}/{name}", lambda p=phantom: fields(p, **scene))
+            row = cell(f"fields/{phantom}/{name}", lambda p=phantom: fields(p, **scene))
             output.line(str(row))
     if options.part == "speed":
         for which in options.row or SPEED:
-            output.line(f"{which}: {results.cell(f'speed/{which}', SPEED[which])}")
+            output.line(f"{which}: {cell(f'speed/{which}', SPEED[which])}")
     if options.part == "page":
         joint_page.write(results.content)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,10 @@ import torch
 
 from noiseflow import Gaussian
 from recon.benchmark import in_turn, make_scene
+from recon.coordinate_network import CoordinateNetwork
 from recon.joint import JointReconstructor
+from recon.metrics import compare
+from recon.presets import PRESETS
 from recon.projector import SliceProjector
 
 TILTS = "-59.5:58:1.5"
@@ -45,6 +50,38 @@ def scaling(sizes: list[int]) -> Row:
         work.append(size**3 * scene.noisy.num_tilts)
     exponent = float(np.polyfit(np.log(work), np.log(seconds), 1)[0])
     return {"sizes": sizes, "seconds": seconds, "exponent": exponent}
+
+
+def network(size: int = 96) -> Row:
+    """The paper's field, one gradient of one slice at all tilts, against its ray-wise sampling; seconds for equal rays."""
+    scene = make_scene(size, tilts=TILTS)
+    field = CoordinateNetwork((size, 1, size), scale=1 / size)
+    projector = SliceProjector(tilt_angles=scene.noisy.tilt_angles, depth=size, width=size)
+    observed = torch.rand(scene.noisy.num_tilts * size, 1, generator=torch.Generator().manual_seed(0))
+    preset = replace(PRESETS["kniesel2022"], accumulate=1)
+    state = next(preset.train(scene.noisy, max_steps=1))
+
+    def by_slice() -> None:
+        ((torch.exp(-projector.project(field())) - observed) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+
+    (slice_wise, _), (ray_wise, _) = in_turn([by_slice, lambda: state.step(1)], repeats=3)
+    rays = scene.noisy.num_tilts * size
+    row = {"rays of a slice": rays, "by slice": slice_wise, "ray by ray": ray_wise * rays / preset.rays}
+    return row | {"ratio": row["ray by ray"] / slice_wise}
+
+
+def skipping(phantom: str, size: int = 48) -> Row:
+    """A small coordinate network with and without skipping of vacuum, equal steps, noise known and weight given."""
+    scene = make_scene(size, phantom=phantom, tilts="-58.5:58.5:3")
+    make = partial(CoordinateNetwork, width=64, layers=4, frequencies=6, skip=2)
+    fit = JointReconstructor(weight=_WEIGHT, make_field=make, noise_model=lambda: scene.noise_model)
+    fits = [replace(fit, skip_vacuum=skip) for skip in (True, False)]
+    (skipped, result), (full, reference) = in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=1)
+    psnr = [compare(each.volume.attenuation, scene.truth).psnr for each in (result, reference)]
+    occupancy = result.signal_model.occupancy
+    row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean()), "occupied": occupancy.share}
+    row |= {"skipping": skipped, "everywhere": full, "ratio": full / skipped}
+    return row | {"volume PSNR, skipping": psnr[0], "volume PSNR, everywhere": psnr[1]}
 
 
 def projector(size: int, repeats: int = 5) -> Row:

@@ -1,0 +1,72 @@
+"""Where a volume may hold anything: fields that are evaluated point by point need not be asked about vacuum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+_RETEST_EVERY = 10
+
+
+class Occupancy(nn.Module):
+    """The voxels that may hold something, from a rough volume, and more of them as soon as the data wants them.
+
+    Everything within a margin of what the rough volume holds is occupied. The rest counts as vacuum, and is tested again in every
+    tenth step: a block of voxels becomes occupied where the likelihood gains more by raising it than the total variation of its
+    faces costs. Nothing is ever taken out.
+
+    Args:
+        rough: (z, y, x) of the same extent and any resolution, in units of the field's scale.
+        shape: (depth, height, width) of the lattice.
+        least: what counts as something in the rough volume.
+        margin: voxels of the lattice around it.
+        block: voxels along the edges of the blocks that are tested.
+    """
+
+    mask: Tensor
+
+    def __init__(
+        self, rough: Tensor, shape: Sequence[int], *, least: float = 0.05, margin: int = 3, block: int = 4
+    ) -> None:
+        super().__init__()
+        self.block, self._since_test = block, 0
+        lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
+        grown = functional.max_pool3d(lattice, 2 * margin + 1, stride=1, padding=margin)[0, 0]
+        self.register_buffer("mask", (grown > least).transpose(1, 2).contiguous())
+
+    @property
+    def share(self) -> float:
+        """The share of the lattice that is occupied."""
+        return float(self.mask.float().mean())
+
+    def indices(self) -> Tensor:
+        """(N,) occupied places of the flat lattice in the projector's order, (z, x, y)."""
+        return self.mask.reshape(-1).nonzero()[:, 0]
+
+    def rows(self, rows: slice) -> Occupancy:
+        """The same for some slices."""
+        part = Occupancy(torch.zeros(1, 1, 1), (1, 1, 1), block=self.block)
+        part.mask = self.mask[..., rows].clone()
+        return part
+
+    @torch.no_grad()
+    def retest(self, gradient: Tensor, cost: float) -> None:
+        """Occupy the blocks that the data wants.
+
+        Args:
+            gradient: of the loss with respect to the attenuation, any shape of the lattice (z, x, y).
+            cost: of the total variation, loss per unit of attenuation and voxel face.
+        """
+        self._since_test += 1
+        if self._since_test % _RETEST_EVERY:
+            return
+        lattice = gradient.view(self.mask.shape)[None, None]
+        options = {"ceil_mode": True, "divisor_override": 1}
+        gain = -functional.avg_pool3d(lattice, self.block, **options)[0, 0]  # type: ignore[arg-type]
+        wanted = gain > 6 * self.block**2 * cost
+        for axis, size in enumerate(self.mask.shape):
+            wanted = wanted.repeat_interleave(self.block, axis).narrow(axis, 0, size)
+        self.mask |= wanted

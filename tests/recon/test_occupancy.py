@@ -1,0 +1,81 @@
+"""Skipping of vacuum: nothing changes where the field is evaluated, and what the data wants is found."""
+
+import pytest
+import torch
+
+from recon.coordinate_network import CoordinateNetwork
+from recon.image_formation import Transmission
+from recon.occupancy import Occupancy
+from recon.projector import SliceProjector
+from recon.signal_model import TomographySignal
+
+
+@pytest.fixture
+def field():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return CoordinateNetwork((8, 10, 12), scale=0.1, width=16, layers=3, frequencies=4, skip=1)
+
+
+def signal_model(field, occupancy, weight=0.3):
+    projector = SliceProjector(tilt_angles=[-50.0, 0.0, 40.0], depth=8, width=12)
+    return TomographySignal(field, projector, Transmission(), weight=weight, occupancy=occupancy)
+
+
+def everything():
+    return Occupancy(torch.ones(2, 2, 2), (8, 10, 12))
+
+
+def test_network_agrees_with_itself_at_single_places(field):
+    places = torch.tensor([0, 7, 119, 959])
+    torch.testing.assert_close(field.at(places), field.units().reshape(-1)[places])
+    field.start_from(torch.full((8, 10, 12), 0.02))
+    assert float(field.volume().mean()) == pytest.approx(0.02, rel=0.5)
+
+
+def test_skipping_nothing_changes_neither_signal_nor_gradient(field):
+    plain, skipping = signal_model(field, None), signal_model(field, everything())
+    gradients = []
+    for model in (plain, skipping):
+        field.zero_grad()
+        (model.signal().square().sum() + model.penalty()).backward()
+        gradients.append([parameter.grad.clone() for parameter in field.parameters()])
+    torch.testing.assert_close(plain.signal(), skipping.signal())
+    torch.testing.assert_close(*gradients)
+
+
+def test_vacuum_is_not_evaluated(field):
+    rough = torch.zeros(8, 10, 12)
+    rough[3, 5, 2] = 1.0
+    occupancy = Occupancy(rough, (8, 10, 12), margin=1)
+    volume = signal_model(field, occupancy).volume()
+    assert int(occupancy.mask.sum()) == 27
+    assert float(volume[2:5, 4:7, 1:4].min()) > 0
+    volume[2:5, 4:7, 1:4] = 0
+    assert not volume.any()
+
+
+def test_rows_of_an_occupancy():
+    rough = torch.rand(8, 10, 12, generator=torch.Generator().manual_seed(0))
+    occupancy = Occupancy(rough, (8, 10, 12), least=0.9, margin=0)
+    assert torch.equal(occupancy.rows(slice(2, 7)).mask, occupancy.mask[..., 2:7])
+    assert 0 < occupancy.share < 1
+
+
+def test_what_the_data_wants_becomes_occupied_and_nothing_else():
+    """Images of a ball that the rough volume does not show: the likelihood's gradient finds it."""
+    truth = torch.zeros(16, 16, 16)
+    truth[6:10, 5:11, 7:12] = 0.1
+    projector = SliceProjector(tilt_angles=[-60.0, -30.0, 0.0, 30.0, 60.0], depth=16, width=16)
+    observed = torch.exp(-projector(truth)).transpose(1, 2).reshape(-1)
+    field = CoordinateNetwork((16, 16, 16), scale=0.1, width=8, layers=2, frequencies=2, skip=0)
+    occupancy = Occupancy(torch.zeros(2, 2, 2), (16, 16, 16))
+    occupancy.mask[0, 0, 0] = True
+    model = TomographySignal(field, projector, Transmission(), weight=0.2, occupancy=occupancy)
+    for _ in range(10):
+        loss = 50 * (model.signal() - observed).square().mean() + model.penalty()
+        loss.backward()
+    found = occupancy.mask.transpose(1, 2)
+    assert bool(found[truth > 0].all())
+    assert not found[:, 12:].any()
+    assert occupancy.share < 0.6
