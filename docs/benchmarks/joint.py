@@ -2,12 +2,14 @@
 
     python docs/benchmarks/joint.py accuracy [--phantom shells] [--noise clipped]     # 25 rows; those already there are kept
     python docs/benchmarks/joint.py fields [--phantom shells]         # which field is best when the true noise is known
+    python docs/benchmarks/joint.py offset [--phantom shells]         # a known offset of a linear series, recovered
     python docs/benchmarks/joint.py speed [--row joint]               # ratios in one run; wants a quiet machine
     python docs/benchmarks/joint.py page                              # joint.md from the JSON
     python docs/benchmarks/joint.py accuracy --size 64 --tilts=-58.5:58.5:3 --out FILE      # other scenes
 
-Each row is saved when it is done, in results/joint.json beside this file, and is not computed again without --again. PSNR is over the range of the truth, without any rescaling. Best weights are found by looking at the
-truth, which only the rivals may do. ASTRA comes with the extra: python -m pip install 'noiseflow[benchmark]'.
+Each row is saved when it is done, in results/joint.json beside this file, and is not computed again without --again. PSNR is
+over the range of the truth, without any rescaling. Best weights are found by looking at the truth, which only the rivals may
+do. ASTRA comes with the extra: python -m pip install 'noiseflow[benchmark]'.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from typing import Any
 import joint_page
 import joint_speed
 import torch
-from joint_accuracy import NOISES, PHANTOMS, accuracy, fields
+from joint_accuracy import NOISES, PHANTOMS, accuracy, fields, offset
 
 from noiseflow.console import Output
 from recon.benchmark import Results
@@ -42,7 +44,7 @@ SPEED: dict[str, Callable[[], dict[str, Any]]] = {
 def main() -> None:
     """Run the chosen rows, save each, and draw the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("accuracy", "fields", "speed", "page"))
+    parser.add_argument("part", choices=("accuracy", "fields", "offset", "speed", "page"))
     parser.add_argument("--phantom", action="append", choices=PHANTOMS)
     parser.add_argument("--noise", action="append", choices=NOISES)
     parser.add_argument("--row", action="append", choices=SPEED, help="of the speed rows; all by default")
@@ -68,10 +70,11 @@ def main() -> None:
             for noise in options.noise or NOISES:
                 row = cell(f"accuracy/{phantom}/{noise}/{name}", lambda p=phantom, n=noise: accuracy(p, n, **scene))
                 output.line(joint_page.accuracy_line(row))
-    if options.part == "fields":
-        for phantom in options.phantom or PHANTOMS:
-            row = cell(f"fields/{phantom}/{name}", lambda p=phantom: fields(p, **scene))
-            output.line(str(row))
+    for part, measure in (("fields", fields), ("offset", offset)):
+        if options.part == part:
+            for phantom in options.phantom or PHANTOMS:
+                row = cell(f"{part}/{phantom}/{name}", lambda p=phantom, m=measure: m(p, **scene))
+                output.line(f"{part}: {row}")
     if options.part == "speed":
         for which in options.row or SPEED:
             output.line(f"{which}: {cell(f'speed/{which}', SPEED[which])}")

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from torch import nn
 
 from noiseflow import Digitised, Gaussian
@@ -16,7 +17,9 @@ from recon.fields import Field, MultiresolutionField, VoxelField
 from recon.first_guess import contrast_slab
 from recon.joint import JointReconstructor
 from recon.metrics import compare
-from recon.simulation import ACQUISITIONS
+from recon.noises import SkewedNoise
+from recon.phantoms import make_phantom
+from recon.simulation import ACQUISITIONS, Acquisition, add_noise, clean_tilt_series, tilt_range
 from recon.tilt_series import TiltSeries
 
 PHANTOMS = ("shells", "virions", "filaments", "particles", "slab")
@@ -117,3 +120,14 @@ def fields(phantom: str, *, size: int, tilts: str, seed: int, noise: str = "clip
         oracle = JointReconstructor(noise_model=lambda: true_noise(noise), make_field=make)
         row[name] = score(replace(oracle, weight=best_weight(oracle, scene)), scene)
     return row
+
+
+def offset(phantom: str, *, size: int, tilts: str, seed: int, injected: float = 0.1) -> Row:
+    """The offset that the joint fit finds in a linear series whose readings were all raised by a known one."""
+    acquisition = Acquisition(lambda: SkewedNoise(0.05, 0.1, skewness=0.7), mode="linear")
+    density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
+    clean, _ = clean_tilt_series(density, tilt_range(tilts), acquisition=acquisition)
+    noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=seed + 1)
+    raised = replace(noisy, images=noisy.images + np.float32(injected))
+    found = float(JointReconstructor()(raised).signal_model.image_formation.offset.mean())
+    return {"phantom": phantom, "size": size, "seed": seed, "injected": injected, "found": found}

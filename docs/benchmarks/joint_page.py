@@ -34,14 +34,19 @@ def page(content: Row) -> str:
     cells = content["cells"]
     accuracy = _rows(cells, "accuracy/")
     fields = _rows(cells, "fields/")
+    offset = _rows(cells, "offset/")
     speed = {key.removeprefix("speed/"): row for key, row in cells.items() if key.startswith("speed/")}
-    parts = [_head(content), _accuracy(accuracy), _fields(fields), _speed(speed)]
+    parts = [_head(content), _accuracy(accuracy), _fields(fields), _offset(offset), _speed(speed)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _rows(cells: Row, start: str) -> list[Row]:
     found = [row for key, row in cells.items() if key.startswith(start)]
-    return sorted(found, key=lambda row: (PHANTOMS.index(row["phantom"]), NOISES.index(row["noise"])))
+    return sorted(found, key=lambda row: (PHANTOMS.index(row["phantom"]), _place(row)))
+
+
+def _place(row: Row) -> int:
+    return NOISES.index(row["noise"]) if "noise" in row else 0
 
 
 def _head(content: Row) -> str:
@@ -114,6 +119,17 @@ def _fields(rows: list[Row]) -> str:
         [row["phantom"], *(f"{_pair(row[name])} ({row[name]['seconds']:.0f} s)" for name in FIELDS)] for row in rows
     ]
     return "\n\n".join(["## Fields", text, table(["phantom", *FIELDS], body)])
+
+
+def _offset(rows: list[Row]) -> str:
+    if not rows:
+        return ""
+    text = (
+        "Readings of a linear series of peak 1.5 with skewed noise, all raised by a known offset. Command: "
+        "`python docs/benchmarks/joint.py offset`."
+    )
+    body = [[row["phantom"], f"{row['size']}³", f"{row['injected']:g}", f"{row['found']:.4f}"] for row in rows]
+    return "\n\n".join(["## Offset", text, table(["phantom", "size", "injected", "found"], body)])
 
 
 def _speed(rows: dict[str, Row]) -> str:
