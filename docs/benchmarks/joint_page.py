@@ -50,13 +50,19 @@ def _place(row: Row) -> int:
 
 
 def _head(content: Row) -> str:
-    machine = content["machine"]
-    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    return (
-        "# Joint reconstruction: accuracy and speed\n\n"
-        "Written by `python docs/benchmarks/joint.py page` from `results/joint.json`; each row is one command.\n\n"
-        f"Measured on {machine['processor']}, {machine['cores']} cores; Python {machine['python']}, {versions}."
-    )
+    lines = [
+        "# Joint reconstruction: accuracy and speed",
+        "",
+        "Written by `python docs/benchmarks/joint.py page` from `results/joint.json`; each row is one command.",
+        "",
+        "Measured on:",
+        "",
+    ]
+    for machine in content["machines"]:
+        versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+        cores = f"{machine['cores']} cores, {machine['threads']} torch threads"
+        lines.append(f"- {machine['processor']}, {cores}; Python {machine['python']}, {versions}")
+    return "\n".join(lines)
 
 
 def _accuracy(rows: list[Row]) -> str:
@@ -140,7 +146,7 @@ def _speed(rows: dict[str, Row]) -> str:
         "Ratios of things timed in turn in one run: `python docs/benchmarks/joint.py speed [--row NAME]`.",
     ]
     for name, row in rows.items():
-        figures = [[key, _figure(value)] for key, value in row.items() if key != "load"]
+        figures = [[key, _figure(value)] for key, value in row.items() if key not in ("load", "machine")]
         lines += [f"### {name}", f"Load average at the start: {row['load']}.", table(["what", "figure"], figures)]
     return "\n\n".join(lines)
 
