@@ -77,7 +77,7 @@ def resume_command(context: typer.Context) -> str:
             words.append(str(value))
         elif value is True and name != "--resume":
             words.append(name)
-        elif value not in (None, False, True) and value != parameter.default:
+        elif not isinstance(value, bool | None) and value != parameter.default:
             words += [name, str(value)]
     return shlex.join([*words, "--resume"])
 
