@@ -98,7 +98,7 @@ def march(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
     for axis in range(3):
         chosen = (steepest == axis).nonzero()[:, 0]
         layers, order = volume.movedim(axis, 0), [axis, *(other for other in range(3) if other != axis)]
-        for part in chosen.split(max(1, _AT_ONCE // volume.shape[axis])):
+        for part in torch.split(chosen, max(1, _AT_ONCE // volume.shape[axis])):
             sums = _march_across(layers, start[part][:, order], along[part][:, order])
             integrals = integrals.index_put((part,), sums)
     return integrals.view(origins.shape[:-1])
