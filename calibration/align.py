@@ -129,7 +129,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
     """
     overlap, most_matches = 1.0, 0
-    for guesses in (feature_guesses(short, long), iter(correlation_guesses(short, long))):
+    for guesses in (feature_guesses(short, long), correlation_guesses(short, long)):
         for guess in guesses:
             most_matches = max(most_matches, len(guess.points))
             if not _plausible(guess.matrix):

@@ -101,8 +101,8 @@ def _tell(out: Output, findings: Findings) -> None:
         describe_burst,
         describe_detector,
         describe_registration,
+        judge,
         table_rows,
-        verdict,
     )
 
     if findings.burst is not None:
@@ -113,10 +113,13 @@ def _tell(out: Output, findings: Findings) -> None:
     out.line("\nDetector: " + (describe_detector(detector) if detector else f"not measured: {findings.no_detector}"))
     out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
     out.table(TABLE_HEADER, table_rows(findings.scores))
-    out.line(f"\n{verdict(findings.scores)}")
+    out.line("\n" + " ".join(judge(findings)))
 
 
 def _detector(findings: Findings) -> dict[str, Any] | None:
+    from calibration.detector import EXCESS_NOISE
+    from calibration.report import unknown_read_noise
+
     detector = findings.detector
     if detector is None:
         return None
@@ -134,6 +137,8 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
         "num_steps": found.num_steps,
         "misfit": detector.misfit,
         "offset_measured": detector.offset is not None,
+        "read_noise_identifiable": not unknown_read_noise(detector),
+        "caveat": EXCESS_NOISE,
     }
 
 

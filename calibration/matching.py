@@ -47,7 +47,7 @@ def feature_guesses(short: Image, long: Image) -> Iterator[Guess]:
         yield from _guesses_at(short, long, blur)
 
 
-def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0) -> list[Guess]:
+def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0) -> Iterator[Guess]:
     """Guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without
     features.
 
@@ -56,7 +56,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
         long: (y, x).
         largest_angle: degrees searched either way, in steps that move the frame's edge by about a pixel and a half.
 
-    Returns:
+    Yields:
         The best guess for the finest and for a coarser band, clearest peak first.
     """
     guesses = []
@@ -69,7 +69,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
         peak, matrix = max(found, key=lambda item: item[0])
         matrix = _scaled(matrix, factor)
         guesses.append((peak, Guess(matrix, "phase correlation", np.empty((0, 2, 2)), 0)))
-    return [guess for _, guess in sorted(guesses, key=lambda item: -item[0])]
+    yield from (guess for _, guess in sorted(guesses, key=lambda item: -item[0]))
 
 
 def band_pass(image: Image, blur: float) -> Image:

@@ -25,6 +25,16 @@ from noiseflow.report import Report
 LARGEST_MISFIT = 1.3
 """χ² per degree of freedom above which the readings do not come from a Poisson-Gaussian detector."""
 
+LARGEST_MISALIGNMENT = 0.1
+"""Pixels of registration error that leave no trace in the residuals."""
+
+UNKNOWN_READ_NOISE = (
+    "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it."
+)
+
+LEAST_DIVERGENCE = 5e-4
+"""Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
+
 LABELS = {
     "gaussian": "Gaussian, one width",
     "poisson": "Poisson",
@@ -69,7 +79,7 @@ def verdict(scores: Sequence[ModelScore]) -> str:
             f"{nearest.excess_error:.4f} nats per pixel."
         )
     overall = chosen.evaluation.overall
-    if overall.jsd > 3 * overall.jsd_floor:
+    if overall.jsd > max(3 * overall.jsd_floor, LEAST_DIVERGENCE):
         text += (
             f" Yet its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
             "finite-sample floor: look at the histograms before trusting it."
@@ -90,10 +100,8 @@ def describe_detector(detector: Detector) -> str:
     ]
     text = ", ".join(parts) + f". Chain of {found.num_steps} steps, {found.num_steps / found.autocorrelation_time:.0f} "
     text += f"autocorrelation times, R-hat {found.rhat:.3f}. "
-    if found.read_noise.q95 > 3 * found.read_noise.q05:
-        text += (
-            "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it. "
-        )
+    if unknown_read_noise(detector):
+        text += UNKNOWN_READ_NOISE + " "
     if detector.misfit > LARGEST_MISFIT:
         text += (
             f"The readings depart from any Poisson-Gaussian detector (χ² per degree of freedom {detector.misfit:.2f}), so "
@@ -141,11 +149,61 @@ def write_report(folder: str | Path, findings: Findings, *, title: str = "Detect
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     page = Report(title)
-    page.text(verdict(findings.scores))
+    page.facts(_facts(findings))
+    page.heading("Verdict")
+    for sentence in judge(findings):
+        page.text(sentence)
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
     return page.save(folder / "report.html")
+
+
+def _facts(findings: Findings) -> list[tuple[str, str]]:
+    facts = []
+    if findings.detector is not None:
+        found = findings.detector.posterior
+        for name, unit, value in (
+            ("Gain", "counts/e⁻", found.gain),
+            ("Offset", "counts", found.offset),
+            ("Read noise", "e⁻ rms", found.read_noise),
+        ):
+            facts.append((f"{name}, {unit}", f"{value.median:.4g} ({value.q05:.4g} … {value.q95:.4g})"))
+    facts.append(("Noise model that suffices", LABELS[simplest_sufficient(findings.scores).name]))
+    return facts
+
+
+def judge(findings: Findings) -> list[str]:
+    """What to believe, in words: the noise model, the detector's parameters, the registration."""
+    found = [verdict(findings.scores)]
+    detector = findings.detector
+    if detector is None:
+        found.append(f"The detector was not measured: {findings.no_detector}.")
+    else:
+        apart = detector.misfit > LARGEST_MISFIT
+        found.append(
+            (
+                "The intervals of gain, offset and read noise are too narrow: the readings depart from those of one "
+                "Poisson-Gaussian detector"
+                if apart
+                else "Gain, offset and read noise can be believed: the readings are those of a Poisson-Gaussian detector"
+            )
+            + f" (χ² per degree of freedom {detector.misfit:.2f}; 1 is perfect)."
+            + (f" {UNKNOWN_READ_NOISE}" if unknown_read_noise(detector) else "")
+        )
+    if findings.burst is None:
+        worst = max(pair.registration.error_px for pair in findings.pairs)
+        found.append(
+            f"The exposures lie on each other to {worst:.3f} px"
+            + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
+        )
+    return found
+
+
+def unknown_read_noise(detector: Detector) -> bool:
+    """Whether the exposures leave the read noise open by more than a factor of three."""
+    interval = detector.posterior.read_noise
+    return interval.q95 > 3 * interval.q05
 
 
 def _add_detector(page: Report, findings: Findings) -> None:
@@ -154,7 +212,10 @@ def _add_detector(page: Report, findings: Findings) -> None:
         page.text(f"Not measured: {findings.no_detector}")
         return
     page.text(describe_detector(findings.detector))
-    page.figure(photon_transfer_figure(findings.detector), caption="Photon transfer: variance against signal.")
+    page.figure(
+        photon_transfer_figure(findings.detector),
+        caption="Photon transfer: variance against signal; band: 90 % of the posterior.",
+    )
     page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
 
 
@@ -166,8 +227,14 @@ def _add_models(page: Report, findings: Findings) -> None:
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
     histograms = histogram_figure(findings.pixels, findings.scores)
-    page.figure(histograms, caption="Residuals of the pixels kept apart, by signal, and every model.")
-    page.figure(pit_figure(findings.scores), caption="Calibration of each model on the pixels kept apart.")
+    page.figure(
+        histograms,
+        caption="Residuals of the pixels kept apart at each level of signal (grey), with every model on top.",
+    )
+    page.figure(
+        pit_figure(findings.scores),
+        caption="Each model on the pixels kept apart: histogram of its probability integral transform (PIT), and QQ.",
+    )
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
@@ -176,7 +243,12 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
-        page.figure(registration_figure(pair), caption="Magenta: short, green: long; grey where they agree.")
-        page.figure(residual_figure(pair), caption="What is left must be structureless.")
+        page.figure(
+            registration_figure(pair),
+            caption="Overlay before and after registration. Magenta: short, green: long; grey where they agree.",
+        )
+        page.figure(
+            residual_figure(pair), caption="What is left: map, and row and column profiles. It must be structureless."
+        )
     if len(findings.pairs) > most:
         page.text(f"{len(findings.pairs) - most} more pairs are not drawn.")

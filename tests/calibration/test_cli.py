@@ -17,6 +17,12 @@ from noiseflow.io import write
 
 from .conftest import textured_scene
 
+PARTS = (
+    *("Photon transfer", "Posterior of gain", "Residuals of the pixels kept apart", "QQ", "PIT", "row and column"),
+    *("before and after registration", "Verdict", "suffices", "can be believed", "lie on each other", "excess noise"),
+)
+"""What a reader of the report must find."""
+
 RANDOM = np.random.default_rng(1)
 
 
@@ -130,7 +136,8 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
     assert type(noiseflow.load(model)).__name__ == KINDS[result["kind"]]
     page = (report / "report.html").read_text()
     assert page.count("data:image/png") == 6
-    assert "suffices" in page
+    assert all(part in page for part in PARTS)
+    assert "excess noise" in result["detector"]["caveat"]
 
 
 def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
