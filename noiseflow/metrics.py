@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
-_SIGNAL_GROUPS = 256
+_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
+_SHIFT_WITHIN_GROUP = 1 / 16
 
 
 @dataclass(frozen=True)
@@ -161,13 +162,25 @@ def divergence(
 def residual_masses(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> NDArray[np.float64]:
     """Probability of each residual bin, averaged over the given (N,) signals, from the model's CDF; (K,) for (K+1,) edges."""
     order = torch.argsort(signal)
-    groups = torch.tensor_split(signal[order], min(_SIGNAL_GROUPS, signal.numel()))
+    groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
     bounds = level[:, None] + edges.to(signal)[None, :]
-    log_mass = noise_model(level[:, None]).log_interval_prob(bounds[:, :-1], bounds[:, 1:])
+    parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
+    log_mass = torch.cat([noise_model(s[:, None]).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts])
     mass = torch.exp(log_mass.double()).cpu().T @ (weight / weight.sum())
     return (mass / mass.sum()).numpy()
+
+
+def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> int:
+    """How many signals stand for all: single readings that have mass must not move across bins within a group."""
+    if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
+        return _SIGNAL_GROUPS
+    bins = edges[torch.isfinite(edges)].diff()
+    lengths = [float(getattr(module, "step", 0.0)) for module in noise_model.modules()]
+    least = min([float(bins.median()) if bins.numel() else math.inf, *(each for each in lengths if each > 0)])
+    wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * least)
+    return int(min(max(wanted, _SIGNAL_GROUPS), _MOST_SIGNAL_GROUPS))
 
 
 def compare_histogram(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,8 @@ def _pairs(folder: Path | None) -> Iterator[tuple[str, bool, Tensor, Tensor]]:
 
 def _aligned(folder: Path, channel: int, time: str) -> tuple[Tensor, Tensor]:
     """A real short exposure and its signal from the long one, registered, scaled and rid of its own noise."""
+    # calibration.py beside this file bears the package's name: keep the folder from hiding the package
+    sys.path = [path for path in sys.path if Path(path or ".").resolve() != Path(__file__).resolve().parent]
     from calibration import align_pair, read_pairs
 
     short, long = (folder / f"channel{channel}_{name}.tif" for name in (f"{time}ms", "long"))

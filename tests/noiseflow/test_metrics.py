@@ -42,6 +42,17 @@ def test_true_model_sits_on_its_floors() -> None:
     assert sum(e.ks > e.ks_floor for e in found) <= 2
 
 
+@pytest.mark.parametrize("step", [0.0, 1 / 255, 1 / 40])
+def test_true_digitised_model_sits_on_its_floor(step: float) -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.06), step=step, low=0.0, high=1.0)
+    found = []
+    for seed in range(4):
+        signal, observation = noisy(seed, 0.06)
+        found.append(metrics.divergence(model, signal, model(signal).digitise(observation)))
+    ratio = np.mean([each.jsd for each in found]) / np.mean([each.jsd_floor for each in found])
+    assert ratio == pytest.approx(1, abs=0.2)
+
+
 def test_floor_is_the_chi_squared_one() -> None:
     masses = np.full(32, 1 / 32)
     counts = np.random.default_rng(0).multinomial(100_000, masses)

@@ -18,19 +18,29 @@ def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tenso
 
 
 def test_simplest_sufficient_model_is_chosen() -> None:
-    signal, observation = noisy()
-    found = select(signal, observation, num_steps=100)
+    signal, observation = noisy(count=20_000)
+    found = select(signal, observation, num_steps=50)
     assert found.chosen.name == "Gaussian"
     assert found.digitisation == (0.0, -math.inf, math.inf)
-    clipped = select(signal, observation.clamp(0, 1), num_steps=100)
+    few = {"Gaussian": noiseflow.Gaussian(), "SplineFlow": noiseflow.SplineFlow()}
+    clipped = select(signal, observation.clamp(0, 1), candidates=few, num_steps=30)
     assert isinstance(clipped.chosen.model, noiseflow.Digitised)
+
+
+def test_resolved_electrons_choose_the_physical_model() -> None:
+    truth = noiseflow.PoissonGaussian(2.0, 100.0, 0.2)
+    signal = 100 + 12 * torch.rand(20_000, generator=torch.Generator().manual_seed(0))
+    found = select(signal, truth(signal).sample(generator=torch.Generator().manual_seed(1)), num_steps=50)
+    assert found.chosen.name == "PoissonGaussian"
+    assert {candidate.name for candidate in found.candidates if candidate.screened_out} >= {"Gaussian", "SplineFlow"}
+    assert metrics.kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
 
 
 def test_flow_is_chosen_for_skewed_noise() -> None:
     generator = torch.Generator().manual_seed(0)
-    signal = torch.rand(60_000, generator=generator)
+    signal = torch.rand(20_000, generator=generator)
     gamma = -torch.log(torch.rand((2, *signal.shape), generator=generator)).sum(0)
-    found = select(signal, signal + 0.1 * (gamma - 2), num_steps=150)
+    found = select(signal, signal + 0.1 * (gamma - 2), num_steps=100)
     assert "Flow" in found.chosen.name
     by_name = {candidate.name: candidate for candidate in found.candidates}
     assert by_name["Gaussian"].excess > 0.05
