@@ -12,18 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import (
-    Digitised,
-    FitResult,
-    Gaussian,
-    Mixture,
-    PoissonGaussian,
-    RadialFlow,
-    SignalDependentGaussian,
-    SplineFlow,
-    detect_digitisation,
-    fit,
-)
+from noiseflow import FitResult, Gaussian, fit
+from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
 from recon.coarse_start import coarse_start, learning_rate
 from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field, MultiresolutionField
@@ -40,10 +30,8 @@ from recon.weight import WeightChoice, choose_weight
 
 Progress = Callable[[int, str], None]
 _FIRST_WEIGHT = 0.4
-_CLIPPED = 0.02
 _TOLERATED = 0.003
 _FIRST_TURN, _SECOND_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the first turn's
-_EXACT_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -136,7 +124,9 @@ class JointReconstructor:
         generator = torch.Generator().manual_seed(self.seed)
         rough = coarse_start(tilt_series, response, grid, generator=generator).to(self.device)
         response = response.to(self.device)
-        field = self.make_field(grid.shape, scale=attenuation_scale(rough)).to(self.device)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            field = self.make_field(grid.shape, scale=attenuation_scale(rough)).to(self.device)
         field.start_from(rough)
         weight = _FIRST_WEIGHT if self.weight is None else self.weight
         rate = learning_rate(rough, field)
@@ -153,7 +143,7 @@ class JointReconstructor:
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None]:
         """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        if given is not None and self.weight is not None and not _learns(given):
+        if given is not None and self.weight is not None and not learns(given):
             return given, None
         rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -174,22 +164,6 @@ class JointReconstructor:
         with _frozen(noise_model):
             choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
         return noise_model, choice
-
-
-def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
-    """Noise models worth trying for these images, simplest first, behind the rounding and rails that they show.
-
-    All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
-    anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
-    seen at other signals stands in for what is hidden.
-    """
-    digitisation = detect_digitisation(images)
-    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian()]
-    if float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) < _CLIPPED:
-        models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
-    else:
-        models.append(RadialFlow(6, num_conditional=0, mean_preserving=True))
-    return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
 
 class _Task:
@@ -213,7 +187,7 @@ class _Task:
         if known:
             with torch.no_grad():
                 signal = self.signal_model.signal().view_as(self.observation)
-        options = {"batch_size": 4096, "learning_rate": _learning_rate(noise_model)} | options
+        options = {"batch_size": 4096, "learning_rate": rate_of(noise_model)} | options
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
@@ -249,24 +223,8 @@ class _Task:
 
     def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
         """Fit a noise model that learns to the signal as it is."""
-        if _learns(noise_model):
-            self.fit(noise_model, known=True, num_steps=_num_steps(noise_model, 60), standardise=standardise)
-
-
-def _learns(noise_model: nn.Module) -> bool:
-    return any(parameter.requires_grad for parameter in noise_model.parameters())
-
-
-def _num_steps(noise_model: nn.Module, usual: int) -> int:
-    """The exact sum over electrons takes long, but it starts at its most likely parameters."""
-    exact = any(isinstance(module, PoissonGaussian) for module in noise_model.modules())
-    return min(usual, _EXACT_STEPS) if exact else usual
-
-
-def _learning_rate(noise_model: nn.Module) -> float:
-    """Models of many parameters overshoot at rates that the others need to keep up with the volume."""
-    rich = any(isinstance(module, SplineFlow | Mixture) for module in noise_model.modules())
-    return 0.01 if rich else 0.03
+        if learns(noise_model):
+            self.fit(noise_model, known=True, num_steps=num_steps_of(noise_model, 60), standardise=standardise)
 
 
 def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
@@ -274,7 +232,7 @@ def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module
     signal that it took for noise."""
     device = task.observation.device
     nll = [
-        task.fit(model.to(device), known=True, num_steps=_num_steps(model, 100)).held_out_nll for model in candidates
+        task.fit(model.to(device), known=True, num_steps=num_steps_of(model, 100)).held_out_nll for model in candidates
     ]
     return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
 

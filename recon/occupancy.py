@@ -29,7 +29,7 @@ class Occupancy(nn.Module):
     mask: Tensor
 
     def __init__(
-        self, rough: Tensor, shape: Sequence[int], *, least: float = 0.05, margin: int = 3, block: int = 4
+        self, rough: Tensor, shape: Sequence[int], *, least: float = 0.2, margin: int = 2, block: int = 4
     ) -> None:
         super().__init__()
         self.block, self._since_test = block, 0

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 import noiseflow
+from recon.candidates import noise_candidates
 from recon.fields import VoxelField
 from recon.first_guess import estimate_response
 from recon.image_formation import Linear, Transmission
-from recon.joint import JointReconstructor, block_mask, noise_candidates
+from recon.joint import JointReconstructor, block_mask
 from recon.metrics import compare
 from recon.phantoms import shells
 from recon.projector import SliceProjector

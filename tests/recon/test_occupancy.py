@@ -1,13 +1,20 @@
 """Skipping of vacuum: nothing changes where the field is evaluated, and what the data wants is found."""
 
+from functools import partial
+
+import numpy as np
 import pytest
 import torch
 
 from recon.coordinate_network import CoordinateNetwork
 from recon.image_formation import Transmission
+from recon.joint import JointReconstructor
 from recon.occupancy import Occupancy
+from recon.phantoms import shells
 from recon.projector import SliceProjector
 from recon.signal_model import TomographySignal
+from recon.simulation import clean_tilt_series
+from recon.tilt_series import VolumeGrid
 
 
 @pytest.fixture
@@ -79,3 +86,16 @@ def test_what_the_data_wants_becomes_occupied_and_nothing_else():
     assert bool(found[truth > 0].all())
     assert not found[:, 12:].any()
     assert occupancy.share < 0.6
+
+
+def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
+    density = shells(16, generator=np.random.default_rng(1), count=2)
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 20.0))
+    make = partial(CoordinateNetwork, width=8, layers=2, frequencies=2, skip=0)
+    grid = VolumeGrid.of(clean)
+    first, second, plain = (
+        JointReconstructor(make_field=make, skip_vacuum=skip).prepare(clean, grid) for skip in (True, True, False)
+    )
+    assert plain.occupancy is None
+    assert torch.equal(first.occupancy.mask, second.occupancy.mask)
+    torch.testing.assert_close(first.field.volume(), second.field.volume(), rtol=0, atol=0)

@@ -1,0 +1,54 @@
+"""Noise models that a joint fit chooses from, and how each is best fitted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+from torch import nn
+
+from noiseflow import (
+    Digitised,
+    Mixture,
+    PoissonGaussian,
+    RadialFlow,
+    SignalDependentGaussian,
+    SplineFlow,
+    detect_digitisation,
+)
+
+_CLIPPED = 0.02
+_EXACT_STEPS = 15
+
+
+def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
+    """Noise models worth trying for these images, simplest first, behind the rounding and rails that they show.
+
+    All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
+    anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
+    seen at other signals stands in for what is hidden.
+    """
+    digitisation = detect_digitisation(images)
+    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian()]
+    if float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) < _CLIPPED:
+        models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
+    else:
+        models.append(RadialFlow(6, num_conditional=0, mean_preserving=True))
+    return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
+
+
+def learns(noise_model: nn.Module) -> bool:
+    """Whether a noise model has anything to learn."""
+    return any(parameter.requires_grad for parameter in noise_model.parameters())
+
+
+def num_steps_of(noise_model: nn.Module, usual: int) -> int:
+    """The exact sum over electrons takes long, but it starts at its most likely parameters."""
+    exact = any(isinstance(module, PoissonGaussian) for module in noise_model.modules())
+    return min(usual, _EXACT_STEPS) if exact else usual
+
+
+def rate_of(noise_model: nn.Module) -> float:
+    """Models of many parameters overshoot at rates that the others need to keep up with the volume."""
+    rich = any(isinstance(module, SplineFlow | Mixture) for module in noise_model.modules())
+    return 0.01 if rich else 0.03
