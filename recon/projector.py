@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,26 @@ class SliceProjector:
         """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
         _require(line_integrals, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
         return from_columns(self.backproject(to_rays(line_integrals)), self.depth)
+
+    def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
+        """Operators of layers across the beam, which add up to this one.
+
+        Args:
+            layer_of: from distances along the beam beyond the tilt axis, voxels, to the numbers of layers, 0 and up.
+        """
+        rays = np.repeat(np.arange(self.matrix.shape[0]), self.matrix.crow_indices().diff().cpu().numpy())
+        voxels = self.matrix.col_indices().cpu().numpy().astype(np.int64)
+        weights = self.matrix.values().double().cpu().numpy()
+        theta = np.deg2rad(self.tilt_angles)[rays // self.detector_width]
+        z, x = voxels // self.width - (self.depth - 1) / 2, voxels % self.width - (self.width - 1) / 2
+        layer = layer_of(z * np.cos(theta) - x * np.sin(theta))
+        parts = []
+        for number in range(int(layer.max(initial=0)) + 1):
+            here, part = layer == number, copy.copy(self)
+            part.matrix = _csr(rays[here], voxels[here], weights[here], self.matrix.shape).to(self.matrix)
+            part.transposed = _csr(voxels[here], rays[here], weights[here], self.transposed.shape).to(self.matrix)
+            parts.append(part)
+        return parts
 
 
 def to_columns(volume: Tensor) -> Tensor:
