@@ -74,7 +74,9 @@ def skipping(phantom: str, size: int = 96, num_steps: int = 80) -> Row:
     """A small coordinate network with and without skipping of vacuum, equal steps, noise known and weight given."""
     scene = make_scene(size, phantom=phantom, tilts="-58.5:58.5:3")
     make = partial(CoordinateNetwork, width=32, layers=3, frequencies=6, skip=1)
-    fit = JointReconstructor(num_steps=num_steps, weight=_WEIGHT, make_field=make, noise_model=lambda: scene.noise_model)
+    fit = JointReconstructor(
+        num_steps=num_steps, weight=_WEIGHT, make_field=make, noise_model=lambda: scene.noise_model
+    )
     fits = [replace(fit, skip_vacuum=skip) for skip in (True, False)]
     (skipped, result), (full, reference) = in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=1)
     psnr = [compare(each.volume.attenuation, scene.truth).psnr for each in (result, reference)]
