@@ -22,6 +22,8 @@ from calibration.matching import (
     correlation_surface,
     feature_guesses,
 )
+from noiseflow.described import described
+from noiseflow.io import as_array
 
 Motion = Literal["translation", "euclidean", "affine"]
 
@@ -42,6 +44,7 @@ SEARCH_MARGIN = 1.5
 """Pixels from zero shift within which that peak must lie."""
 
 
+@described(rms_px="px", error_px="px")
 @dataclass(frozen=True)
 class Registration:
     """Where the short frame's pixels lie in the long one.
@@ -128,6 +131,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     Raises:
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
     """
+    short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
     overlap, most_matches = 1.0, 0
     for guesses in (feature_guesses(short, long), correlation_guesses(short, long)):
         for guess in guesses:

@@ -11,6 +11,7 @@ from calibration.align import Registration, register
 from calibration.exposures import ExposurePair, Image, rails
 from calibration.masks import Mask, MaskCounts, clear_of_rails, defects, saturated
 from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
+from noiseflow.described import described
 
 LARGEST_SHARE = 0.5
 """Share of the residual's variance above which the 'long' exposure is the noisier of the two."""
@@ -22,6 +23,7 @@ MINIMUM_PIXELS = 500
 """Pixels below which a noise model cannot be told from another."""
 
 
+@described(short="counts", long="as recorded", signal="counts")
 @dataclass(frozen=True)
 class AlignedPair:
     """A short exposure, untouched, and the signal of each of its pixels, from the registered long one.

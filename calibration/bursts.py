@@ -13,6 +13,7 @@ from calibration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.exposures import Burst, Image
 from calibration.masks import Mask, MaskCounts, defects, restless, saturated
 from calibration.scaling import Scaling, VarianceLine, fit_line, fit_scaling
+from noiseflow.described import described
 
 LEAST_DRIFT = 0.1
 """Pixels below which a burst counts as still: warping would cost more than it mends."""
@@ -24,6 +25,7 @@ LEAST_DOSE_CHANGE = 0.005
 """Relative dose change below which a burst counts as steady."""
 
 
+@described(shift="px", drift="px", dose="of the mean", dose_error="of the mean")
 @dataclass(frozen=True)
 class BurstReport:
     """What moved or faded along a burst.

@@ -18,6 +18,7 @@ from calibration.masks import Mask, clear_of_rails
 from calibration.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.posterior import DetectorPosterior, sample_posterior
 from calibration.scaling import ring_mean
+from noiseflow.described import described
 
 if TYPE_CHECKING:
     from noiseflow.console import Progress
@@ -31,6 +32,7 @@ FEW_ELECTRONS = 25.0
 """Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
 
 
+@described(offset="counts")
 @dataclass(frozen=True)
 class Detector:
     """A detector's parameters and what they rest on.

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.described import described
 from noiseflow.digitisation import detect_digitisation
-from noiseflow.io import read, require_contrast, require_finite
+from noiseflow.io import as_array, read, require_contrast, require_finite
 
 Image = NDArray[np.float64]
 
@@ -20,12 +21,13 @@ MINIMUM_SIDE = 32
 """Smallest frame side, in pixels, that can be registered and judged."""
 
 
+@described(short="detector units", long="detector units")
 @dataclass(frozen=True)
 class ExposurePair:
     """One scene taken twice: a short, noisy exposure and a long, cleaner one.
 
     Args:
-        short: (y, x) frame whose noise is to be learned, detector units.
+        short: (y, x) frame whose noise is to be learned, detector units; an array or a tensor.
         long: (y, x) frame that tells its signal, in any linear scale of detector units.
         exposure_ratio: exposure time (or dose) of the long frame over that of the short one, > 1; None: unknown.
         short_name: how messages call the short frame.
@@ -58,12 +60,13 @@ class ExposurePair:
             )
 
 
+@described(frames="detector units")
 @dataclass(frozen=True)
 class Burst:
     """Equal exposures of one scene: every frame is judged against the mean of the others.
 
     Args:
-        frames: (frame, y, x) in the order taken, detector units, two frames or more.
+        frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
         name: how messages call the burst.
 
     Raises:
@@ -74,7 +77,7 @@ class Burst:
     name: str = "the burst"
 
     def __post_init__(self) -> None:
-        frames = np.asarray(self.frames)
+        frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
                 f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give a long "
@@ -97,7 +100,7 @@ def checked_frame(data: NDArray[Any], name: str) -> Image:
     Raises:
         ValueError: not one grey image, smaller than `MINIMUM_SIDE`, NaN, flat, or half of it saturated.
     """
-    data = np.asarray(data)
+    data = as_array(data)
     if data.ndim == 3 and data.shape[0] == 1:
         data = data[0]
     if data.ndim == 3 and min(data.shape[0], data.shape[-1]) <= 4:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.aligned import AlignedPair, block_split
+from noiseflow.described import described
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -35,6 +36,7 @@ NUM_STEPS = 500
 """Optimisation steps of each model."""
 
 
+@described(signal="counts", observation="counts")
 @dataclass(frozen=True)
 class Pixels:
     """Pixels of all pairs in one row, ready to fit and to judge.
@@ -52,6 +54,7 @@ class Pixels:
     block: NDArray[np.int64]
 
 
+@described(nll="nats per pixel", nll_error="nats per pixel", excess="nats per pixel", excess_error="nats per pixel")
 @dataclass(frozen=True)
 class ModelScore:
     """A fitted noise model and its figures on the pixels kept apart.

@@ -10,12 +10,16 @@ import numpy as np
 from calibration.exposures import Image
 from calibration.levels import Levels
 from calibration.scaling import fit_line
+from noiseflow.described import described
 
 
 class NotMeasurable(ValueError):
     """The exposures cannot tell the detector's gain, though a noise model can still be fitted."""
 
 
+@described(
+    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²"
+)
 @dataclass(frozen=True)
 class PhotonTransfer:
     """The straight line of variance against signal: ``variance = gain·signal + intercept``

@@ -15,6 +15,7 @@ from calibration.detector import Detector, measure_detector
 from calibration.exposures import Burst, ExposurePair, Image
 from calibration.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.photon_transfer import NotMeasurable
+from noiseflow.described import described
 
 if TYPE_CHECKING:
     from noiseflow.console import Progress
@@ -23,6 +24,7 @@ Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
 """``bar(title, total)``: a context that gives a progress callback."""
 
 
+@described()
 @dataclass(frozen=True)
 class Findings:
     """All that a calibration found.

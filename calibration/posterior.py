@@ -11,6 +11,7 @@ import numpy as np
 from calibration.exposures import Image
 from calibration.levels import Levels
 from calibration.log_posterior import LogPosterior, maximum_likelihood
+from noiseflow.described import described
 
 if TYPE_CHECKING:
     from noiseflow.console import Progress
@@ -30,6 +31,7 @@ BURN_IN = 60
 """Steps that only find out where the posterior lies."""
 
 
+@described()
 @dataclass(frozen=True)
 class Interval:
     """Median and 5 % and 95 % quantiles of a parameter."""
@@ -39,6 +41,7 @@ class Interval:
     q95: float
 
 
+@described(samples="gain (counts per electron), offset (counts), read noise (electrons)", autocorrelation_time="steps")
 @dataclass(frozen=True)
 class DetectorPosterior:
     """The posterior of a detector's parameters.

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures import Image
+from noiseflow.described import described
 
 Mask = NDArray[np.bool_]
 
 
+@described(intercept="counts", intercept_error="counts", level_error="counts")
 @dataclass(frozen=True)
 class Scaling:
     """signal = slope·long + intercept, in the short exposure's units.
@@ -42,6 +44,7 @@ class Scaling:
         return offset, float(np.hypot(self.level_error / (1 - self.slope), lever * self.slope_error))
 
 
+@described(floor="counts²", rate="counts")
 @dataclass(frozen=True)
 class VarianceLine:
     """A variance that grows linearly with the signal, as shot noise with read noise does: floor + rate·signal,

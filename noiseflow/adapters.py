@@ -15,6 +15,7 @@ from noiseflow.fit import fit
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics import kl_divergence
 from noiseflow.mixture import MixtureDistribution
+from noiseflow.modules import ArrayModel
 
 _NUM_PIXELS = 100_000
 _LEAST_VARIANCE = 1e-4  # of the noise's own
@@ -114,7 +115,7 @@ def _fitted_range(model: nn.Module) -> tuple[float, float]:
     )
 
 
-class PolynomialMixture(nn.Module):
+class PolynomialMixture(ArrayModel):
     """The noise model of PN2V (Prakash et al. 2020, arXiv:1911.12291) as CAREamics evaluates it.
 
     With t the signal from 0 at `low` to 1 at `high`: the variances are Σ exp(a_i)·tⁱ, the log-weights Σ b_i·tⁱ before they are

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions import LatentDistribution, NoiseDistribution, bisect_quantile
+from noiseflow.modules import ArrayModel
 
 
-class Gaussian(nn.Module):
+class Gaussian(ArrayModel):
     """Gaussian noise of one standard deviation around the signal.
 
     Args:
@@ -65,7 +66,7 @@ class GaussianDistribution(LatentDistribution):
         return torch.exp(2 * self.log_scale).expand_as(self.signal)
 
 
-class Poisson(nn.Module):
+class Poisson(ArrayModel):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
     Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell: it

@@ -51,7 +51,7 @@ def detect_digitisation(readings: ArrayLike) -> Digitisation:
     Args:
         readings: any shape and real type, detector units; NaN and infinite ones are left out.
     """
-    values = np.asarray(readings)
+    values = np.asarray(readings.detach().cpu() if hasattr(readings, "detach") else readings)
     if values.dtype.kind == "b":
         values = values.astype(np.uint8)
     values = values.reshape(-1)

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 
 from noiseflow import tabulated
 from noiseflow.distributions import NoiseDistribution
+from noiseflow.modules import ArrayModel
 from noiseflow.picked import Signal, given_to, values_of
 
 _MOMENT_NODES = 257
 _LEAST_CLEAR, _RAILED = 256, 0.02
 
 
-class Digitised(nn.Module):
+class Digitised(ArrayModel):
     """A detector that rounds to steps and clips at rails, in front of any noise model.
 
     An observation k stands for every reading in (k − step/2, k + step/2]; the rails stand for everything beyond them too.

@@ -6,9 +6,12 @@ import logging
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arrays import as_tensor
 from noiseflow.digitisation import Digitisation, detect_digitisation
 from noiseflow.digitised import Digitised
 from noiseflow.fit_loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
@@ -22,13 +25,13 @@ _log = logging.getLogger("noiseflow")
 
 def fit(
     noise_model: nn.Module,
-    signal: Tensor | nn.Module,
-    observation: Tensor,
+    signal: Tensor | NDArray[Any] | nn.Module,
+    observation: Tensor | NDArray[Any],
     *,
-    mask: Tensor | None = None,
+    mask: Tensor | NDArray[np.bool_] | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
-    held_out: float | Tensor = 0.1,
+    held_out: float | Tensor | NDArray[np.bool_] = 0.1,
     num_steps: int = 500,
     batch_size: int = 8192,
     learning_rate: float = 1e-2,
@@ -49,15 +52,15 @@ def fit(
 
     Args:
         noise_model: the model to fit; one without trainable parameters stays as it is.
-        signal: clean signals shaped like `observation`, or a `SignalModel`. A trainable one may offer ``parameter_groups()``,
-            parameter groups with their learning rates for Adam.
-        observation: noisy readings, any shape and real type, detector units; for models that look beyond single pixels,
-            images (..., y, x).
+        signal: clean signals, a tensor or an array shaped like `observation`, or a `SignalModel`. A trainable one may offer
+            ``parameter_groups()``, parameter groups with their learning rates for Adam.
+        observation: noisy readings, a tensor or an array of any shape and real type, detector units; for models that look
+            beyond single pixels, images (..., y, x).
         mask: pixels to use, shaped like `observation`; all by default.
         skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
         digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
             model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
-        held_out: fraction of the pixels, or a boolean tensor of those, that judge the fit and never train it.
+        held_out: fraction of the pixels, or those, boolean, that judge the fit and never train it.
         num_steps: optimisation steps.
         batch_size: pixels per noise-model step.
         learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``.
@@ -76,6 +79,11 @@ def fit(
     Raises:
         ValueError: shapes differ, pixels are not finite, too few pixels, or no finite step could be made.
     """
+    if isinstance(signal, np.ndarray):
+        signal = as_tensor(signal)
+    observation = as_tensor(observation)
+    mask = mask if mask is None else as_tensor(mask)
+    held_out = as_tensor(held_out) if isinstance(held_out, np.ndarray) else held_out
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"

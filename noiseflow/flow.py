@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from noiseflow import tabulated
 from noiseflow.distributions import LatentDistribution, normal_quadrature
+from noiseflow.modules import ArrayModel
 from noiseflow.picked import Signal, require_image, values_of, windows_of
 from noiseflow.standardisation import Standardisation, interpolate_cubic
 from noiseflow.transforms import Affine, Radial, Spline, StudentTail, Transform
@@ -103,7 +104,7 @@ def _knots(raw: Tensor, reach: float) -> Tensor:
     return torch.cat([-end, inner, end], -1)
 
 
-class ConditionalFlow(nn.Module):
+class ConditionalFlow(ArrayModel):
     """A noise model made of layers, the first one next to the data; the last one gives the standard normal latent.
 
     Args:
@@ -203,7 +204,10 @@ class ConditionalFlow(nn.Module):
 
     def extra_repr(self) -> str:
         low, high = float(self.standardisation.signal_low), float(self.standardisation.signal_high)
-        return f"signals {low:g} … {high:g}, {len(self.layers)} layers, mean_preserving={self.mean_preserving}"
+        return (
+            f"signals {low:g} … {high:g}, {len(self.layers)} layers, width={self.width}, "
+            f"mean_preserving={self.mean_preserving}"
+        )
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""

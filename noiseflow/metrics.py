@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from noiseflow.arrays import Given, alike, as_tensor, floating
+from noiseflow.described import described
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -20,6 +24,7 @@ _SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
 _SHIFT_WITHIN_GROUP = 1 / 16
 
 
+@described(jsd="nats", jsd_floor="nats", jsd_interval="nats", bd="nats", bd_floor="nats")
 @dataclass(frozen=True)
 class Divergence:
     """Distances between a histogram and a model, in nats.
@@ -43,6 +48,7 @@ class Divergence:
     bd_floor: float
 
 
+@described(nll="nats per pixel", nll_error="nats per pixel")
 @dataclass(frozen=True)
 class Evaluation:
     """A noise model judged on pixels it has not seen.
@@ -80,8 +86,8 @@ class Evaluation:
 
 def evaluate(
     noise_model: nn.Module,
-    signal: Tensor,
-    observation: Tensor,
+    signal: Tensor | NDArray[Any],
+    observation: Tensor | NDArray[Any],
     *,
     num_bins: int = 64,
     num_signal_bins: int = 16,
@@ -92,7 +98,7 @@ def evaluate(
 
     Args:
         noise_model: the model.
-        signal, observation: any shape, equal; detector units.
+        signal, observation: tensors or arrays of any shape, equal; detector units.
         num_bins: bins of the residual histograms.
         num_signal_bins: bins of equal population along the signal.
         skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
@@ -101,7 +107,7 @@ def evaluate(
     Raises:
         ValueError: shapes differ, pixels are not finite, or there are none.
     """
-    signal, observation = signal.reshape(-1), observation.reshape(-1)
+    signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)
     if signal.shape != observation.shape or not signal.numel():
         raise ValueError(
             f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
@@ -134,21 +140,22 @@ def evaluate(
 
 
 @torch.no_grad()
-def pixel_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor:
+def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) -> Given:
     """Log-likelihood of each pixel, float64, (N,), computed piece by piece."""
-    pieces = zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True)
-    return torch.cat([noise_model(s).log_prob(o).double().cpu() for s, o in pieces])
+    pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
+    return alike(torch.cat([noise_model(s).log_prob(o).double().cpu() for s, o in pieces]), signal)
 
 
 def divergence(
     noise_model: nn.Module,
-    signal: Tensor,
-    observation: Tensor,
+    signal: Tensor | NDArray[Any],
+    observation: Tensor | NDArray[Any],
     *,
     num_bins: int = 64,
     random: np.random.Generator | None = None,
 ) -> Divergence:
     """Divergence between the residuals observation − signal and the model's exact masses in the same bins; both (N,)."""
+    signal, observation = floating(signal), floating(observation)
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
     low, high = np.quantile(residual, (0.001, 0.999))
@@ -159,8 +166,11 @@ def divergence(
 
 
 @torch.no_grad()
-def residual_masses(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> NDArray[np.float64]:
+def residual_masses(
+    noise_model: nn.Module, signal: Tensor | NDArray[Any], edges: Tensor | NDArray[Any]
+) -> NDArray[np.float64]:
     """Probability of each residual bin, averaged over the given (N,) signals, from the model's CDF; (K,) for (K+1,) edges."""
+    signal, edges = floating(signal), as_tensor(edges)
     order = torch.argsort(signal)
     groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
@@ -226,11 +236,15 @@ def _relative_entropy(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray
 
 @torch.no_grad()
 def probability_integral_transform(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, random: np.random.Generator
+    noise_model: nn.Module,
+    signal: Tensor | NDArray[Any],
+    observation: Tensor | NDArray[Any],
+    random: np.random.Generator,
 ) -> NDArray[np.float64]:
     """F(observation | signal) of (N,) pixels, uniform under the true model; jumps of F are filled at random."""
     values = []
-    for s, o in zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True):
+    pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
+    for s, o in pieces:
         distribution = noise_model(s)
         values.append(torch.stack([distribution.cdf_below(o), distribution.cdf(o)]).double().cpu().numpy())
     below, at = np.concatenate(values, axis=1)
@@ -283,7 +297,9 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
 
 
 @torch.no_grad()
-def kl_divergence(truth: nn.Module, noise_model: nn.Module, signal: Tensor, *, seed: int = 0) -> tuple[float, float]:
+def kl_divergence(
+    truth: nn.Module, noise_model: nn.Module, signal: Tensor | NDArray[Any], *, seed: int = 0
+) -> tuple[float, float]:
     """Kullback–Leibler divergence from a known truth, E[log p_true − log p_model] in nats per pixel, and its standard error.
 
     Args:
@@ -292,6 +308,7 @@ def kl_divergence(truth: nn.Module, noise_model: nn.Module, signal: Tensor, *, s
         signal: (N,) signals; one observation is drawn at each.
         seed: of the draws.
     """
+    signal = floating(signal)
     generator = torch.Generator(signal.device).manual_seed(seed)
     observation = truth(signal).sample(generator=generator)
     difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 
 from noiseflow.distributions import NoiseDistribution, bisect_quantile, log_normal_interval
 from noiseflow.flow import conditioning_features, conditioning_network
+from noiseflow.modules import ArrayModel
 from noiseflow.standardisation import Standardisation
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
-class Mixture(nn.Module):
+class Mixture(ArrayModel):
     """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
 
     Args:
@@ -63,7 +64,7 @@ class Mixture(nn.Module):
         return {"num_components": self.num_components, "mean_preserving": self.mean_preserving, "width": self.width}
 
     def extra_repr(self) -> str:
-        return f"{self.num_components} components, mean_preserving={self.mean_preserving}"
+        return f"{self.num_components} components, width={self.width}, mean_preserving={self.mean_preserving}"
 
 
 class MixtureDistribution(NoiseDistribution):

@@ -32,14 +32,14 @@ def kinds() -> dict[str, type[nn.Module]]:
 
 
 def save(
-    model: nn.Module, path: str | Path, *, units: str = "detector units", provenance: Mapping[str, Any] | None = None
+    model: nn.Module, path: str | Path, *, units: str | None = None, provenance: Mapping[str, Any] | None = None
 ) -> Path:
     """Save a noise model.
 
     Args:
         model: any model whose class is in `kinds`, on any device.
         path: target, ``.safetensors``.
-        units: units of signal and observation.
+        units: units of signal and observation; by default those of the model, which `load` keeps.
         provenance: where the model comes from: anything JSON can hold.
 
     Raises:
@@ -53,7 +53,7 @@ def save(
         "format_version": str(FORMAT_VERSION),
         "library_version": version("noiseflow"),
         "model": json.dumps(_describe(model)),
-        "units": units,
+        "units": units or str(getattr(model, "measured_in", "detector units")),
         "provenance": json.dumps(dict(provenance or {}), default=str),
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
@@ -87,6 +87,8 @@ def load(path: str | Path) -> nn.Module:
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
     model.load_state_dict(tensors)
+    if metadata.get("units"):
+        model.measured_in = metadata["units"]  # type: ignore[assignment]
     return model.eval()
 
 

@@ -11,11 +11,12 @@ from torch import Tensor, nn
 
 from noiseflow.distributions import NoiseDistribution, bisect_quantile
 from noiseflow.electrons import log_both_tails, log_density, log_interval
+from noiseflow.modules import ArrayModel
 
 _LEAST_READ_NOISE = 1e-3
 
 
-class PoissonGaussian(nn.Module):
+class PoissonGaussian(ArrayModel):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
     The rate of k is (signal − offset)/gain, and 0 where the signal lies below the offset. The likelihood is exact at any dose,

@@ -5,16 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from noiseflow.flow import ConditionalFlow, affine_layer, spline_layer
 from noiseflow.latent_mean import LatentMean
+from noiseflow.modules import ArrayModel
 from noiseflow.physical import PoissonGaussian
 from noiseflow.physics_distribution import PhysicsFlowDistribution
 from noiseflow.transforms import Affine, Transform
 
 
-class PhysicsFlow(nn.Module):
+class PhysicsFlow(ArrayModel):
     """Poisson–Gaussian noise, corrected by a flow of its latent.
 
     The latent of an observation under the detector, z = Φ⁻¹(F(o | s)), is standard normal if the detector is the whole truth.
@@ -86,6 +87,9 @@ class PhysicsFlow(nn.Module):
     def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
         """Log-likelihood of intervals by their `fixed_interval_part`."""
         return self.forward(signal).corrected_interval(*fixed_part.unbind(-1)).to(signal.dtype)
+
+    def extra_repr(self) -> str:
+        return f"{self.num_bins} bins, width={self.width}, mean_preserving={self.mean_preserving}"
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the detector inside."""

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arrays import floating
 from noiseflow.distributions import NoiseDistribution
+from noiseflow.modules import ArrayModel
 from noiseflow.picked import PickedSignal, Signal, given_to, require_image, values_of
 
 
-class WithMaps(nn.Module):
+class WithMaps(ArrayModel):
     """A noise model seen through a detector whose pixels have gains and offsets of their own.
 
     observation = gain·o + offset, o drawn from the model at the clean signal: signals are those of an ideal pixel (gain 1,
@@ -35,8 +38,8 @@ class WithMaps(nn.Module):
     def __init__(
         self,
         model: nn.Module,
-        gain: Tensor | None = None,
-        offset: Tensor | None = None,
+        gain: Tensor | NDArray[Any] | None = None,
+        offset: Tensor | NDArray[Any] | None = None,
         *,
         shape: Sequence[int] | None = None,
     ) -> None:
@@ -45,8 +48,8 @@ class WithMaps(nn.Module):
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:
             raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or two of one size")
         self.model = model
-        self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else gain.detach().clone())
-        self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else offset.detach().clone())
+        self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
+        self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
         if not bool((torch.isfinite(self.gain) & torch.isfinite(self.offset) & (self.gain > 0)).all()):
             raise ValueError(
                 "some gains are not positive, or gains or offsets are NaN; mend or mask these pixels' maps"

@@ -12,13 +12,14 @@ from torch import Tensor, nn
 from noiseflow.digitisation import Digitisation
 from noiseflow.digitised import Digitised
 from noiseflow.distributions import NoiseDistribution, bisect_quantile, normal_quadrature
+from noiseflow.modules import ArrayModel
 from noiseflow.picked import PickedSignal, Signal, given_to, require_image, values_of
 
 _REACH = 8.0  # standard deviations of the offset beyond which nothing is looked for
 _FINE, _COARSE = 0.1, 0.25
 
 
-class ScanNoise(nn.Module):
+class ScanNoise(ArrayModel):
     """A noise model plus one Gaussian offset for every row (or column) of an image, as scanning adds it.
 
     The readings of a row are no longer independent: given the offset b they are, so the likelihood of a row is

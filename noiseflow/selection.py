@@ -6,12 +6,16 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import baselines, flow, mixture, physical, physics_flow
+from noiseflow.arrays import as_tensor
+from noiseflow.described import described
 from noiseflow.digitisation import Digitisation, detect_digitisation
 from noiseflow.digitised import Digitised
 from noiseflow.fit import fit
@@ -23,6 +27,7 @@ _HOPELESS = 0.02
 _SHARE_FROM_MAXIMUM = 0.1
 
 
+@described(nll="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
 @dataclass(frozen=True)
 class Candidate:
     """A fitted noise model and its held-out likelihood.
@@ -46,6 +51,7 @@ class Candidate:
     screened_out: bool = False
 
 
+@described()
 @dataclass(frozen=True)
 class Selection:
     """All candidates, simplest first, and the chosen one.
@@ -75,8 +81,8 @@ def default_candidates() -> dict[str, nn.Module]:
 
 
 def select(
-    signal: Tensor,
-    observation: Tensor,
+    signal: Tensor | NDArray[Any],
+    observation: Tensor | NDArray[Any],
     *,
     candidates: Mapping[str, nn.Module] | None = None,
     held_out: float = 0.2,
@@ -89,7 +95,7 @@ def select(
     those whose held-out likelihood is then hopelessly behind (0.02 nats, and three standard errors) get no long one.
 
     Args:
-        signal, observation: equal shapes, detector units.
+        signal, observation: tensors or arrays of equal shapes, detector units.
         candidates: models by name, simplest first; they are fitted in place. `default_candidates` by default.
         held_out: fraction of the pixels kept apart to judge.
         num_steps: optimisation steps of each; a tenth of them for one that starts at its most likely parameters.
@@ -98,6 +104,7 @@ def select(
     Raises:
         ValueError: as `fit`.
     """
+    signal, observation = as_tensor(signal), as_tensor(observation)
     digitisation = detect_digitisation(observation.detach().cpu().numpy())
     signal, observation = signal.reshape(-1).float(), observation.reshape(-1).float()
     # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arrays import floating
+from noiseflow.described import described
 from noiseflow.metrics import probability_integral_transform
 from noiseflow.picked import needs_image
 from noiseflow.scan_noise import ScanDistribution
 
 
+@described()
 @dataclass(frozen=True)
 class SpatialStructure:
     """Correlations that a per-pixel noise model cannot have, of standardised residuals of an image.
@@ -51,12 +55,14 @@ class SpatialStructure:
 
 
 @torch.no_grad()
-def spatial_structure(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> SpatialStructure:
+def spatial_structure(
+    noise_model: nn.Module, signal: Tensor | NDArray[Any], observation: Tensor | NDArray[Any]
+) -> SpatialStructure:
     """Residual row, column, neighbour and fixed-pattern correlation of (y, x) images, or stacks of them, under a noise model.
 
     NaN and infinite pixels are left out: their residuals count as 0.
     """
-    z = _latent(noise_model, signal, observation)
+    z = _latent(noise_model, floating(signal), floating(observation))
     height, width = z.shape[-2:]
     error = 1 / math.sqrt(z.size)
     rows, columns = float(z.mean(-1).var() * width), float(z.mean(-2).var() * height)

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from noiseflow.modules import Described
 from recon.projector import from_columns
 
 _LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
 
 
-class Field(nn.Module):
+class Field(Described):
     """A trainable volume of non-negative attenuation.
 
     Args:
@@ -22,6 +23,7 @@ class Field(nn.Module):
         scale: attenuation per voxel that counts as one unit; a guess within a factor of ten serves.
     """
 
+    measured_in = "attenuation per voxel"
     scale: Tensor
     relative_rate = 1.0
     """Learning rate that suits the field, relative to what suits a free number per voxel."""
@@ -55,6 +57,10 @@ class Field(nn.Module):
         """Attenuation per voxel, (depth * width, height)."""
         values = self.units() * self.scale
         return values.reshape(self.depth * self.width, self.height)
+
+    def extra_repr(self) -> str:
+        """The lattice and the scale."""
+        return f"{self.depth} x {self.height} x {self.width} voxels (z, y, x), scale={float(self.scale):.4g}"
 
     def volume(self) -> Tensor:
         """The attenuation as (z, y, x), detached."""

@@ -7,8 +7,10 @@ import math
 import torch
 from torch import Tensor, nn
 
+from noiseflow.modules import Described
 
-class Transmission(nn.Module):
+
+class Transmission(Described):
     """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 per tilt or for all.
 
     Args:
@@ -49,13 +51,17 @@ class Transmission(nn.Module):
         intensity = ((images - self.offset) * share).sum(dims, keepdim=True) / (share**2).sum(dims, keepdim=True)
         self.log_intensity.copy_(torch.where(intensity > 0, intensity.log(), self.log_intensity))
 
+    def extra_repr(self) -> str:
+        learnt = ", learnt" if self.log_intensity.requires_grad else ""
+        return f"intensity={_range(self.intensity)}{learnt}, offset={float(self.offset):.4g}"
+
     @property
     def intensity(self) -> Tensor:
         """Incident intensity, (1,) or (tilts,)."""
         return self.log_intensity.detach().exp().reshape(-1)
 
 
-class Linear(nn.Module):
+class Linear(Described):
     """HAADF or EDX: signal = gain·beam·line integral + offset.
 
     The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is
@@ -103,10 +109,20 @@ class Linear(nn.Module):
         scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
         self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean()))
 
+    def extra_repr(self) -> str:
+        learnt = ", learnt" if self.scaled_offset.requires_grad else ""
+        beam = "" if self.log_beam is None else f", beam={_range(_relative(self.log_beam.detach()))}"
+        return f"gain={float(self.gain):.4g}, offset={_range(self.offset)}{learnt}{beam}"
+
     @property
     def offset(self) -> Tensor:
         """Detector units, (1,) or (tilts,)."""
         return (self.gain * self.scaled_offset.detach()).reshape(-1)
+
+
+def _range(values: Tensor) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.4g}" if values.numel() == 1 else f"{low:.4g} … {high:.4g} ({values.numel()} tilts)"
 
 
 def _relative(log_beam: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import FitResult, Gaussian, fit
+from noiseflow.described import described
 from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
 from recon.coarse_start import coarse_start, learning_rate
 from recon.coordinate_network import CoordinateNetwork
@@ -34,6 +35,7 @@ _TOLERATED = 0.003
 _FIRST_TURN, _SECOND_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the first turn's
 
 
+@described(projections="detector units")
 @dataclass(frozen=True)
 class Reconstruction:
     """What a fit of a volume gives.
@@ -55,6 +57,7 @@ class Reconstruction:
     weight_choice: WeightChoice | None = None
 
 
+@described(weight="nats per unit of jump")
 @dataclass(frozen=True)
 class JointReconstructor:
     """Reconstruct a volume together with the noise model of its images; with a `Gaussian`, plain least squares.

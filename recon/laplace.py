@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions import NoiseDistribution
+from noiseflow.modules import ArrayModel
 
 
-class Laplace(nn.Module):
+class Laplace(ArrayModel):
     """Laplace noise of one width around the signal.
 
     Args:

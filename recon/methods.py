@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from noiseflow import Digitised, FitResult, Gaussian, fit
+from noiseflow.described import described
 from recon.classical import LineIntegralProblem, best_num_iterations, best_window
 from recon.denoise import find_denoiser
 from recon.fields import VoxelField
@@ -25,6 +26,7 @@ from recon.wbp import WINDOWS, wbp
 Progress = Callable[[int, str], None]
 
 
+@described(projections="detector units")
 @dataclass(frozen=True)
 class Outcome:
     """What any method gives.
@@ -48,6 +50,7 @@ class Outcome:
     weights_tried: dict[float, float] = field(default_factory=dict)
 
 
+@described()
 @dataclass(frozen=True)
 class Settings:
     """What a user may settle; whatever is None the method chooses by itself.

@@ -8,12 +8,17 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
+
+from noiseflow.arrays import Given, alike
+from noiseflow.described import described
 
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
 Array = NDArray[Any]
 
 
+@described(mse="squared ranges", psnr="dB")
 @dataclass(frozen=True)
 class Errors:
     """Errors of one array against its reference, both scaled by the reference's range.
@@ -29,11 +34,11 @@ class Errors:
     dssim: float
 
 
-def compare(result: Array, reference: Array, *, scaling: Scaling = "raw") -> Errors:
+def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
     """Compare an array with its reference.
 
     Args:
-        result: (z, y, x) or (y, x).
+        result: (z, y, x) or (y, x), an array or a tensor.
         reference: the truth, same shape.
         scaling: ``raw`` takes the numbers as they are; ``affine`` first fits gain and offset of `result` by least
             squares; ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
@@ -41,12 +46,12 @@ def compare(result: Array, reference: Array, *, scaling: Scaling = "raw") -> Err
     Raises:
         ValueError: shapes differ, pixels are not finite, or the reference is flat.
     """
-    result, reference = _checked(result, reference)
-    matched = match(result, reference, scaling=scaling)
-    span = float(reference.max() - reference.min())
-    mse = float(np.mean((matched - reference) ** 2)) / span**2
+    found, truth = _checked(result, reference)
+    matched = match(found, truth, scaling=scaling)
+    span = float(truth.max() - truth.min())
+    mse = float(np.mean((matched - truth) ** 2)) / span**2
     psnr = math.inf if mse == 0 else -10 * math.log10(mse)
-    return Errors(mse, psnr, _dssim(matched, reference, span))
+    return Errors(mse, psnr, _dssim(matched, truth, span))
 
 
 def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
@@ -65,32 +70,33 @@ def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
     raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
 
 
-def fourier_shell_correlation(first: Array, second: Array) -> tuple[Array, Array]:
+def fourier_shell_correlation(first: Given, second: Given) -> tuple[Given, Given]:
     """Correlation of two volumes or images by shells of spatial frequency (doi:10.1016/0304-3991(86)90198-4).
 
     Args:
-        first, second: arrays of the same shape.
+        first, second: arrays or tensors of the same shape.
 
     Returns:
-        Frequencies in cycles per voxel up to 0.5, and the correlation at each.
+        Frequencies in cycles per voxel up to 0.5, and the correlation at each; of the kind given.
 
     Raises:
         ValueError: shapes differ, or pixels are not finite.
     """
-    first, second = _checked(first, second, flat=True)
-    f, g = np.fft.fftn(first), np.fft.fftn(second)
-    frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*(np.fft.fftfreq(n) for n in first.shape), indexing="ij")))
-    shells = min(first.shape) // 2
+    one, other = _checked(first, second, flat=True)
+    f, g = np.fft.fftn(one), np.fft.fftn(other)
+    frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*(np.fft.fftfreq(n) for n in one.shape), indexing="ij")))
+    shells = min(one.shape) // 2
     shell = np.rint(frequency * 2 * shells).astype(int).ravel()
     cross, power_f, power_g = (
         np.bincount(shell, weights=values.ravel(), minlength=shells + 1)[: shells + 1]
         for values in ((f * g.conj()).real, np.abs(f) ** 2, np.abs(g) ** 2)
     )
     norm = np.sqrt(power_f * power_g)
-    return np.arange(shells + 1) / (2 * shells), np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
+    correlation = np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
+    return alike(np.arange(shells + 1) / (2 * shells), first), alike(correlation, first)
 
 
-def compare_images(result: Array, reference: Array, *, scaling: Scaling = "raw") -> Errors:
+def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
     """Compare images with their references one by one; the mean of each error.
 
     Args:
@@ -101,6 +107,9 @@ def compare_images(result: Array, reference: Array, *, scaling: Scaling = "raw")
     Raises:
         ValueError: as `compare`.
     """
+    from noiseflow.io import as_array
+
+    result, reference = as_array(result), as_array(reference)
     if result.shape != reference.shape:
         raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
     errors = [compare(one, other, scaling=scaling) for one, other in zip(result, reference, strict=True)]
@@ -141,9 +150,10 @@ def _dssim(result: Array, reference: Array, span: float) -> float:
     return (1 - float(np.mean(values))) / 2
 
 
-def _checked(result: Array, reference: Array, *, flat: bool = False) -> tuple[Array, Array]:
-    from noiseflow.io import require_contrast, require_finite
+def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = False) -> tuple[Array, Array]:
+    from noiseflow.io import as_array, require_contrast, require_finite
 
+    result, reference = as_array(result), as_array(reference)
     if result.shape != reference.shape:
         raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
     require_finite(result, "the result")

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from noiseflow.distributions import (
     LatentDistribution,
@@ -16,11 +16,12 @@ from noiseflow.distributions import (
     log_normal_interval,
     normal_quadrature,
 )
+from noiseflow.modules import ArrayModel
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
-class KnownNoise(nn.Module, ABC):
+class KnownNoise(ArrayModel, ABC):
     """A noise model without parameters to learn."""
 
     @abstractmethod

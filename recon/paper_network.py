@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from noiseflow.distributions import LatentDistribution
+from noiseflow.modules import ArrayModel
 from noiseflow.transforms import Radial
 
 _PARAMETER_RANGE = 10.0
@@ -51,7 +52,7 @@ class CoordinateDensity(nn.Module):
         return torch.cat([torch.sin(phases), torch.cos(phases)], -1)
 
 
-class PaperFlow(nn.Module):
+class PaperFlow(ArrayModel):
     """Radial layers on the residual, of which the later ones take their parameters from the signal by a small network.
 
     Args:

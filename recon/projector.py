@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow.arrays import Given, alike, as_tensor
+
 
 class SliceProjector:
     """Line integrals of a volume along all rays of a single-axis tilt series.
@@ -65,6 +67,14 @@ class SliceProjector:
         self.matrix = _csr(rays, voxels, weights, shape).to(device=device, dtype=dtype)
         self.transposed = _csr(voxels, rays, weights, shape[::-1]).to(device=device, dtype=dtype)
 
+    def __repr__(self) -> str:
+        low, high = self.tilt_angles.min(), self.tilt_angles.max()
+        kind = str(self.matrix.dtype).removeprefix("torch.")
+        return (
+            f"SliceProjector({self.num_tilts} tilts {low:g}° to {high:g}°, {self.depth} x {self.width} voxels (z, x) to "
+            f"{self.detector_width} pixels, {kind} on {self.matrix.device})"
+        )
+
     @property
     def num_tilts(self) -> int:
         """How many tilts the series has."""
@@ -80,15 +90,17 @@ class SliceProjector:
         result: Tensor = _Product.apply(rays, self.transposed, self.matrix)  # type: ignore[no-untyped-call]
         return result
 
-    def __call__(self, attenuation: Tensor) -> Tensor:
+    def __call__(self, attenuation: Given) -> Given:
         """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
-        _require(attenuation, "attenuation (z, y, x)", self.depth, self.width)
-        return from_rays(self.project(to_columns(attenuation)), self.num_tilts)
+        volume = as_tensor(attenuation, like=self.matrix)
+        _require(volume, "attenuation (z, y, x)", self.depth, self.width)
+        return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
 
-    def T(self, line_integrals: Tensor) -> Tensor:  # reads as the transposed operator it is
+    def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
         """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
-        _require(line_integrals, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
-        return from_columns(self.backproject(to_rays(line_integrals)), self.depth)
+        images = as_tensor(line_integrals, like=self.matrix)
+        _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
+        return alike(from_columns(self.backproject(to_rays(images)), self.depth), line_integrals)
 
     def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
         """Operators of layers across the beam, which add up to this one.

@@ -7,14 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from noiseflow.arrays import Given, alike, as_tensor
 
-def total_variation(volume: Tensor, *, smoothing: float) -> Tensor:
+
+def total_variation(volume: Given, *, smoothing: float) -> Given:
     """Isotropic total variation of a 3D array, summed: Σ √(‖∇v‖² + ε²) − ε (doi:10.1016/0167-2789(92)90242-F).
 
     Forward differences; the gradient is defined everywhere and comes in the same pass. A flat volume has none of either.
 
     Args:
-        volume: (a, b, c), any axis order.
+        volume: (a, b, c), any axis order, a tensor or an array.
         smoothing: ε, in the units of `volume`: jumps well below it are treated as noise to be smoothed quadratically.
 
     Raises:
@@ -22,8 +24,8 @@ def total_variation(volume: Tensor, *, smoothing: float) -> Tensor:
     """
     if not smoothing > 0:
         raise ValueError(f"smoothing {smoothing} must be positive, in the units of the volume")
-    value: Tensor = _TotalVariation.apply(volume, smoothing)  # type: ignore[no-untyped-call]
-    return value
+    value: Tensor = _TotalVariation.apply(as_tensor(volume), smoothing)  # type: ignore[no-untyped-call]
+    return alike(value, volume)
 
 
 class _TotalVariation(torch.autograd.Function):

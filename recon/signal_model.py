@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow.modules import Described
 from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field
 from recon.occupancy import Occupancy
@@ -15,7 +16,7 @@ from recon.projector import SliceProjector, from_columns
 from recon.regularisers import total_variation
 
 
-class TomographySignal(nn.Module):
+class TomographySignal(Described):
     """A volume, its projections and the detector's response as one signal model, for `noiseflow.fit`.
 
     Pixels are numbered in the projector's native order: ``images.transpose(0, 2, 1)``, that is (tilt, u, y), made flat.
@@ -48,6 +49,9 @@ class TomographySignal(nn.Module):
         self.occupancy = occupancy
         self._columns: Tensor | None = None
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
+
+    def extra_repr(self) -> str:
+        return f"{self.projector!r}, weight={self.weight:.4g}, smoothing={self.smoothing:.4g}"
 
     @property
     def num_pixels(self) -> int:

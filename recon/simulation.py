@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import Digitised
+from noiseflow import Digitised, io
 from recon.noises import CountingNoise, OutlierNoise, SkewedNoise
 from recon.projector import SliceProjector
 from recon.tilt_series import Mode, TiltSeries
@@ -62,7 +62,7 @@ ACQUISITIONS = {
 
 
 def clean_tilt_series(
-    volume: NDArray[np.floating[Any]],
+    volume: NDArray[np.floating[Any]] | torch.Tensor,
     tilt_angles: Sequence[float] | NDArray[np.floating[Any]],
     *,
     acquisition: Acquisition = ACQUISITIONS["none"],
@@ -71,7 +71,7 @@ def clean_tilt_series(
     """Project a known volume without noise.
 
     Args:
-        volume: (z, y, x) density, any unit.
+        volume: (z, y, x) density, any unit, an array or a tensor.
         tilt_angles: degrees.
         acquisition: how the images are formed.
         pixel_size: Å.
@@ -83,7 +83,7 @@ def clean_tilt_series(
         ValueError: an empty volume.
     """
     projector = SliceProjector(tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2])
-    line_integrals = projector(torch.from_numpy(np.asarray(volume, dtype=np.float32)))
+    line_integrals = projector(torch.from_numpy(np.asarray(io.as_array(volume), dtype=np.float32)))
     highest = float(line_integrals.max())
     if not highest > 0:
         raise ValueError("the volume is empty: there is nothing to project")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
+from noiseflow.described import described, size_of
 
 Mode = Literal["transmission", "linear"]
 
@@ -89,6 +90,7 @@ class TiltSeries:
         return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
 
 
+@described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")
 @dataclass(frozen=True)
 class VolumeGrid:
     """The lattice to reconstruct on, centred on the tilt axis.
@@ -129,16 +131,19 @@ class Volume:
     """A reconstruction.
 
     Attributes:
-        attenuation: (z, y, x), per voxel.
+        attenuation: (z, y, x), per voxel, an array or a tensor.
         voxel_size: Å, or None where unknown.
     """
 
     attenuation: NDArray[np.float32]
     voxel_size: float | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "attenuation", io.as_array(self.attenuation))
+
     def __repr__(self) -> str:
         size = "unknown voxel size" if self.voxel_size is None else f"{self.voxel_size:.4g} Å per voxel"
-        return f"Volume({' x '.join(map(str, self.attenuation.shape))} {self.attenuation.dtype}, {size})"
+        return f"Volume({size_of(self.attenuation)}, {size})"
 
     def write(self, path: str | Path) -> None:
         """Write to an MRC, TIFF, ``.npy`` or OME-Zarr file with the voxel size. Raises as `noiseflow.io.write`."""

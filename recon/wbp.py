@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from noiseflow.arrays import Given, alike, as_tensor
 from recon.projector import SliceProjector
 
 WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -21,20 +22,20 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
 """What multiplies the ramp, by name: functions of frequency over cutoff, in [0, 1]."""
 
 
-def wbp(line_integrals: Tensor, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Tensor:
+def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Given:
     """Reconstruct by filtered back-projection.
 
     The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are
     kept; each tilt weighs as much as the angle it stands for.
 
     Args:
-        line_integrals: (tilt, y, u).
+        line_integrals: (tilt, y, u), a tensor or an array.
         projector: the operator whose adjoint back-projects.
         window: one of `WINDOWS`; it tames the ramp's gain of fine noise.
         cutoff: fraction of the Nyquist frequency at which the window ends and beyond which nothing passes.
 
     Returns:
-        (z, y, x) attenuation per voxel, not clamped.
+        (z, y, x) attenuation per voxel, not clamped; of the kind given.
 
     Raises:
         ValueError: an unknown window, or a cutoff outside (0, 1].
@@ -43,12 +44,13 @@ def wbp(line_integrals: Tensor, projector: SliceProjector, *, window: str = "ram
         raise ValueError(f"window '{window}': choose one of {', '.join(WINDOWS)}")
     if not 0 < cutoff <= 1:
         raise ValueError(f"cutoff {cutoff} must be above 0 and at most 1, a fraction of the Nyquist frequency")
-    count = line_integrals.shape[-1]
+    images = as_tensor(line_integrals, like=projector.matrix)
+    count = images.shape[-1]
     padded = 2 ** math.ceil(math.log2(2 * count))
-    response = _filter(padded, window, cutoff, like=line_integrals)
-    filtered = torch.fft.irfft(torch.fft.rfft(line_integrals, n=padded) * response, n=padded)[..., :count]
+    response = _filter(padded, window, cutoff, like=images)
+    filtered = torch.fft.irfft(torch.fft.rfft(images, n=padded) * response, n=padded)[..., :count]
     shares = torch.as_tensor(angular_shares(projector.tilt_angles), dtype=filtered.dtype, device=filtered.device)
-    return projector.T((filtered * shares[:, None, None]).contiguous())
+    return alike(projector.T((filtered * shares[:, None, None]).contiguous()), line_integrals)
 
 
 def angular_shares(

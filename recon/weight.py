@@ -6,7 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from noiseflow.described import described
 
+
+@described()
 @dataclass(frozen=True)
 class WeightChoice:
     """A weight and the evidence for it.

@@ -1,0 +1,55 @@
+"""One line for every object: arrays by shape and type, figures with their units, lists by length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, TypeVar
+
+Kind = TypeVar("Kind")
+_FEW = 4
+
+
+def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:
+    """Give a dataclass a repr of one line.
+
+    Args:
+        **units: of its fields, by name.
+    """
+
+    def decorate(kind: type[Kind]) -> type[Kind]:
+        def __repr__(self: Any) -> str:
+            parts = []
+            for field in fields(self):
+                value = getattr(self, field.name)
+                unit = f" {units[field.name]}" if field.name in units and value is not None else ""
+                parts.append(f"{field.name}={in_short(value)}{unit}")
+            return f"{kind.__name__}({', '.join(parts)})"
+
+        kind.__repr__ = __repr__  # type: ignore[method-assign]
+        return kind
+
+    return decorate
+
+
+def in_short(value: Any) -> str:
+    """A value in a few words."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return size_of(value)
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    if callable(value) and hasattr(value, "__name__"):
+        return str(value.__name__)
+    if isinstance(value, tuple) and len(value) <= _FEW and all(isinstance(v, (int, float)) for v in value):
+        return f"({', '.join(in_short(v) for v in value)})" if not hasattr(value, "_fields") else repr(value)
+    if isinstance(value, (Mapping, Sequence)) and not isinstance(value, str):
+        return f"<{len(value)} entries>"
+    return repr(value)
+
+
+def size_of(array: Any) -> str:
+    """Shape and number type of an array or tensor: ``64 x 64 float32``."""
+    kind = str(array.dtype).removeprefix("torch.")
+    if not array.shape:
+        return f"{array.item():.5g}"
+    return f"{' x '.join(map(str, array.shape))} {kind}"
