@@ -40,7 +40,8 @@ def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
 
     Args:
         stack: the file the stack was read from. Beside ``name.st`` are looked for ``name.rawtlt``, ``name.tlt``,
-            ``name.st.mdoc`` and ``name.mdoc``; an aligned stack (``.ali``) takes the refined ``.tlt`` first.
+            ``name.st.mdoc`` and ``name.mdoc``; an aligned stack (``.ali``) takes the refined ``.tlt`` first. Of a folder of
+            images, the one such file inside counts, too.
         image: what was read.
 
     Returns:
@@ -51,7 +52,8 @@ def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
         ValueError: the angle file cannot be read.
     """
     stack = Path(stack)
-    candidates = _beside(stack)
+    inside = [f for s in (*RAW_FIRST, ".mdoc") for f in stack.glob(f"*{s}")] if stack.is_dir() else []
+    candidates = [*_beside(stack), *(inside if len(inside) == 1 else [])]
     for candidate in candidates:
         if candidate.is_file():
             angles = read_angles(candidate)

@@ -22,7 +22,7 @@ TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
-SUFFIXES = WRITE_SUFFIXES | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
+SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
 
 VoxelSize = tuple[float, float, float]
 
@@ -53,7 +53,7 @@ def read(path: str | Path) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF or ``.npy`` file, or a folder of single images; with the
+        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, or a folder of single images; with the
             extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5. Of a file that holds several images,
             ``FILE::NAME`` names one.
 
@@ -138,13 +138,15 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
 
 
 def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import hdf5, microscope, mrc, ome_zarr, tiff
+    from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, tiff
 
     suffix = path.suffix.lower()
     if suffix in MICROSCOPE_SUFFIXES:
         return partial(microscope.read, member=member)
     if suffix in HDF5_SUFFIXES:
         return partial(hdf5.read, member=member)
+    if suffix == ".npz":
+        return partial(numpy_files.read_npz, member=member)
     if suffix not in SUFFIXES:
         raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
     if member is not None:
@@ -153,11 +155,7 @@ def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
         return mrc.read
     if suffix in TIFF_SUFFIXES:
         return tiff.read
-    return ome_zarr.read if suffix == ".zarr" else _read_npy
-
-
-def _read_npy(path: Path) -> ImageFile:
-    return ImageFile(np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
+    return ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy
 
 
 def _checked(image: ImageFile, path: Path) -> ImageFile:

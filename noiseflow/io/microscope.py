@@ -14,6 +14,7 @@ from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.images import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
 from noiseflow.io.units import in_angstrom
+from noiseflow.io.velox import stage_angles
 
 _PLUGINS = {
     ".dm3": "digitalmicrograph",
@@ -48,7 +49,10 @@ def read(path: Path, member: str | None = None) -> ImageFile:
     ]
     if len(axes) == 3 and in_degrees(axes[2].get("units")) is not None:  # (x, y, tilt)
         data, axes = np.ascontiguousarray(data.transpose()), axes[::-1]
-    return ImageFile(data, _voxel_size(axes), _tilt_angles(signal, axes, data.shape))
+    angles = _tilt_angles(signal, axes, data.shape)
+    if angles is None and plugin == "emd" and data.ndim == 3:
+        angles = stage_angles(path, len(data))
+    return ImageFile(data, _voxel_size(axes), angles)
 
 
 def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:

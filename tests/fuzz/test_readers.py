@@ -67,6 +67,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("sound")
     for name in ("a.mrc", "a.npy"):
         io.write(folder / name, STACK.astype(np.float32))
+    np.savez_compressed(folder / "a.npz", images=STACK, tilt_angles=np.arange(3.0))
     tifffile.imwrite(folder / "a.tif", STACK.astype(np.uint16), photometric="minisblack", compression="zlib")
     tifffile.imwrite(folder / "a.tiff", STACK.astype(np.uint16), ome=True, metadata={"axes": "ZYX"})
     with h5py.File(folder / "a.h5", "w") as file:
@@ -106,7 +107,7 @@ def read_or_refuse(path: Path, content: bytes) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".tif", ".tiff", ".h5", ".safetensors"])
+@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".tif", ".tiff", ".h5", ".safetensors"])
 @fuzz
 @given(wounds=st.lists(damage, min_size=1, max_size=4))
 def test_damaged_files_are_read_or_refused(

@@ -1,0 +1,42 @@
+"""NumPy's own files: ``.npy`` with one array, ``.npz`` with several by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.checks import require_room
+from noiseflow.io.images import ImageFile
+from noiseflow.io.metadata import recorded_angles
+from noiseflow.io.microscope import choose_member
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def read_npy(path: Path) -> ImageFile:
+    """Read the array as it is; the memory map refuses claims beyond the file."""
+    return ImageFile(np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
+
+
+def read_npz(path: Path, member: str | None = None) -> ImageFile:
+    """Read the largest image, stack or volume, or the one of a name; tilt angles come from ``tilt_angles`` and the like."""
+    with np.load(path, allow_pickle=False) as archive:
+        names = list(archive.files)
+        shapes = [_claim(archive, name, path) for name in names]
+        name = names[choose_member(names, shapes, member)]
+        data: NDArray[Any] = archive[name]
+        lists = [n for n, shape in zip(names, shapes, strict=True) if shape == (len(data),)]
+        angles = recorded_angles(((n, [float(value) for value in archive[n]]) for n in lists), len(data))
+    return ImageFile(data, None, angles)
+
+
+def _claim(archive: Any, name: str, path: Path) -> tuple[int, ...]:
+    """The shape that an array's header claims, refused where the file cannot hold it."""
+    with archive.zip.open(f"{name}.npy") as stream:
+        version = np.lib.format.read_magic(stream)
+        shape, _, dtype = _HEADERS[version](cast(IO[bytes], stream))
+    require_room(int(np.prod(shape, dtype=object)) * dtype.itemsize, path, compressed=True)
+    return tuple(shape)
