@@ -13,7 +13,7 @@ from torch import nn
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation, fit
 from recon.benchmark import Cell, Results, Scene, make_scene
 from recon.benchmark_network import WIDTHS, fit_network
-from recon.benchmark_search import Array, Best, back_projections, best, best_fit, denoised
+from recon.benchmark_search import STEPS, Array, Best, back_projections, best, best_fit, denoised
 from recon.external import missing
 from recon.fields import MultiresolutionField, VoxelField
 from recon.joint import JointReconstructor
@@ -72,7 +72,7 @@ def _score(scene: Scene) -> Callable[[Array], float]:
 
 
 def _searched(scene: Scene, **options: Any) -> Best:
-    return best_fit(scene.noisy, scene.grid, JointReconstructor(**options), _score(scene))
+    return best_fit(scene.noisy, scene.grid, JointReconstructor(num_steps=STEPS, **options), _score(scene))
 
 
 def _once(scene: Scene, **options: Any) -> Best:
@@ -105,7 +105,9 @@ def _denoisers(scene: Scene) -> list[Variant]:
             )
 
         def least_squares(series: Callable[[], Any] = series) -> Best:
-            return best_fit(series(), scene.grid, JointReconstructor(noise_model=Gaussian), _score(scene))
+            return best_fit(
+                series(), scene.grid, JointReconstructor(noise_model=Gaussian, num_steps=STEPS), _score(scene)
+            )
 
         found.append(Variant("denoiser, then WBP", denoiser, back_projected, scene))
         found.append(Variant("denoiser, then L2", denoiser, least_squares, scene))
@@ -116,10 +118,10 @@ def _fields(scene: Scene) -> list[Variant]:
     found = []
     for field_name, field in (("voxels", VoxelField), ("sum of grids", MultiresolutionField)):
         variants: dict[str, Callable[[], Best]] = {
-            "L2, no TV": partial(_once, scene, noise_model=Gaussian, make_field=field, weight=0.0),
+            "L2, no TV": partial(_once, scene, noise_model=Gaussian, make_field=field, weight=0.0, num_steps=STEPS),
             "L2, TV": partial(_searched, scene, noise_model=Gaussian, make_field=field),
-            "noise model, no TV": partial(_once, scene, make_field=field, weight=0.0),
-            "noise model, TV": partial(_once, scene, make_field=field),
+            "noise model, no TV": partial(_once, scene, make_field=field, weight=0.0, num_steps=STEPS),
+            "noise model, TV": partial(_once, scene, make_field=field, num_steps=STEPS),
         }
         found += [Variant("field", f"{field_name}, {name}", make, scene) for name, make in variants.items()]
     return found

@@ -13,7 +13,7 @@ import torch
 import noiseflow
 from noiseflow import Gaussian, SignalDependentGaussian, fit
 from recon.benchmark import Cell, Results
-from recon.benchmark_search import Array, Best, back_projections, best, best_fit, denoised, sirts
+from recon.benchmark_search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from recon.comparison import project
 from recon.fields import VoxelField
 from recon.joint import JointReconstructor
@@ -71,7 +71,8 @@ def split(series: TiltSeries, noise: str, gap: str, *, seed: int) -> Split:
 def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Callable[[], Best]]:
     """The best volume by method and score; the joint fits choose by themselves and come last."""
     grid = VolumeGrid.of(given)
-    least_squares = JointReconstructor(noise_model=Gaussian)
+    least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS)
+    absolute = replace(least_squares, noise_model=Laplace)
     voxels = replace(least_squares, make_field=VoxelField)
 
     def once(reconstructor: JointReconstructor, words: str) -> Best:
@@ -85,9 +86,10 @@ def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Cal
         "L2, voxels, no TV": lambda: once(replace(voxels, weight=0.0), ""),
         "L2 + TV, voxels": lambda: best_fit(given, grid, voxels, score),
         "L2 + TV": lambda: best_fit(given, grid, least_squares, score),
-        "L1 + TV": lambda: best_fit(given, grid, JointReconstructor(noise_model=Laplace), score),
+        "L1 + TV": lambda: best_fit(given, grid, absolute, score),
         "L2 + TV, denoised (nlm)": lambda: best_fit(denoised(given, "nlm"), grid, least_squares, score),
         "joint, voxels": lambda: once(JointReconstructor(make_field=VoxelField), "chose "),
+        f"joint, {STEPS} steps": lambda: once(JointReconstructor(num_steps=STEPS), "chose "),
         "joint": lambda: once(JointReconstructor(), "chose "),
     }
 

@@ -10,7 +10,7 @@ from torch import nn
 
 from noiseflow import Digitised, Gaussian, SplineFlow, detect_digitisation, fit
 from recon.benchmark import Cell, Results, Scene
-from recon.benchmark_search import Array, Best, back_projections, best, best_fit, denoised, sirts
+from recon.benchmark_search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from recon.external import missing
 from recon.joint import JointReconstructor
 from recon.metrics import compare
@@ -40,7 +40,9 @@ def run(scene: Scene, results: Results, line: Callable[[str], None]) -> None:
 
 def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
     noisy, grid = scene.noisy, scene.grid
-    least_squares = JointReconstructor(noise_model=Gaussian)
+    least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS)
+
+    oracle = JointReconstructor(noise_model=lambda: scene.noise_model, num_steps=STEPS)
 
     def score(volume: Array) -> float:
         return compare(volume, scene.truth, scaling="affine").psnr
@@ -60,7 +62,7 @@ def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
         "L2, noisy images": lambda: best_fit(noisy, grid, least_squares, score),
         "L2, denoised images": cleaned,
         "L2, clean images": lambda: best_fit(scene.clean, grid, least_squares, score, first=_CLEAN),
-        "oracle": lambda: best_fit(noisy, grid, JointReconstructor(noise_model=lambda: scene.noise_model), score),
+        "oracle": lambda: best_fit(noisy, grid, oracle, score),
         "joint, supervised": lambda: joint(JointReconstructor(noise_model=lambda: calibrated(scene))),
         "joint": lambda: joint(JointReconstructor()),
     }

@@ -23,7 +23,6 @@ from recon.classical import LineIntegralProblem
 from recon.external import astra_sirt, missing, quantem_inr
 from recon.fields import VoxelField
 from recon.joint import JointReconstructor
-from recon.laplace import Laplace
 from recon.metrics import compare
 from recon.presets import PRESETS, Kniesel2022
 from recon.sirt import sirt
@@ -39,15 +38,15 @@ class Effort:
     """How much to spend.
 
     Attributes:
-        steps: of the fits; each is a run of its own.
+        steps: of the fits; each is a run of its own, and weights are searched at the most of them.
         weights: of the total variation, where the search begins.
         refine: how often the search halves its ladder around the best weight.
         repeats: of every curve, in turn.
         budget: seconds for methods that would go on for hours.
     """
 
-    steps: tuple[int, ...] = (15, 40, 80, 150, 300)
-    weights: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0)
+    steps: tuple[int, ...] = (30, 120, 300)
+    weights: tuple[float, ...] = (0.1, 0.3, 1.0)
     refine: int = 1
     repeats: int = 3
     budget: float = 600.0
@@ -92,7 +91,6 @@ def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
 
     return {
         "L2 + TV": JointReconstructor(noise_model=Gaussian),
-        "L1 + TV": JointReconstructor(noise_model=Laplace),
         "L2 + TV, voxels": JointReconstructor(noise_model=Gaussian, make_field=VoxelField),
         "oracle": JointReconstructor(noise_model=truth),
     }
@@ -101,6 +99,7 @@ def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
 def best_setting(scene: Scene, reconstructor: JointReconstructor, effort: Effort) -> Cell:
     """The weight, and the incident intensity learnt or not, of the highest PSNR of the volume."""
     tried: dict[float, float] = {}
+    reconstructor = replace(reconstructor, num_steps=max(effort.steps))
 
     def visit(weights: Iterable[float]) -> float:
         for weight in weights:

@@ -22,6 +22,8 @@ Candidate = tuple[str, Array]
 CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 FIRST_WEIGHT = 0.2
+STEPS = 360
+"""Of the rivals' fits: three times those of the joint fit, so that they end where they would."""
 
 
 @dataclass(frozen=True)

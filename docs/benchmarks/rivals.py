@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from noiseflow.io import atomic_path
-from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals
+from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals, benchmark_search
 from recon.benchmark import Results
 
 HERE = Path(__file__).parent
@@ -96,7 +96,8 @@ def paper_table(folder: Path) -> str:
         "nine-layer network; WBP "
         "and SIRT are this library's, not IMOD's, at their best window, cutoff and number of iterations. "
         "The supervised fit keeps "
-        "a flow fitted to clean and noisy images. Settings of all but the joint fits were searched by looking at the truth. In "
+        "a flow fitted to clean and noisy images. Settings of all "
+        f"but the joint fits were searched by looking at the truth, in fits of {benchmark_search.STEPS} steps. In "
         "the printed table MSE and DSSIM of the last five rows are exchanged (the printed PSNR is that of "
         "the other column); here "
         "they are put right.",
@@ -132,7 +133,8 @@ def ablations(folder: Path) -> str:
         "# What each part is worth",
         "One thing changed at a time. PSNR of the volume and of 20 clean projections at angles between the "
         "tilts. Least squares, L1 "
-        "and the oracle take the best weight that a bracketing search finds; *parts* and "
+        "and the oracle take the best weight that a bracketing search finds, in fits of "
+        f"{benchmark_search.STEPS} steps, and fields take as many; *parts* and "
         "*flow layers* fit a radial flow at the same weight "
         f"of {benchmark_ablations.WEIGHT:g}. The networks are the paper's nine layers, evaluated on the "
         "whole lattice for all tilts "
@@ -147,7 +149,7 @@ def ablations(folder: Path) -> str:
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), _machines([content])]
     gaps = (
-        "- Defocus modelled or not: the reconstruction has no model of defocus yet.\n"
+        "- Defocus modelled or not: the reconstruction has no model of defocus yet (`noiseflow simulate --defocus` has).\n"
         "- Skipping of vacuum on or off: the joint fit does not skip yet.\n"
         "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
     )
@@ -182,7 +184,9 @@ def needle(folder: Path) -> str:
         "the left-out tilts, as noisy as the given ones, under a Gaussian whose width depends on the "
         "signal, fitted to the other "
         "half of them: the same judge for all. Noise, where it is added: Poisson counts of so many in the brightest pixel, and "
-        "read noise of half a count. Settings of all but the joint fits are those of the best PSNR on the left-out "
+        "read noise of half a count. "
+        f"Least squares and L1 take {benchmark_search.STEPS} steps, so that they end where they would. Settings of all "
+        "but the joint fits are those of the best PSNR on the left-out "
         "tilts, which favours them.",
     ]
     for name, content in _named_files(folder, "needle-"):
