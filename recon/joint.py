@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -74,6 +75,7 @@ class JointReconstructor:
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether a `CoordinateNetwork` is evaluated only where there may be something.
         slab: slices used to choose.
+        settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
         seed: of every random choice.
         device: where to compute.
         run_fit: runs every fit; `Journal.fit` keeps what each has reached.
@@ -86,6 +88,7 @@ class JointReconstructor:
     estimate_response: bool = True
     skip_vacuum: bool = True
     slab: int = 24
+    settled: TomographySignal | None = None
     seed: int = 0
     device: torch.device | str = "cpu"
     run_fit: Callable[..., FitResult] = fit
@@ -126,17 +129,23 @@ class JointReconstructor:
         response = estimate_response(tilt_series, estimate=self.estimate_response)
         generator = torch.Generator().manual_seed(self.seed)
         rough = coarse_start(tilt_series, response, grid, generator=generator).to(self.device)
-        response = response.to(self.device)
+        image_formation: nn.Module = response.to(self.device)
+        scale = attenuation_scale(rough)
+        weight = _FIRST_WEIGHT if self.weight is None else self.weight
+        if self.settled is not None:
+            image_formation = copy.deepcopy(self.settled.image_formation).requires_grad_(False)
+            scale, weight = float(self.settled.field.scale), self.settled.weight
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            field = self.make_field(grid.shape, scale=attenuation_scale(rough)).to(self.device)
+            field = self.make_field(grid.shape, scale=scale).to(self.device)
         field.start_from(rough)
-        weight = _FIRST_WEIGHT if self.weight is None else self.weight
         rate = learning_rate(rough, field)
         occupancy = None
         if self.skip_vacuum and isinstance(field, CoordinateNetwork):
             occupancy = Occupancy(rough / field.scale, grid.shape).to(self.device)
-        return TomographySignal(field, projector, response, weight=weight, learning_rate=rate, occupancy=occupancy)
+        return TomographySignal(
+            field, projector, image_formation, weight=weight, learning_rate=rate, occupancy=occupancy
+        )
 
     def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> _Task:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)

@@ -52,7 +52,7 @@ def require_memory(needed: int, device: Any = "cpu") -> str:
     if needed > available:
         raise MemoryError(
             f"this reconstruction needs about {_human(needed)} of memory and {_human(available)} are available; "
-            "give a smaller --thickness, or bin or crop the images"
+            "give --slices-at-once 32 (or fewer), a smaller --thickness, or bin or crop the images"
         )
     return f"memory: about {_human(needed)} needed, {_human(available)} available"
 

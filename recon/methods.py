@@ -262,14 +262,15 @@ def _fitted(name: str, tilt_series: TiltSeries, grid: VolumeGrid, settings: Sett
     learnt = "intensity" if tilt_series.mode == "transmission" else "offset"
     choices: dict[str, float | str] = {
         "weight": result.signal_model.weight,
-        "noise model": _describe(result.noise_model),
+        "noise model": describe(result.noise_model),
         learnt: float(getattr(response, learnt).mean()),
     }
     tried = result.weight_choice.tried if result.weight_choice is not None else {}
     return Outcome(result.volume, result.projections, name, result.fit_result, result.noise_model, choices, tried)
 
 
-def _describe(noise_model: nn.Module) -> str:
+def describe(noise_model: nn.Module) -> str:
+    """A noise model in a few words."""
     if not isinstance(noise_model, Digitised):
         return type(noise_model).__name__
     rounding = f"rounded to {noise_model.step:g}, " if noise_model.step else ""

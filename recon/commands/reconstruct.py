@@ -11,7 +11,7 @@ import typer
 
 from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, step_report
 from recon.commands.options import load_noise_model, method_of
-from recon.commands.running import memory_line, open_journal, stoppable, warnings_as_lines
+from recon.commands.running import memory_line, open_journal, scratch_beside, stoppable, warnings_as_lines
 
 if TYPE_CHECKING:
     from recon.checkpoint import Journal
@@ -74,6 +74,9 @@ def reconstruct(
     keep_tilts: Annotated[
         bool, typer.Option("--keep-tilts", help="Leave no tilt out, though it does not fit the others.")
     ] = False,
+    slices_at_once: Annotated[
+        int | None, typer.Option(min=1, help="Reconstruct in blocks of so many slices, where memory is short.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
     checkpoint_interval: Annotated[float, typer.Option(help="Seconds between checkpoints.")] = 60.0,
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
@@ -124,13 +127,15 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
         options |= {"window": window, "denoiser": denoiser}
-        settings = _settings(tilt_series, grid, {**options, "fsc": fsc}, noise_model)
+        settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         fixed = load_noise_model(noise_model)
         options |= {"noise_model": fixed, "device": choose_device(device)}
-        output.line(memory_line(tilt_series, grid, method, options["device"]))
+        output.line(memory_line(tilt_series, grid, method, options["device"], slices_at_once))
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
-        with stoppable(journal, context):
+        with stoppable(journal, context), scratch_beside(out) as scratch:
+            if slices_at_once is not None:
+                options |= {"rows_at_once": slices_at_once, "scratch": scratch}
             with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc and report is not None)
             targets.write(
@@ -152,10 +157,15 @@ def _solve(
     tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
 ) -> tuple[Outcome, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
+    from recon.blocks import reconstruct_in_blocks
     from recon.methods import reconstruct
     from recon.report import even_odd
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
+    if "scratch" in options:
+        if fsc:
+            raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
+        return reconstruct_in_blocks(tilt_series, grid, **options, progress=lambda done, note: None), None
     outcome = reconstruct(tilt_series, grid, **options, progress=lambda done, note: None)
     if not fsc:
         return outcome, None

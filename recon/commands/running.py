@@ -99,16 +99,32 @@ def warnings_as_lines(output: Output) -> Iterator[list[str]]:
         yield told
 
 
-def memory_line(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any) -> str:
+def memory_line(
+    tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, slices_at_once: int | None = None
+) -> str:
     """One line about the memory needed and available.
 
     Raises:
         MemoryError: it does not fit.
     """
+    from recon.blocks import block_memory
     from recon.memory import needed_memory, require_memory
 
     fitted = not method.startswith(("sirt", "wbp"))
-    return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
+    if slices_at_once is None:
+        return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
+    block = block_memory(tilt_series, grid, slices_at_once, fitted=fitted)
+    return require_memory(needed_memory(*block, fitted=fitted) + 2 * tilt_series.images.size * 4, device)
+
+
+@contextlib.contextmanager
+def scratch_beside(out: Path) -> Iterator[Path]:
+    """A name for a file beside `out`, gone at the end if it was made."""
+    scratch = out.with_name(f".{out.name}.blocks.npy")
+    try:
+        yield scratch
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
