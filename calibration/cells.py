@@ -60,16 +60,14 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
         if len(group) < LEAST_READINGS or cells.sum() < 3:
             continue
         row = _cells(one, group, float(np.interp(signal[group].mean(), grid, deviation)), float(deviation.min()) / 5)
-        mass, first, second = (float(moment[cells].sum()) for moment in moments)
-        mean = float(np.average(grid[cells], weights=density[cells]))
-        about = float(np.average((grid[cells] - mean) ** 2, weights=density[cells]))
         noise = float(np.average(own[cells], weights=density[cells]))
-        regressed = {
-            "own": noise,
-            "shift": first / mass + offset - mean,
-            "excess": (second / mass - (first / mass) ** 2 - about) / noise,
-        }
-        rows.append(row | (regressed if noise > 0 else {}))
+        if noise > 0:
+            mass, first, second = (float(moment[cells].sum()) for moment in moments)
+            mean = float(np.average(grid[cells], weights=density[cells]))
+            about = float(np.average((grid[cells] - mean) ** 2, weights=density[cells]))
+            excess = (second / mass - (first / mass) ** 2 - about) / noise
+            row |= {"own": noise, "shift": first / mass + offset - mean, "excess": excess}
+        rows.append(row)
     return rows
 
 

@@ -208,10 +208,13 @@ def test_a_mean_of_frames_as_the_long_exposure_tells_no_offset_but_the_gain():
     assert measure_detector([pair]).posterior.gain.median == pytest.approx(2.0, rel=0.06)
 
 
-def test_exposures_without_a_trace_of_the_long_ones_noise_are_measured():
+def test_a_signal_known_without_noise_is_no_special_case():
     generator = np.random.default_rng(9)
-    dose = 10 * np.exp(0.6 * ndimage.gaussian_filter(generator.standard_normal((160, 160)), 3) * 10)
-    short = np.round(100 + 2.0 * (generator.poisson(dose) + generator.standard_normal(dose.shape)))
-    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
-    found = measure_detector([align_with(ExposurePair(short, 1000 * dose), still)])
-    assert found.posterior.gain.median == pytest.approx(2.0, rel=0.05)
+    rate = 10 * np.exp(0.6 * generator.standard_normal(40_000))
+    observation = np.round(
+        OFFSET + GAIN * (generator.poisson(rate) + READ_NOISE * generator.standard_normal(rate.shape))
+    )
+    signal = OFFSET + GAIN * rate
+    known = Readings(observation, signal, signal, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
+    found = sample_posterior([collect_cells([known], guess=(GAIN, OFFSET, READ_NOISE))])
+    assert found.gain.median == pytest.approx(GAIN, rel=0.05)
