@@ -162,6 +162,8 @@ class Levels:
         factor, shift = np.ones_like(self.signal), np.zeros_like(self.signal)
         scales = list(self.scales)
         for index, (times, plus) in change.items():
+            if index not in self.scale:
+                continue
             factor[self.scale == index], shift[self.scale == index] = times, plus
             scales[index] = scales[index].rescaled(times, plus)
         signal = factor * self.signal + shift

@@ -79,7 +79,7 @@ def registration_trial(kind: str, seed: int, size: int = 256) -> dict[str, Any]:
 
 
 def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) -> list[dict[str, Any]]:
-    """Results of the trials of some seeds, as many as end in time.
+    """Results of the trials of some seeds, as many as end in time, and of all that are kept from before.
 
     Each is kept as a line of the file `rows`, so that a run that was stopped goes on where it was.
     """
@@ -95,7 +95,7 @@ def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) ->
             print(f"\r{len(found)} trials", end="", file=sys.stderr, flush=True)
             if time.perf_counter() > deadline:
                 break
-    return sorted((one for one in found if one["seed"] in seeds), key=lambda one: int(one["seed"]))
+    return sorted(found, key=lambda one: int(one["seed"]))
 
 
 def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict[str, Any]:

@@ -218,3 +218,14 @@ def test_a_signal_known_without_noise_is_no_special_case():
     known = Readings(observation, signal, signal, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
     found = sample_posterior([collect_cells([known], guess=(GAIN, OFFSET, READ_NOISE))])
     assert found.gain.median == pytest.approx(GAIN, rel=0.05)
+
+
+def test_pairs_some_of_few_and_some_of_many_electrons_are_measured_together():
+    pairs = []
+    for number, electrons in enumerate((2.0, 4000.0)):
+        generator = np.random.default_rng(number)
+        scene = textured_scene(generator, 128)
+        pair = expose(scene, rigid(0, (0, 0), 128), 128, generator, electrons=electrons)
+        still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+        pairs.append(align_with(ExposurePair(pair.short, pair.long, 16.0), still))
+    assert measure_detector(pairs).posterior.gain.median == pytest.approx(GAIN, rel=0.06)
