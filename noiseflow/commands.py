@@ -27,6 +27,7 @@ def sample(
     from noiseflow import io
 
     io.check_output(output)
+    io.require_other(output, clean)
     image = io.read(clean)
     io.require_finite(image.data, clean)
     noise_model = noiseflow.load(model).to(choose_device(device))

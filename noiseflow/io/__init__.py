@@ -10,6 +10,7 @@ from .checks import require_finite as require_finite
 from .files import atomic_path as atomic_path
 from .files import check_folder as check_folder
 from .files import check_output as check_output
+from .files import require_other as require_other
 from .images import SUFFIXES as SUFFIXES
 from .images import ImageFile as ImageFile
 from .images import read as read

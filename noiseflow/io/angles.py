@@ -51,7 +51,8 @@ def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
         FileNotFoundError: neither is there.
         ValueError: the angle file cannot be read.
     """
-    stack = Path(stack)
+    stack = Path(str(stack).partition("::")[0])
+    stack = stack.resolve() if stack.is_dir() else stack
     inside = [f for s in (*RAW_FIRST, ".mdoc") for f in stack.glob(f"*{s}")] if stack.is_dir() else []
     candidates = [*_beside(stack), *(inside if len(inside) == 1 else [])]
     for candidate in candidates:

@@ -45,6 +45,19 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
     return path
 
 
+def require_other(output: str | Path, *inputs: str | Path | None) -> None:
+    """Refuse an output that would replace one of the inputs.
+
+    Raises:
+        ValueError: it would.
+    """
+    target = Path(output)
+    for source in inputs:
+        path = None if source is None else Path(str(source).partition("::")[0])
+        if path is not None and path.exists() and target.exists() and target.samefile(path):
+            raise ValueError(f"{output} is an input too and would be lost; name another output")
+
+
 def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
     """Fail now, before long work, where results could not be written into a folder, which need not exist yet.
 

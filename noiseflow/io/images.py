@@ -23,6 +23,11 @@ MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
+_NO_IMAGES = {
+    **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), "a file of tilt angles (--angles)"),
+    ".xf": "a file of alignments (--transforms)",
+    ".safetensors": "a noise model",
+}
 
 VoxelSize = tuple[float, float, float]
 
@@ -147,6 +152,8 @@ def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
         return partial(hdf5.read, member=member)
     if suffix == ".npz":
         return partial(numpy_files.read_npz, member=member)
+    if suffix in _NO_IMAGES:
+        raise ValueError(f"{path} is no image but {_NO_IMAGES[suffix]}; check the order and the names of what you gave")
     if suffix not in SUFFIXES:
         raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
     if member is not None:

@@ -47,6 +47,7 @@ def benchmark(
         raise ValueError(f"--repeats {repeats} must be at least 1")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; name a folder with --out")
+    _check_scene(size, noise, phantom)
     out.mkdir(parents=True, exist_ok=True)
     effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
@@ -58,3 +59,16 @@ def benchmark(
     except KeyboardInterrupt:
         kept = f"what is finished is kept in {out}; the same command goes on from there"
         raise KeyboardInterrupt(kept) from None
+
+
+def _check_scene(size: int | None, noise: str, phantom: str) -> None:
+    from recon.phantoms import PHANTOMS
+    from recon.simulation import ACQUISITIONS
+
+    noises = [name for name, acquisition in ACQUISITIONS.items() if acquisition.noise is not None]
+    if size is not None and size < 8:
+        raise ValueError(f"--size {size}: give at least 8 voxels")
+    if noise not in noises:
+        raise ValueError(f"--noise {noise}: a benchmark needs one of {', '.join(noises)}")
+    if phantom not in PHANTOMS:
+        raise ValueError(f"--phantom {phantom}: choose one of {', '.join(PHANTOMS)}")

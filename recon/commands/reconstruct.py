@@ -95,12 +95,14 @@ def reconstruct(
 
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
+    from noiseflow.io import require_other
     from recon.commands.inputs import load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.report import read_reference
     from recon.tilt_series import VolumeGrid
 
     output, targets = Output(json), Targets(out, report=report, noise_model=save_noise_model)
+    require_other(out, tilts, angles, transforms, mask, reference)
     with warnings_as_lines(output) as warned:
         tilt_series = load_tilt_series(
             tilts,
@@ -124,6 +126,8 @@ def reconstruct(
             )
         tilt_series = prepared.tilt_series
         grid, method = VolumeGrid.of(tilt_series, thickness), method_of(method, preset)
+        if save_noise_model is not None and method.startswith(("sirt", "wbp")):
+            raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
         options |= {"window": window, "denoiser": denoiser}

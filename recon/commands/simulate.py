@@ -65,6 +65,8 @@ def simulate(
         "validation": angles_between(angles, _VALIDATION, share=1 / 3),
         "test": angles_between(angles, _TEST, share=2 / 3),
     }
+    if (folder / "tilts.mrc").exists() and not (folder / "truth.mrc").exists():
+        raise ValueError(f"{folder} holds a tilts.mrc that was not simulated and would be lost; name another folder")
     num_images = sum(map(len, stacks.values())) + len(angles)
     io.check_folder(folder, num_bytes=4 * size**2 * (size + num_images))
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
