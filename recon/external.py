@@ -11,7 +11,6 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon.classical import LineIntegralProblem
@@ -71,8 +70,9 @@ def quantem_inr(
 ) -> Iterator[tuple[str, float, Array]]:
     """quantem's implicit reconstruction (``TomographyLiteINR``: an H-SIREN network, Adam at 1e-4, 1024 rays at a time).
 
-    Its own settings are left alone but for the poses, which are known here and not learnt. It reconstructs a cube of the longest
-    side of the stack, tilts included; the volume is cut out of it, in the orientation that agrees best with a back-projection.
+    Its own settings are left alone but for the poses, which are known here and not learnt. It wants square images with no fewer
+    pixels a side than there are tilts (it counts its rays by the longest side of the stack), so they are padded with vacuum. The
+    volume is cut out of its cube, in the orientation that agrees best with a back-projection.
 
     Args:
         tilt_series: the data.
@@ -91,16 +91,25 @@ def quantem_inr(
     started = time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         tomography = TomographyLiteINR.from_dataset(
-            measured / measured.max(), tilt_series.tilt_angles.astype(np.float32), device=device, rng=0
+            _padded(measured) / measured.max(), tilt_series.tilt_angles.astype(np.float32), device=device, rng=0
         )
     seconds, passes = time.perf_counter() - started, 0
     while seconds < budget:
         started = time.perf_counter()
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             tomography.reconstruct(num_iter=1, num_workers=0, learn_pose=False)
+        cube = np.asarray(tomography.obj_model.obj_view).squeeze()
         seconds, passes = seconds + time.perf_counter() - started, passes + 1
-        cube = torch.as_tensor(tomography.obj_model.obj).detach().cpu().numpy().squeeze()
         yield f"{passes} passes", seconds, _oriented(_cut(cube, max(grid.shape)), rough)
+
+
+def _padded(line_integrals: Array) -> Array:
+    """Square images (tilt, y, u) with vacuum around them, as many pixels a side as there are tilts or more; centres stay."""
+    tilts, height, width = line_integrals.shape
+    side = max(tilts, height, width)
+    side += (side - width) % 2
+    margins = [((side - size) // 2, side - size - (side - size) // 2) for size in (height, width)]
+    return np.pad(line_integrals, [(0, 0), *margins])
 
 
 def _cut(cube: Array, side: int) -> Array:

@@ -17,7 +17,7 @@ from recon.benchmark_rivals import Effort, best_cutoff, curves, own_sirt, summar
 from recon.benchmark_search import Best, best, best_fit
 from recon.commands.benchmark import benchmark
 from recon.comparison import project
-from recon.external import _oriented, astra_sirt, missing
+from recon.external import _cut, _oriented, _padded, astra_sirt, missing
 from recon.joint import JointReconstructor
 from recon.tilt_series import Volume
 
@@ -254,3 +254,16 @@ def test_weight_of_the_highest_score_is_bracketed():
     found = best_fit(None, None, Constant(), score)
     assert found.volume[0, 0, 0] == pytest.approx(0.9, rel=0.05)
     assert not found.at_an_end
+
+
+@pytest.mark.parametrize(("shape", "side"), [((9, 4, 4), 10), ((3, 4, 4), 4), ((3, 5, 4), 6), ((9, 5, 5), 9)])
+def test_padded_images_are_square_and_cut_out_again(shape, side):
+    images = np.random.default_rng(0).random(shape)
+    padded = _padded(images)
+    assert padded.shape == (shape[0], side, side)
+    assert padded.sum() == pytest.approx(images.sum())
+    centre = (side - shape[2]) // 2
+    np.testing.assert_array_equal(padded[:, (side - shape[1]) // 2][:, centre : centre + shape[2]], images[:, 0])
+    if shape[1] == shape[2]:
+        cube = np.broadcast_to(padded[0], (side, side, side))
+        np.testing.assert_array_equal(_cut(cube, shape[1])[0], images[0])
