@@ -170,11 +170,16 @@ class JointReconstructor:
         )
         task.alternate(noise_model, num_steps=80, standardise=given is not None)
         task.refine(noise_model)
+        choice = None
+        if self.weight is None:
+            with _frozen(noise_model):
+                choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
+        else:
+            with _frozen(noise_model):
+                task.fit(noise_model, num_steps=80, standardise=False)
+        # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
+        task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
-        if self.weight is not None:
-            return noise_model, None
-        with _frozen(noise_model):
-            choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
         return noise_model, choice
 
 
