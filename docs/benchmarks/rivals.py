@@ -107,7 +107,7 @@ def paper_table(folder: Path) -> str:
         absent = [method for method in benchmark_paper.METHODS if method not in content["cells"]]
         parts += [f"## {_scene(name)}", _table(header, rows), _standing(content["cells"]), _absent(absent)]
         parts += [_command("paper-table", name), _machines([content])]
-    return _joined(parts)
+    return _joined([*parts, _nothing(folder, "paper-table", " --size 96 --phantom cell")])
 
 
 def _standing(cells: Content) -> str:
@@ -153,7 +153,7 @@ def ablations(folder: Path) -> str:
         "- Skipping of vacuum on or off: the joint fit does not skip yet.\n"
         "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
     )
-    return _joined([*parts, "## Not measured", gaps])
+    return _joined([*parts, _nothing(folder, "ablations", " --size 64"), "## Not measured", gaps])
 
 
 def _remark(group: str, cells: Content) -> str:
@@ -199,7 +199,7 @@ def needle(folder: Path) -> str:
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
             parts += [f"Best by PSNR: {chosen[0][0]}.", _absent(absent)]
         parts += [_command("needle", name), _machines([content])]
-    return _joined(parts)
+    return _joined([*parts, _nothing(folder, "needle")])
 
 
 _METHODS = tuple(benchmark_needle.methods(benchmark_needle.load(), lambda volume: 0.0))
@@ -266,6 +266,13 @@ def _absent(names: Sequence[str]) -> str:
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _nothing(folder: Path, benchmark: str, options: str = "") -> str:
+    """That a benchmark has no results, with the command that makes them; nothing where it has."""
+    if _files(folder, f"{benchmark}-"):
+        return ""
+    return f"Not measured yet: `noiseflow benchmark {benchmark}{options} --out docs/benchmarks/results` does it."
 
 
 def _joined(parts: Iterable[str]) -> str:

@@ -28,6 +28,8 @@ def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:
 
     assert "64³, 96³, 128³ on a CPU are not measured" in rivals.run_time(tmp_path)
     assert set(rivals.PAGES) == set(NAMES)
+    for name in NAMES[1:]:
+        assert "Not measured yet: `noiseflow benchmark" in rivals.PAGES[name](tmp_path)
 
 
 def test_a_page_shows_a_changed_figure_and_the_rows_that_are_missing(tmp_path: Path) -> None:
