@@ -149,8 +149,7 @@ def ablations(folder: Path) -> str:
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), _machines([content])]
     gaps = (
-        "- Defocus modelled or not: the reconstruction has no model of defocus yet (`noiseflow simulate --defocus` has).\n"
-        "- Skipping of vacuum on or off: the joint fit does not skip yet.\n"
+        "- Defocus modelled or not, and skipping of vacuum on or off: this benchmark has no such rows yet.\n"
         "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
     )
     return _joined([*parts, _nothing(folder, "ablations", " --size 64"), "## Not measured", gaps])
