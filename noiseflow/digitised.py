@@ -114,7 +114,8 @@ class DigitisedDistribution(NoiseDistribution):
         found = None if self._signal is None else tabulated.automatic_log_prob(self._detector, self._signal, value)
         if found is not None:
             return found
-        result = self._log_cell(value) if self.step > 0 else self.base.log_prob(value)
+        inside = value.clamp(self.low, self.high)  # what lies beyond a rail is not used, and must not spoil a gradient
+        result = self._log_cell(inside) if self.step > 0 else self.base.log_prob(inside)
         # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
         infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)
         if math.isfinite(self.low):

@@ -126,15 +126,22 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return self._as(value, self.log_both_tails(value)[0].exp())
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        bottom, top = self._bound(low), self._bound(high)
+        bottom, top = self._bounds(low, high)
         return self._as(low, log_interval(bottom, top, self.rate.expand_as(bottom), self.read_noise))
 
-    def _bound(self, value: Tensor) -> Tensor:
-        """Residual of a bound, electrons; an infinite one moves to where nothing is left beyond it, without a gradient."""
-        finite = torch.isfinite(value)
-        residual, rate = self.electrons(torch.where(finite, value, torch.zeros_like(value)))
+    def _bounds(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals of bounds, electrons; an infinite one moves to where nothing is left beyond it, without a gradient."""
+        finite = [torch.isfinite(value) for value in (low, high)]
+        (bottom, rate), (top, _) = (
+            self.electrons(torch.where(known, value, torch.zeros_like(value)))
+            for known, value in zip(finite, (low, high), strict=True)
+        )
         end = (40 * torch.sqrt(rate + self.read_noise**2) + 100).detach()
-        return torch.where(finite, residual, torch.where(value > 0, end, -end))
+        least = torch.where(finite[1], torch.minimum(top.detach() - end, -end), -end)
+        most = torch.where(finite[0], torch.maximum(bottom.detach() + end, end), end)
+        return torch.where(finite[0], bottom, torch.where(low > 0, most, least)), torch.where(
+            finite[1], top, torch.where(high > 0, most, least)
+        )
 
     def icdf(self, value: Tensor) -> Tensor:
         reach = 40 * self.variance.sqrt().double() + 40 * self.gain
@@ -143,7 +150,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            rate = self._as(self.signal, self.rate).expand(*sample_shape, *self.batch_shape)
+            rate = self._as(self.signal, self.rate).expand((*sample_shape, *self.batch_shape))
             normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
             gain, offset, read_noise = (
                 self._as(self.signal, each) for each in (self.gain, self.offset, self.read_noise)

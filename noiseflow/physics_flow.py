@@ -58,10 +58,11 @@ class PhysicsFlow(ArrayModel):
 
     def _maps(self, signal: Tensor) -> list[Transform]:
         coordinate = self.correction.standardisation.coordinate(signal)
-        maps = self.correction.transforms(coordinate)
-        if not self.mean_preserving:
-            return maps
-        shift = self._latent_mean(signal, self.detector, self.correction)
+        with torch.autocast(signal.device.type, enabled=False):
+            maps = self.correction.transforms(coordinate)
+            if not self.mean_preserving:
+                return maps
+            shift = self._latent_mean(signal, self.detector, self.correction)
         return [Affine(shift, torch.zeros_like(shift)), *maps]
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
