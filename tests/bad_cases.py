@@ -192,6 +192,10 @@ benchmark --size 2 --quick --out {out}/b | at least 8
 benchmark --noise none --quick --out {out}/b | noise
 benchmark --noise magic --quick --out {out}/b | magic
 benchmark --phantom unicorn --quick --out {out}/b | unicorn
+sample {good}/model.safetensors {good}/clean.mrc -o /proc/n.mrc | not writable
+reconstruct {good}/tilts.mrc -o /proc/v.mrc | not writable
+simulate /proc/s | not writable
+demo --out /proc/demo | not writable
 demo --out {bad}/empty.mrc | is a file
 demo --out {bad}/empty.mrc/below | empty.mrc
 """

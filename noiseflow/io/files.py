@@ -40,8 +40,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
         raise ValueError(f"{path} is a folder; name an output file")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} does not exist; create the folder first")
-    if not os.access(path.parent, os.W_OK):
-        raise PermissionError(f"{path.parent} is not writable; choose another output folder")
+    _require_writable(path.parent)
     return path
 
 
@@ -74,8 +73,7 @@ def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ValueError(f"{existing} is a file; name a folder instead of {path}")
-    if not os.access(existing, os.W_OK):
-        raise PermissionError(f"{existing} is not writable; choose another output folder")
+    _require_writable(existing)
     free = shutil.disk_usage(existing).free
     if num_bytes > free:
         raise OSError(
@@ -83,6 +81,17 @@ def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
             "free some space, choose another disk or a smaller size"
         )
     return path
+
+
+def _require_writable(folder: Path) -> None:
+    """Refuse a folder that takes no files: by its permissions, or because making one fails."""
+    refusal = f"{folder} is not writable; choose another output folder"
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(refusal)
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise PermissionError(refusal) from error
 
 
 def require_whole(path: Path, num_bytes: int) -> None:
