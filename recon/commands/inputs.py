@@ -49,6 +49,7 @@ def load_tilt_series(
         series = replace(series, tilt_angles=-series.tilt_angles)
     if invert_contrast:
         series = inverted(series)
+    _warn_of_outliers(series)
     check_contrast(series)
     steps = np.diff(series.tilt_angles)
     if (steps > 0).any() and (steps < 0).any():
@@ -56,6 +57,18 @@ def load_tilt_series(
             "the tilt angles are not in order; each image keeps its own angle, which is all that counts", stacklevel=2
         )
     return series
+
+
+def _warn_of_outliers(series: TiltSeries) -> None:
+    used = series.images[series.used].astype(np.float64)
+    low, high = np.quantile(used[:: max(1, used.size // 1_000_000)], (0.02, 0.98))
+    far = np.abs(used - (low + high) / 2) > 100 * (high - low)
+    if high > low and far.any():
+        warnings.warn(
+            f"{int(far.sum())} pixels are a hundred times farther out than the others (up to {np.abs(used).max():.3g}) and would "
+            "spoil the volume; leave them out with --mask FILE, or replace them",
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)

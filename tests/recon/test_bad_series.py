@@ -60,6 +60,7 @@ def test_impossible_series_gives_one_line_and_no_volume(images, tmp_path, refuse
         (lambda i, a: (np.concatenate([i, i[:1]]), np.append(a, a[0])), [], "more than once"),
         (lambda i, a: (i[::-1][[3, 1, 2, 0, *range(4, 13)]], a[::-1][[3, 1, 2, 0, *range(4, 13)]]), [], "not in order"),
         (lambda i, a: (1 - i, a), [], "--invert-contrast"),
+        (lambda i, a: (at(i, 1e5, 1), a), [], "farther out"),
         (lambda i, a: (i, a), ["--mode", "linear"], "--mode transmission"),
         (
             lambda i, a: (np.concatenate([i, np.full_like(i[:1], np.nan)]), np.append(a, 70)),
