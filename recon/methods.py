@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from noiseflow import Digitised, FitResult, Gaussian, fit
+from noiseflow import Digitisation, Digitised, FitResult, Gaussian, fit
 from noiseflow.described import described
 from recon.classical import LineIntegralProblem, best_num_iterations, best_window
 from recon.denoise import find_denoiser
@@ -273,5 +273,5 @@ def describe(noise_model: nn.Module) -> str:
     """A noise model in a few words."""
     if not isinstance(noise_model, Digitised):
         return type(noise_model).__name__
-    rounding = f"rounded to {noise_model.step:g}, " if noise_model.step else ""
-    return f"{type(noise_model.model).__name__}, {rounding}clipped to [{noise_model.low:g}, {noise_model.high:g}]"
+    found = Digitisation(noise_model.step, noise_model.low, noise_model.high)
+    return f"{type(noise_model.model).__name__}, {found.in_words()}"

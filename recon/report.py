@@ -10,15 +10,18 @@ import torch
 
 from noiseflow import io
 from noiseflow.console import invocation
-from noiseflow.report import COLOURS, Report, make_sprites, new_chart, provenance
-from noiseflow.spatial import spatial_structure
+from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
+from noiseflow.spatial import SpatialStructure, spatial_structure
 from recon.methods import Outcome
 from recon.metrics import fourier_shell_correlation
 from recon.report_noise import noise_charts
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 
+_MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
-_NOT_SETTINGS = frozenset({"tilts", "out", "report", "json", "seed", "device", "fsc", "reference"})
+_NOT_SETTINGS = frozenset(
+    {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
+)
 _NAMES = {
     "transmission": "bright field, I₀·exp(−line integral)",
     "linear": "linear (HAADF, EDX), line integral + offset",
@@ -90,7 +93,7 @@ def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, 
     """Rows (setting, value, evidence): what the user gave, what was left at its default, what the data decided."""
     called = invocation()
     rows = [
-        (name.replace("_", " "), "none" if value is None else str(value), "given" if given else "default")
+        (name.replace("_", " "), _text(value), "given" if given else "default")
         for name, (value, given) in (called.options if called else {}).items()
         if name not in _NOT_SETTINGS and (given or value is not None) and name not in outcome.choices
     ]
@@ -120,8 +123,10 @@ def _evidence(name: str, outcome: Outcome) -> str:
     return "set by the method" if outcome.method != "joint" else "found from the data"
 
 
-def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
+def _text(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _add_volume(report: Report, volume: Volume) -> None:
@@ -180,7 +185,20 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> Non
     )
     device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
     pair = (torch.from_numpy(np.ascontiguousarray(stack)).to(device) for stack in (outcome.projections, images))
-    report.text(f"Residuals under this model: {spatial_structure(outcome.noise_model, *pair).in_words()}.")
+    report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")
+
+
+def _in_words(structure: SpatialStructure) -> str:
+    """What the residuals share; of so many pixels every trace of the volume's own smoothness stands out from chance."""
+    correlations = np.abs([structure.horizontal, structure.vertical, structure.pattern])
+    words = structure.in_words()
+    if (
+        structure.suffices
+        or correlations.max() > _MATTERS
+        or max(structure.rows, structure.columns) > 1 + 10 * _MATTERS
+    ):
+        return words
+    return words.partition("; a per-pixel")[0] + "; that is more than chance, and too little to matter"
 
 
 def _add_course(report: Report, outcome: Outcome) -> None:
@@ -204,21 +222,21 @@ def _add_course(report: Report, outcome: Outcome) -> None:
 def _add_resolution(
     report: Report, volume: Volume, halves: tuple[Volume, Volume] | None, reference: Volume | None
 ) -> None:
-    if halves is not None:
-        pair, level, what = halves, 0.143, "reconstructions of the even and of the odd tilts"
-    elif reference is not None:
-        pair, level, what = (volume, reference), 0.5, "the volume and the reference"
-    else:
+    pairs = [] if halves is None else [(*halves, 0.143, "even and odd tilts")]
+    pairs += [] if reference is None else [(volume, reference, 0.5, "volume and reference")]
+    if not pairs:
         return
-    frequency, correlation = fourier_shell_correlation(pair[0].attenuation, pair[1].attenuation)
     figure, axis = new_chart("Fourier shell correlation", x="cycles per voxel", y="correlation")
-    axis.plot(frequency, correlation, color=COLOURS["accent"])
-    axis.axhline(level, color=COLOURS["warm"], linewidth=1, linestyle="--")
-    axis.set_ylim(min(0.0, float(correlation.min())), 1.05)
-    below = np.flatnonzero(correlation[1:] < level)
-    reach = float(frequency[below[0] + 1]) if below.size else 0.5
+    words, least = [], 0.0
+    for (first, second, level, what), colour in zip(pairs, (COLOURS["accent"], COLOURS["warm"]), strict=False):
+        frequency, correlation = fourier_shell_correlation(first.attenuation, second.attenuation)
+        axis.plot(frequency, correlation, color=colour, label=what)
+        axis.axhline(level, color=colour, linewidth=1, linestyle="--")
+        least = min(least, float(correlation.min()))
+        below = np.flatnonzero(correlation[1:] < level)
+        reach = f"falls below {level} at {frequency[below[0] + 1]:.3f} cycles per voxel" if below.size else ""
+        words.append(f"Between {what} it {reach or f'stays above {level} at all frequencies'}.")
+    axis.set_ylim(least, 1.05)
+    add_legend(axis)
     report.heading("Resolution")
-    text = f"Between {what}; it falls below {level} at {reach:.3f} cycles per voxel."
-    if not below.size:
-        text = f"Between {what}; it stays above {level} at all frequencies."
-    report.charts([figure], caption=text)
+    report.charts([figure], caption=" ".join(words))

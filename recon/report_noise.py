@@ -61,7 +61,7 @@ def _quantile_chart(
         axis.plot(level, model[:, number], **style, label="model" if middle else None)
         points: dict[str, Any] = {"color": COLOURS["warm"], "markersize": 3, "linestyle": ""}
         axis.plot(level, data[:, number], "o", **points, label="data: 5, 25, 50, 75, 95 %" if middle else None)
-    add_legend(axis, loc="best")
+    add_legend(axis)
     return figure
 
 
@@ -90,5 +90,5 @@ def _histogram(noise_model: nn.Module, signal: Pixels, observation: Pixels, *, l
     axis.set_yscale("log")
     axis.set_ylim(bottom=max(0.2 / (residual.size * width), 1e-4 * masses.max() / width))
     if legend:
-        add_legend(axis, loc="lower center")
+        add_legend(axis)
     return figure

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from noiseflow.report import Report, make_sprites, new_chart, provenance
+from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
 from recon.methods import reconstruct
 from recon.report import even_odd, reconstruction_report
 from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -308,3 +308,21 @@ def test_page_names_its_contents_and_its_file_as_text(open_page):
         "Settings and choices",
         "Provenance",
     ]
+
+
+def test_resolution_is_drawn_of_halves_and_reference_alike(scene, tmp_path):
+    noisy, outcome = scene
+    half = Volume(outcome.volume.attenuation[:, ::-1].copy())
+    report = reconstruction_report(noisy, outcome, [], halves=(half, outcome.volume), reference=half)
+    page = report.save(tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Between even and odd tilts it" in page
+    assert "Between volume and reference it" in page
+
+
+def test_legends_hide_no_data():
+    figure, axis = new_chart("chart")
+    axis.plot([1, 2], label="data")
+    add_legend(axis)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert not legend.get_window_extent().overlaps(axis.get_window_extent())

@@ -68,9 +68,11 @@ def new_chart(title: str, *, x: str = "", y: str = "", width: float = 4.1, heigh
     return figure, axis
 
 
-def add_legend(axis: Any, **options: Any) -> None:
-    """A frameless legend in the page's text colour."""
-    axis.legend(frameon=False, fontsize=8.5, labelcolor=COLOURS["soft"], **options)
+def add_legend(axis: Any) -> None:
+    """A frameless legend in the page's text colour, below the axis where it hides nothing."""
+    handles, labels = axis.get_legend_handles_labels()
+    style = {"frameon": False, "fontsize": 8.5, "labelcolor": COLOURS["soft"], "ncols": len(labels)}
+    axis.figure.legend(handles, labels, loc="outside lower center", **style)
 
 
 def themed_svg(figure: Figure) -> str:
