@@ -5,6 +5,7 @@ Only the long exposure is ever interpolated: that of the short one would correla
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -36,6 +37,9 @@ MINIMUM_OVERLAP = 0.25
 CLEAR_PEAK = 8.0
 """Standard deviations by which the correlation of registered frames must stand out at zero shift. Unrelated frames
 reach 5.5 once the search over shifts, rotations and motions has picked their best."""
+
+TRUSTED_INLIERS = 10
+"""Matches that agree, from which on the correlation need not be asked."""
 
 LARGEST_ERROR = 0.5
 """Standard error, in pixels, above which a transform is too uncertain to use."""
@@ -121,7 +125,9 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
     has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
     sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
-    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift.
+    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift. Few matches may
+    all be wrong, as where a handful of round particles looks like another: the correlation's guess is then asked too, and
+    the clearer of the two counts.
 
     Args:
         short: (y, x) detector units.
@@ -132,18 +138,16 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    overlap, most_matches = 1.0, 0
+    tried = _Tried()
+    found: list[Registration] = []
     for guesses in (feature_guesses(short, long), correlation_guesses(short, long)):
-        for guess in guesses:
-            most_matches = max(most_matches, len(guess.points))
-            if not _plausible(guess.matrix):
-                continue
-            overlap = float(covered(guess.matrix, short.shape).mean())
-            if overlap < MINIMUM_OVERLAP:
-                continue
-            found = _refined(short, long, guess)
-            if found is not None:
-                return found
+        one = _first_refined(short, long, guesses, tried)
+        found += [] if one is None else [one]
+        if one is not None and one.inliers >= TRUSTED_INLIERS:
+            break
+    if found:
+        return max(found, key=lambda one: one.peak)
+    overlap, most_matches = tried.overlap, tried.most_matches
     reason = (
         f"they overlap by {overlap:.0%} only"
         if overlap < MINIMUM_OVERLAP
@@ -153,6 +157,29 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
         "at the same magnification, or give a longer short exposure"
     )
+
+
+@dataclass
+class _Tried:
+    """What the last guesses came to, for the message where all fail."""
+
+    overlap: float = 1.0
+    most_matches: int = 0
+
+
+def _first_refined(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Registration | None:
+    """The first of the guesses that stands, if any does."""
+    for guess in guesses:
+        tried.most_matches = max(tried.most_matches, len(guess.points))
+        if not _plausible(guess.matrix):
+            continue
+        tried.overlap = float(covered(guess.matrix, short.shape).mean())
+        if tried.overlap < MINIMUM_OVERLAP:
+            continue
+        found = _refined(short, long, guess)
+        if found is not None:
+            return found
+    return None
 
 
 def _plausible(matrix: Image) -> bool:

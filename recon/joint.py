@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,9 @@ from recon.weight import WeightChoice, choose_weight
 Progress = Callable[[int, str], None]
 _FIRST_WEIGHT = 0.4
 _TOLERATED = 0.003
-_FIRST_TURN, _SECOND_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the first turn's
+_SETTLING, _SETTLED = (40, 80, 160, 320), 0.03  # steps of least squares; nats per pixel
+_FIRST_TURN, _NEXT_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the turn before
+_MOST_TURNS = 6
 
 
 @described(projections="detector units")
@@ -164,7 +168,7 @@ class JointReconstructor:
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
-        task.fit(Gaussian().to(self.device), num_steps=40)
+        task.settle()
         noise_model = (
             _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
         )
@@ -208,35 +212,48 @@ class _Task:
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
+    def settle(self) -> None:
+        """Least squares, longer and longer until held-out pixels gain little: what an unfinished signal misses would pass for
+        noise, and be left as it is. Little noise takes long."""
+        reached = math.inf
+        for num_steps in _SETTLING:
+            nll = self.fit(Gaussian().to(self.observation.device), num_steps=num_steps).held_out_nll
+            if reached - nll < _SETTLED:
+                break
+            reached = nll
+
     def alternate(
         self, noise_model: nn.Module, *, num_steps: int, standardise: bool = False, progress: Progress | None = None
     ) -> FitResult:
-        """Fit the signal to the noise model as it is, twice, and the noise model to the signal as it is in between.
+        """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: twice, and on while
+        held-out pixels gain much, as they do where there is little noise.
 
-        Each turn ends at a small learning rate, and the second starts at a smaller one: the incident intensity would overshoot
+        Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
         again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
         wander with the few outliers of each batch, and drags the signal along.
 
         Args:
             noise_model: fitted in place.
-            num_steps: of the signal, both turns together.
+            num_steps: of the signal, the first two turns together.
             standardise: fit the noise model from scratch first.
             progress: called with the steps done and a note.
         """
         if standardise:
             self.refine(noise_model, standardise=True)
-        with _frozen(noise_model):
-            first = self.fit(
-                noise_model, num_steps=round(_FIRST_TURN * num_steps), standardise=False, progress=progress
-            )
-        self.refine(noise_model)
-        later = None if progress is None else lambda step, note: progress(first.num_steps + step, note)
-        rate = self.signal_model.learning_rate
-        self.signal_model.learning_rate = rate * _SECOND_TURN
-        with _frozen(noise_model):
-            second = self.fit(noise_model, num_steps=num_steps - first.num_steps, standardise=False, progress=later)
+        rate, done, reached = self.signal_model.learning_rate, 0, math.inf
+        for turn in range(_MOST_TURNS):
+            share = _FIRST_TURN if turn == 0 else 1 - _FIRST_TURN
+            later = None if progress is None else partial(_continue, progress, done)
+            self.signal_model.learning_rate = rate * _NEXT_TURN**turn
+            with _frozen(noise_model):
+                result = self.fit(noise_model, num_steps=round(share * num_steps), standardise=False, progress=later)
+            done += result.num_steps
+            if turn > 0 and reached - result.held_out_nll < _SETTLED:
+                break
+            reached = result.held_out_nll
+            self.refine(noise_model)
         self.signal_model.learning_rate = rate
-        return second
+        return result
 
     def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
         """Fit a noise model that learns to the signal as it is."""
@@ -252,6 +269,10 @@ def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module
         task.fit(model.to(device), known=True, num_steps=num_steps_of(model, 100)).held_out_nll for model in candidates
     ]
     return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
+
+
+def _continue(progress: Progress, done: int, step: int, note: str) -> None:
+    progress(done + step, note)
 
 
 def _held_out_nll(task: _Task, noise_model: nn.Module, weight: float) -> float:

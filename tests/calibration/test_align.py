@@ -106,3 +106,17 @@ def test_a_small_rotation_is_not_lost_to_the_smoothing_of_a_half_pixel_shift():
     found = register(short, long)
     assert found.motion == "euclidean"
     assert error_px(found, matrix, 192) < 0.2
+
+
+def test_a_few_matches_that_are_all_wrong_do_not_outweigh_the_correlation():
+    generator = np.random.default_rng(
+        20074
+    )  # three particles of the one frame resemble three others, a quarter turn away
+    scene, size = sparse_scene(generator, 256), 256
+    snr, angle = generator.uniform(2, 5), generator.uniform(-3, 3)
+    matrix = rigid(angle, tuple(generator.uniform(-0.1, 0.1, 2) * size), size)
+    y, x = np.mgrid[:size, :size].astype(float)
+    moved = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([x, y])) + matrix[:, 2][:, None, None]
+    short = scene(*moved) + generator.standard_normal(x.shape) / snr
+    long = 16 * scene(x, y) + 4 * generator.standard_normal(x.shape) / snr
+    assert error_px(register(short, long), matrix, size) < 0.3

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import noiseflow
+from recon import benchmark_needle
 from recon.candidates import noise_candidates
 from recon.fields import VoxelField
 from recon.first_guess import estimate_response
@@ -123,3 +124,13 @@ def test_chosen_weight_is_nearly_the_best(scene):
     ladder = [JointReconstructor(weight=weight)(noisy) for weight in (0.1, 0.2, 0.4, 0.8, 1.6)]
     best = max(compare(result.volume.attenuation, truth).psnr for result in ladder)
     assert compare(chosen.volume.attenuation, truth).psnr > best - 0.4
+
+
+@pytest.mark.slow
+def test_a_real_series_with_little_noise_is_not_taken_for_noise():
+    parts = benchmark_needle.split(benchmark_needle.load(), "as measured", "every fifth", seed=0)
+    volume = JointReconstructor()(parts.given).volume.attenuation
+    predicted = benchmark_needle.predict(parts.given, volume, parts.left_out.tilt_angles)
+    assert (
+        compare(predicted, parts.target).psnr > 34
+    )  # least squares reaches 38 dB, a fit that takes the misfit for noise 22
