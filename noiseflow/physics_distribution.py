@@ -101,8 +101,10 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def corrected_interval(self, bottom: Tensor, top: Tensor, mass: Tensor) -> Tensor:
         """The detector's own, exact mass times the mean correction, so that masses far below rounding of the CDF survive."""
-        narrow = top - bottom < 1e-3
         zero = torch.zeros_like(bottom)
+        empty = bottom == top  # at the ends of the line too
+        bottom, top = torch.where(empty, zero, bottom), torch.where(empty, zero, top)
+        narrow = top - bottom < 1e-3
         at_middle = self.correct(torch.where(narrow, (bottom + top) / 2, zero))[1]
         a, b = torch.where(narrow, zero - 1, bottom), torch.where(narrow, zero + 1, top)
         wide = log_normal_interval(self._mapped_bound(a), self._mapped_bound(b)) - log_normal_interval(a, b)

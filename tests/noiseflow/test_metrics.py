@@ -133,3 +133,12 @@ def test_floors_are_met_by_the_truth_and_follow_the_number_of_bins(seed: int, nu
     ):
         assert np.mean(floors) == pytest.approx(expected, rel=0.15)
         assert np.mean(values) == pytest.approx(expected, rel=5 * math.sqrt(2 / (num_bins - 1) / 40) + 0.05)
+
+
+def test_bins_beyond_the_rails_have_no_mass():
+    edges = torch.tensor([-math.inf, -0.6, -0.5, 0.1, 0.7, 0.9, math.inf])
+    for model in (noiseflow.PhysicsFlow(), noiseflow.PoissonGaussian(), noiseflow.SplineFlow(), noiseflow.Mixture()):
+        railed = noiseflow.Digitised(model, step=0.0, low=0.0, high=1.0)
+        masses = metrics.residual_masses(railed, torch.full((5,), 0.4), edges)
+        assert masses[[0, 1, 4, 5]] == pytest.approx(0.0, abs=1e-12)
+        assert masses.sum() == pytest.approx(1.0)
