@@ -29,7 +29,7 @@ class PhysicsFlow(ArrayModel):
         num_bins: bins of the spline.
         mean_preserving: shift the latent so that E[observation | signal] is the detector's: the signal, or the offset where the
             signal lies below it. Peaks stay in their places. To 1e-4 standard deviations where the read noise exceeds 0.4
-            electrons; where electrons are resolved better, a strong correction leaves up to 1e-2.
+            electrons; where electrons are resolved better, a strong correction leaves up to 1e-2, and 1e-1 near the offset.
         width: hidden units of the conditioning network.
         detector: the physical part; a default `PoissonGaussian` where none is given.
 
