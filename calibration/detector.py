@@ -28,6 +28,9 @@ EXCESS_NOISE = (
     "the excess-noise factor: read 'gain' as that product."
 )
 
+LEAST_GAIN = 1e-4
+"""Standard deviations of the noise below which a gain is none: such a noise would be that of 10⁸ electrons and more."""
+
 FEW_ELECTRONS = 25.0
 """Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
 
@@ -88,6 +91,12 @@ def measure_detector(
         levels, start = _with_cells(levels, cells, offset, _guess(pairs))
     posterior = sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress)
     levels = list(posterior.levels)
+    noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))
+    if posterior.gain.median < LEAST_GAIN * noise:
+        raise NotMeasurable(
+            "the noise grows so little with the signal that the gain cannot be told from none; give the exposure ratio, "
+            "dark frames, or exposures of more electrons"
+        )
     return Detector(posterior, fit_photon_transfer(levels), levels, offset, misfit(levels, posterior.most_likely))
 
 

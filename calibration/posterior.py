@@ -204,7 +204,10 @@ def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Gene
         axes = factor * np.linalg.cholesky(spread).T
         spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
     found = best + generator.standard_normal((6 * NUM_WALKERS, 3)) @ np.linalg.cholesky(spread).T
-    found = np.concatenate([found, best + 0.1 * (found[:NUM_WALKERS] - best)])
+    nearer = [
+        best + share * (found[:NUM_WALKERS] - best) for share in (0.1, 0.01, 0.001)
+    ]  # the maximum may be at an edge
+    found = np.concatenate([found, *nearer])
     return np.asarray(found[log_posterior(found) > highest - FARTHEST])
 
 
@@ -213,10 +216,12 @@ def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback:
     pairs = [(0, 1), (0, 2), (1, 2)]
     steps = np.concatenate([np.zeros((1, 3)), axes, -axes, [axes[i] + axes[j] for i, j in pairs]])
     value = log_posterior(best + steps)
+    if not np.isfinite(value).all():
+        return fallback
     curvature = np.diag(value[1:4] + value[4:7] - 2 * value[0])
     for (i, j), both in zip(pairs, value[7:], strict=True):
         curvature[i, j] = curvature[j, i] = both - value[1 + i] - value[1 + j] + value[0]
-    if not np.isfinite(curvature).all() or np.linalg.eigvalsh(curvature).max() > -1e-3:
+    if np.linalg.eigvalsh(curvature).max() > -1e-3:
         return fallback
     return np.asarray(axes.T @ np.linalg.inv(-curvature) @ axes)
 

@@ -229,3 +229,16 @@ def test_pairs_some_of_few_and_some_of_many_electrons_are_measured_together():
         still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
         pairs.append(align_with(ExposurePair(pair.short, pair.long, 16.0), still))
     assert measure_detector(pairs).posterior.gain.median == pytest.approx(GAIN, rel=0.06)
+
+
+def test_a_gain_that_cannot_be_told_from_none_is_refused():
+    generator = np.random.default_rng(1)
+    dose = 2.4 * np.exp(
+        0.8 * (lambda x: x / x.std())(ndimage.gaussian_filter(generator.standard_normal((192, 192)), 4))
+    )
+    short = 100 + generator.normal(3.3 * dose, 25.0)  # the noise does not depend on the signal at all
+    long = 100 + generator.normal(16 * 3.3 * dose, 25.0)
+    pair = ExposurePair(np.round(short), np.round(long))
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    with pytest.raises(NotMeasurable, match="gain"):
+        measure_detector([align_with(pair, still)])
