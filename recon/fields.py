@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +43,10 @@ class Field(Described):
     def units(self) -> Tensor:
         """Attenuation in units of the scale, not negative, (depth, width, height)."""
         raise NotImplementedError
+
+    def at(self, places: Tensor) -> Tensor:
+        """Attenuation, in units of the scale, at (N,) places of the flat lattice (z, x, y)."""
+        return self.units().reshape(-1).index_select(0, places)
 
     def start_from(self, volume: Tensor) -> None:
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
@@ -83,6 +88,9 @@ class VoxelField(Field):
     def units(self) -> Tensor:
         return functional.softplus(self.values)
 
+    def at(self, places: Tensor) -> Tensor:
+        return functional.softplus(_picked(self.values, places))
+
 
 class MultiresolutionField(Field):
     """The sum of dense grids at doubling resolutions: the same volumes as `VoxelField`, far better conditioned.
@@ -112,20 +120,80 @@ class MultiresolutionField(Field):
             grid.copy_(self._raw_of(volume, grid.shape))
 
     def units(self) -> Tensor:
+        return functional.softplus(self._sum())
+
+    def at(self, places: Tensor) -> Tensor:
+        return functional.softplus(_picked(self._sum(), places))
+
+    def _sum(self) -> Tensor:
         total: Tensor = self.grids[0]
         for grid in list(self.grids)[1:]:
             total = upsample(total, grid.shape) + grid
-        return functional.softplus(total)
+        return total
+
+
+def _picked(lattice: Tensor, places: Tensor) -> Tensor:
+    """Values at different places, so that the gradient may be copied where it belongs."""
+    picked: Tensor = _Picked.apply(lattice, places)  # type: ignore[no-untyped-call]
+    return picked
+
+
+class _Picked(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, lattice: Tensor, places: Tensor) -> Tensor:
+        ctx.shape = lattice.shape
+        ctx.save_for_backward(places)
+        return lattice.reshape(-1).index_select(0, places)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (places,) = ctx.saved_tensors
+        return gradient.new_zeros(ctx.shape.numel()).index_copy_(0, places, gradient).view(ctx.shape), None
 
 
 def upsample(grid: Tensor, shape: Sequence[int]) -> Tensor:
     """Linear interpolation of a 3D grid to twice its size along each axis (or one less), cell centres aligned.
 
-    As three small matrix products it is several times faster than the general interpolation, forward and back.
+    Axis by axis it is several times faster than the general interpolation, forward and back.
     """
-    first, second, third = (_upsampling_matrix(*sizes, like=grid) for sizes in zip(grid.shape, shape, strict=True))
-    grid = torch.matmul(second, grid @ third.T)
-    return torch.matmul(first, grid.flatten(1)).view(tuple(shape))
+    first, _, third = grid.shape
+    grid = grid @ _upsampling_matrix(third, shape[2], like=grid).T
+    grid = _Doubled.apply(grid, shape[1])  # type: ignore[no-untyped-call]
+    doubled: Tensor = _Doubled.apply(grid.view(1, first, -1), shape[0])  # type: ignore[no-untyped-call]
+    return doubled.view(tuple(shape))
+
+
+class _Doubled(torch.autograd.Function):
+    """Linear interpolation along the middle axis: three quarters of the nearest, one quarter of the next."""
+
+    @staticmethod
+    def forward(ctx: Any, coarse: Tensor, fine: int) -> Tensor:
+        size = ctx.size = coarse.shape[1]
+        if fine == size:
+            return coarse.clone()
+        result = coarse.new_empty(coarse.shape[0], fine, coarse.shape[2])
+        even, odd = result[:, 0::2], result[:, 1::2]
+        even[:, 0] = coarse[:, 0]
+        torch.lerp(coarse[:, 1:], coarse[:, :-1], 0.25, out=even[:, 1:])
+        torch.lerp(coarse[:, :-1], coarse[:, 1:], 0.25, out=odd[:, : size - 1])
+        if odd.shape[1] == size:
+            odd[:, -1] = coarse[:, -1]
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        size = ctx.size
+        if gradient.shape[1] == size:
+            return gradient, None
+        even, odd = gradient[:, 0::2], gradient[:, 1::2]
+        found = even * 0.75
+        found[:, : odd.shape[1]].add_(odd, alpha=0.75)
+        found[:, :-1].add_(even[:, 1:], alpha=0.25)
+        found[:, 1:].add_(odd[:, : size - 1], alpha=0.25)
+        found[:, 0].add_(even[:, 0], alpha=0.25)
+        if odd.shape[1] == size:
+            found[:, -1].add_(odd[:, -1], alpha=0.25)
+        return found, None
 
 
 def _upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:

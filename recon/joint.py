@@ -19,7 +19,6 @@ from noiseflow import FitResult, Gaussian, fit
 from noiseflow.described import described
 from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
 from recon.coarse_start import coarse_start, learning_rate
-from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field, MultiresolutionField
 from recon.first_guess import (
     attenuation_scale,
@@ -38,6 +37,7 @@ _TOLERATED = 0.003
 _SETTLING, _SETTLED = (40, 80, 160, 320), 0.03  # steps of least squares; nats per pixel
 _FIRST_TURN, _NEXT_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
+_WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
 
 
 @described(projections="detector units")
@@ -77,7 +77,7 @@ class JointReconstructor:
         make_field: makes the field from shape and scale.
         num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
-        skip_vacuum: whether a `CoordinateNetwork` is evaluated only where there may be something.
+        skip_vacuum: whether voxels are left out where there is nothing.
         slab: slices used to choose.
         settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
         seed: of every random choice.
@@ -145,8 +145,9 @@ class JointReconstructor:
         field.start_from(rough)
         rate = learning_rate(rough, field)
         occupancy = None
-        if self.skip_vacuum and isinstance(field, CoordinateNetwork):
+        if self.skip_vacuum:
             occupancy = Occupancy(rough / field.scale, grid.shape).to(self.device)
+            occupancy = occupancy if occupancy.share < _WORTHWHILE else None
         return TomographySignal(
             field, projector, image_formation, weight=weight, learning_rate=rate, occupancy=occupancy
         )

@@ -1,4 +1,4 @@
-"""Where a volume may hold anything: fields that are evaluated point by point need not be asked about vacuum."""
+"""Where a volume may hold anything: the rest need not be evaluated, projected or regularised."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from recon.projector import SliceProjector
+
 _RETEST_EVERY = 10
 
 
@@ -16,7 +18,7 @@ class Occupancy(nn.Module):
 
     Everything within a margin of what the rough volume holds is occupied. The rest counts as vacuum, and is tested again in every
     tenth step: a block of voxels becomes occupied where the likelihood gains more by raising it than the total variation of its
-    faces costs. Nothing is ever taken out.
+    faces costs, two times in a row, for a fit that swings wants much at once. Nothing is ever taken out.
 
     Args:
         rough: (z, y, x) of the same extent and any resolution, in units of the field's scale.
@@ -27,46 +29,52 @@ class Occupancy(nn.Module):
     """
 
     mask: Tensor
+    wanted: Tensor
+    num_steps: Tensor
 
     def __init__(
         self, rough: Tensor, shape: Sequence[int], *, least: float = 0.2, margin: int = 2, block: int = 4
     ) -> None:
         super().__init__()
-        self.block, self._since_test = block, 0
+        self.block = block
         lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
         grown = functional.max_pool3d(lattice, 2 * margin + 1, stride=1, padding=margin)[0, 0]
         self.register_buffer("mask", (grown > least).transpose(1, 2).contiguous())
+        self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
+        self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
 
     @property
     def share(self) -> float:
         """The share of the lattice that is occupied."""
         return float(self.mask.float().mean())
 
-    def indices(self) -> Tensor:
-        """(N,) occupied places of the flat lattice in the projector's order, (z, x, y)."""
-        return self.mask.reshape(-1).nonzero()[:, 0]
-
     def rows(self, rows: slice) -> Occupancy:
         """The same for some slices."""
-        part = Occupancy(torch.zeros(1, 1, 1), (1, 1, 1), block=self.block)
+        depth, width, _ = self.mask.shape
+        part = Occupancy(torch.zeros(1, 1, 1), (depth, rows.stop - rows.start, width), block=self.block).to(
+            self.mask.device
+        )
         part.mask = self.mask[..., rows].clone()
         return part
 
     @torch.no_grad()
-    def retest(self, gradient: Tensor, cost: float) -> None:
-        """Occupy the blocks that the data wants.
+    def retest(self, gradient: Tensor, projector: SliceProjector, cost: float) -> None:
+        """Occupy the blocks that the data wants, in every tenth call.
 
         Args:
-            gradient: of the loss with respect to the attenuation, any shape of the lattice (z, x, y).
+            gradient: of the loss with respect to the line integrals, (tilts * detector_width, height).
+            projector: of the whole lattice.
             cost: of the total variation, loss per unit of attenuation and voxel face.
         """
-        self._since_test += 1
-        if self._since_test % _RETEST_EVERY:
+        self.num_steps += 1
+        if int(self.num_steps) % _RETEST_EVERY:
             return
-        lattice = gradient.view(self.mask.shape)[None, None]
+        lattice = projector.backproject(gradient).view(self.mask.shape)[None, None]
         options = {"ceil_mode": True, "divisor_override": 1}
         gain = -functional.avg_pool3d(lattice, self.block, **options)[0, 0]  # type: ignore[arg-type]
         wanted = gain > 6 * self.block**2 * cost
+        lasting, self.wanted = wanted & self.wanted, wanted
         for axis, size in enumerate(self.mask.shape):
-            wanted = wanted.repeat_interleave(self.block, axis).narrow(axis, 0, size)
-        self.mask |= wanted
+            lasting = lasting.repeat_interleave(self.block, axis).narrow(axis, 0, size)
+        if bool((lasting & ~self.mask).any()):
+            self.mask |= lasting

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 class SliceProjector:
@@ -122,6 +125,15 @@ class SliceProjector:
             parts.append(part)
         return parts
 
+    def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """The matrix of some columns of the lattice, (n,) indices z·width + x, and its transpose."""
+        from scipy.sparse import csr_array
+
+        back = self.transposed
+        parts = (part.cpu().numpy() for part in (back.values(), back.col_indices(), back.crow_indices()))
+        chosen = csr_array(tuple(parts), shape=tuple(back.shape))[columns.cpu().numpy()]
+        return _as_tensor(chosen.T.tocsr()).to(self.matrix), _as_tensor(chosen).to(self.matrix)
+
 
 def to_columns(volume: Tensor) -> Tensor:
     """(z, y, x) -> (z * x, y): each slice becomes one column."""
@@ -185,7 +197,10 @@ def _csr(
 ) -> Tensor:
     from scipy.sparse import csr_array
 
-    matrix = csr_array((values, (rows, columns)), shape=shape)
+    return _as_tensor(csr_array((values, (rows, columns)), shape=shape))
+
+
+def _as_tensor(matrix: csr_array) -> Tensor:
     matrix.sort_indices()
     with warnings.catch_warnings():  # torch announces that CSR is in beta
         warnings.simplefilter("ignore")
@@ -193,7 +208,7 @@ def _csr(
             torch.from_numpy(matrix.indptr.astype(np.int32)),
             torch.from_numpy(matrix.indices.astype(np.int32)),
             torch.from_numpy(matrix.data),
-            size=shape,
+            size=matrix.shape,
         )
 
 

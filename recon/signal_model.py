@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.modules import Described
-from recon.coordinate_network import CoordinateNetwork
 from recon.fields import Field
 from recon.occupancy import Occupancy
 from recon.projector import SliceProjector, from_columns
 from recon.regularisers import total_variation
+from recon.tiles import Tiles
 
 
 class TomographySignal(Described):
@@ -29,7 +29,7 @@ class TomographySignal(Described):
             voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
         learning_rate: of a field of voxels; the detector's response learns at a twentieth of it.
-        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For fields with a method ``at``.
+        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None.
     """
 
     def __init__(
@@ -47,7 +47,8 @@ class TomographySignal(Described):
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
         self.occupancy = occupancy
-        self._columns: Tensor | None = None
+        self._values: Tensor | None = None
+        self._tiles: tuple[int, Tiles] | None = None
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
 
     def extra_repr(self) -> str:
@@ -60,30 +61,52 @@ class TomographySignal(Described):
 
     def signal(self) -> Tensor:
         """The signal of all pixels, flat."""
-        self._columns, self._seen = self._evaluate(), None
-        rays = self.projector.project(self._columns)
+        self._values, self._seen = self._evaluate(), None
+        rays = self._project(self._values)
         shape = (self.projector.num_tilts, self.projector.detector_width, self.field.height)
         signal: Tensor = self.image_formation(rays.view(shape))
         return signal.reshape(-1)
 
     def _evaluate(self) -> Tensor:
-        """The field where it is occupied, and vacuum elsewhere; what the data wants there is tested as gradients pass."""
-        occupancy, field = self.occupancy, self.field
-        if occupancy is None or not isinstance(field, CoordinateNetwork):
-            everywhere: Tensor = field()
+        """The field on the whole lattice, (depth * width, height), or at the places where it is occupied."""
+        if self.occupancy is None:
+            everywhere: Tensor = self.field()
             return everywhere
-        places = occupancy.indices()
-        empty = torch.zeros(occupancy.mask.numel(), dtype=field.scale.dtype, device=field.scale.device)
-        columns = empty.index_put((places,), field.at(places) * field.scale).view(-1, field.height)
-        if columns.requires_grad:
-            cost = self.weight / (float(field.scale) * self.num_pixels)
-            columns.register_hook(lambda gradient: occupancy.retest(gradient, cost))  # type: ignore[no-untyped-call]
-        return columns
+        tiles = self.tiles
+        units = self.field.at(tiles.places[tiles.occupied])
+        return units.new_zeros(tiles.places.numel()).index_copy(0, tiles.occupied, units * self.field.scale)
+
+    def _project(self, values: Tensor) -> Tensor:
+        """Line integrals; what the data wants where the lattice counts as empty is tested as gradients pass."""
+        occupancy, projector = self.occupancy, self.projector
+        if occupancy is None:
+            return projector.project(values)
+        rays = self.tiles.project(values)
+        if rays.requires_grad:
+            cost = self.weight / (float(self.field.scale) * self.num_pixels)
+            rays.register_hook(lambda gradient: occupancy.retest(gradient, projector, cost))  # type: ignore[no-untyped-call]
+        return rays
+
+    @property
+    def tiles(self) -> Tiles:
+        """What is occupied, as it is now.
+
+        Raises:
+            ValueError: there is no occupancy.
+        """
+        if self.occupancy is None:
+            raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
+        mask = self.occupancy.mask
+        if self._tiles is None or self._tiles[0] != mask._version:
+            self._tiles = mask._version, Tiles(mask, self.projector)
+        return self._tiles[1]
 
     def volume(self) -> Tensor:
         """The attenuation that the signal is made of, (z, y, x), detached."""
         with torch.no_grad():
-            return from_columns(self._evaluate(), self.field.depth).contiguous()
+            values = self._evaluate()
+            columns = values if self.occupancy is None else self.tiles.lattice(values)
+            return from_columns(columns, self.field.depth).contiguous()
 
     def forward(self, pixels: Tensor) -> Tensor:
         """The signal of some pixels; without gradients, all are projected once for each state of the parameters."""
@@ -98,11 +121,15 @@ class TomographySignal(Described):
 
     def penalty(self) -> Tensor:
         """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""
-        columns = self._evaluate() if self._columns is None else self._columns
-        self._columns = None
+        values = self._evaluate() if self._values is None else self._values
+        self._values = None
         scale = float(self.field.scale)
-        lattice = columns.view(self.field.depth, self.field.width, self.field.height)
-        variation = total_variation(lattice, smoothing=self.smoothing * scale)
+        smoothing = self.smoothing * scale
+        if self.occupancy is None:
+            lattice = values.view(self.field.depth, self.field.width, self.field.height)
+            variation = total_variation(lattice, smoothing=smoothing)
+        else:
+            variation = self.tiles.total_variation(values, smoothing=smoothing)
         return variation * (self.weight / (scale * self.num_pixels))
 
     def with_field(self, field: Field) -> TomographySignal:

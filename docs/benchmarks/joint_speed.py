@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from noiseflow import Gaussian
 from recon.benchmark import in_turn, make_scene
 from recon.coordinate_network import CoordinateNetwork
+from recon.fields import MultiresolutionField, VoxelField
 from recon.joint import JointReconstructor
 from recon.metrics import compare
 from recon.presets import PRESETS
@@ -70,20 +72,33 @@ def network(size: int = 96) -> Row:
     return row | {"ratio": row["ray by ray"] / slice_wise}
 
 
-def skipping(phantom: str, size: int = 96, num_steps: int = 80) -> Row:
-    """A small coordinate network with and without skipping of vacuum, equal steps, noise known and weight given."""
-    scene = make_scene(size, phantom=phantom, tilts="-58.5:58.5:3")
-    make = partial(CoordinateNetwork, width=32, layers=3, frequencies=6, skip=1)
-    fit = JointReconstructor(
-        num_steps=num_steps, weight=_WEIGHT, make_field=make, noise_model=lambda: scene.noise_model
-    )
+_NETWORK = partial(CoordinateNetwork, width=32, layers=3, frequencies=6, skip=1)
+
+
+def skipping(
+    phantom: str, size: int, make_field: Callable[..., Any] = MultiresolutionField, tilts: str = TILTS, repeats: int = 3
+) -> Row:
+    """A field with and without skipping of vacuum, equal steps, noise known and weight given; whole runs."""
+    scene = make_scene(size, phantom=phantom, tilts=tilts)
+    fit = JointReconstructor(weight=_WEIGHT, make_field=make_field, noise_model=lambda: scene.noise_model)
     fits = [replace(fit, skip_vacuum=skip) for skip in (True, False)]
-    (skipped, result), (full, reference) = in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=1)
+    (skipped, result), (full, reference) = in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=repeats)
     psnr = [compare(each.volume.attenuation, scene.truth).psnr for each in (result, reference)]
     occupancy = result.signal_model.occupancy
-    row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean()), "occupied": occupancy.share}
+    row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean())}
+    row |= {"occupied": 1.0 if occupancy is None else occupancy.share}
     row |= {"skipping": skipped, "everywhere": full, "ratio": full / skipped}
     return row | {"volume PSNR, skipping": psnr[0], "volume PSNR, everywhere": psnr[1]}
+
+
+def skipping_voxels(phantom: str) -> Row:
+    """The same for a free number per voxel."""
+    return skipping(phantom, 96, VoxelField)
+
+
+def skipping_network(phantom: str) -> Row:
+    """The same for a small coordinate network."""
+    return skipping(phantom, 96, _NETWORK, "-58.5:58.5:3", repeats=1)
 
 
 def projector(size: int, repeats: int = 5) -> Row:

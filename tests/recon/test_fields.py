@@ -36,10 +36,14 @@ def test_every_grid_of_a_field_learns():
     assert all(float(grid.grad.abs().min()) > 0 for grid in field.grids)
 
 
-def test_upsampling_equals_the_general_interpolation():
-    grid = torch.rand(3, 4, 5, dtype=torch.float64)
-    expected = functional.interpolate(grid[None, None], size=(6, 8, 10), mode="trilinear")[0, 0]
-    torch.testing.assert_close(upsample(grid, (6, 8, 10)), expected)
+@pytest.mark.parametrize("shape", [(6, 8, 10), (5, 7, 9), (1, 2, 3), (12, 1, 2)])
+def test_upsampling_equals_the_general_interpolation(shape):
+    coarse = [(size + 1) // 2 for size in shape]
+    grid = torch.rand(coarse, dtype=torch.float64, requires_grad=True)
+    even = [size if size == 1 else 2 * size for size in coarse]
+    expected = functional.interpolate(grid[None, None], size=even, mode="trilinear")[0, 0]
+    torch.testing.assert_close(upsample(grid, shape), expected[: shape[0], : shape[1], : shape[2]])
+    assert torch.autograd.gradcheck(lambda values: upsample(values, shape), grid)
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 4), (4, 4)])

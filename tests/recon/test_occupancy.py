@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from recon.coordinate_network import CoordinateNetwork
+from recon.fields import MultiresolutionField, VoxelField
 from recon.image_formation import Transmission
 from recon.joint import JointReconstructor
 from recon.occupancy import Occupancy
@@ -27,6 +28,25 @@ def field():
 def signal_model(field, occupancy, weight=0.3):
     projector = SliceProjector(tilt_angles=[-50.0, 0.0, 40.0], depth=8, width=12)
     return TomographySignal(field, projector, Transmission(), weight=weight, occupancy=occupancy)
+
+
+@pytest.mark.parametrize("kind", [VoxelField, MultiresolutionField])
+def test_fields_skip_alike(kind):
+    field = kind((8, 10, 12), scale=0.1)
+    field.start_from(torch.rand(8, 10, 12, generator=torch.Generator().manual_seed(0)) * 0.1)
+    rough = torch.zeros(8, 10, 12)
+    rough[3, 5, 2] = rough[6, 9, 11] = 1.0
+    occupancy = Occupancy(rough, (8, 10, 12), margin=1)
+    skipping, inside = signal_model(field, occupancy), occupancy.mask.transpose(1, 2)
+    torch.testing.assert_close(skipping.volume(), field.volume() * inside)
+    (skipping.signal().sum() + skipping.penalty()).backward()
+    found = [parameter.grad.clone() for parameter in field.parameters()]
+    field.zero_grad()
+    columns = field() * occupancy.mask.reshape(-1, 10)
+    plain = signal_model(field, None)
+    plain._evaluate = lambda: columns
+    (plain.signal().sum() + plain.penalty()).backward()
+    torch.testing.assert_close(found, [parameter.grad for parameter in field.parameters()])
 
 
 def everything():
@@ -79,13 +99,27 @@ def test_what_the_data_wants_becomes_occupied_and_nothing_else():
     occupancy = Occupancy(torch.zeros(2, 2, 2), (16, 16, 16))
     occupancy.mask[0, 0, 0] = True
     model = TomographySignal(field, projector, Transmission(), weight=0.2, occupancy=occupancy)
-    for _ in range(10):
+    for _ in range(20):
         loss = 50 * (model.signal() - observed).square().mean() + model.penalty()
         loss.backward()
     found = occupancy.mask.transpose(1, 2)
     assert bool(found[truth > 0].all())
     assert not found[:, 12:].any()
     assert occupancy.share < 0.6
+
+
+def test_what_is_wanted_only_once_stays_empty():
+    projector, occupancy = (
+        SliceProjector(tilt_angles=[0.0], depth=8, width=8),
+        Occupancy(torch.zeros(2, 2, 2), (8, 8, 8)),
+    )
+    swings = -torch.ones(8, 8), torch.ones(8, 8)
+    for step in range(40):
+        occupancy.retest(swings[step // 10 % 2], projector, 1e-6)
+    assert occupancy.share == 0
+    for _ in range(20):
+        occupancy.retest(swings[0], projector, 1e-6)
+    assert occupancy.share == 1
 
 
 def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
@@ -97,5 +131,7 @@ def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
         JointReconstructor(make_field=make, skip_vacuum=skip).prepare(clean, grid) for skip in (True, True, False)
     )
     assert plain.occupancy is None
+    dense, _ = clean_tilt_series(np.ones((8, 16, 16), np.float32), np.arange(-60, 61, 20.0))
+    assert JointReconstructor().prepare(dense, VolumeGrid.of(dense, 8)).occupancy is None
     assert torch.equal(first.occupancy.mask, second.occupancy.mask)
     torch.testing.assert_close(first.field.volume(), second.field.volume(), rtol=0, atol=0)
