@@ -12,6 +12,7 @@ from torch import nn
 
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation, fit
 from recon.benchmark import Cell, Results, Scene, make_scene
+from recon.benchmark_defocus import STRENGTH, defocused_scene
 from recon.benchmark_network import WIDTHS, fit_network
 from recon.benchmark_search import STEPS, Array, Best, back_projections, best, best_fit, denoised
 from recon.external import missing
@@ -162,7 +163,21 @@ def _weights(scene: Scene) -> list[Variant]:
     ]
 
 
-GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers)
+def _defocus(scene: Scene) -> list[Variant]:
+    return [
+        Variant("defocus", name, lambda d=strength: _once(defocused_scene(scene), weight=WEIGHT, defocus=d), scene)  # type: ignore[misc]
+        for name, strength in (("modelled", STRENGTH), ("not modelled", 0.0))
+    ]
+
+
+def _skipping(scene: Scene) -> list[Variant]:
+    return [
+        Variant("skipping of vacuum", name, partial(_once, scene, weight=WEIGHT, skip_vacuum=skip), scene)
+        for name, skip in (("on", True), ("off", False))
+    ]
+
+
+GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
 """What changes, on one scene."""
 
 

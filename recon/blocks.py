@@ -17,7 +17,7 @@ from recon.fields import MultiresolutionField, VoxelField
 from recon.first_guess import contrast_slab, estimate_response
 from recon.joint import JointReconstructor
 from recon.laplace import Laplace
-from recon.methods import Outcome, Settings, describe
+from recon.methods import Outcome, Settings, describe, describe_defocus
 from recon.projector import SliceProjector
 from recon.sirt import sirt
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -67,6 +67,8 @@ def reconstruct_in_blocks(
     if method in _FITTED:
         solve, choices, start = _fitted(tilt_series, grid, method, chosen)
     elif method in ("sirt", "wbp"):
+        if chosen.defocus:
+            raise ValueError(f"--defocus: method {method} models none; use --method {', '.join(_FITTED)}")
         (solve, choices), start = _classical(tilt_series, grid, method, chosen), None
     else:
         raise ValueError(
@@ -121,6 +123,7 @@ def _fitted(
 ) -> tuple[Solve, dict[str, float | str], Outcome]:
     options: dict[str, Any] = {"make_field": MultiresolutionField, **_FITTED[method]}
     options |= {"seed": settings.seed, "device": settings.device, "run_fit": settings.run_fit}
+    options["defocus"] = settings.defocus
     if settings.num_steps is not None:
         options["num_steps"] = settings.num_steps
     if settings.noise_model is not None:
@@ -136,6 +139,7 @@ def _fitted(
         "weight": model.weight,
         "noise model": describe(noise_model),
         "settled on slices": f"{slab.start} to {slab.stop - 1}",
+        **describe_defocus(settings.defocus, model.projector),
     }
 
     def solve(rows: slice) -> Block:
@@ -149,7 +153,8 @@ def _fitted(
         return found.volume.attenuation[:, inner], found.projections[:, inner]
 
     tried = first.weight_choice.tried if first.weight_choice is not None else {}
-    start = Outcome(first.volume, first.projections, method, first.fit_result, noise_model, choices, tried)
+    found = first.volume, first.projections, method, first.fit_result, noise_model
+    start = Outcome(*found, choices, tried, model.response())
     return solve, choices, start
 
 

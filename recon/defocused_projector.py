@@ -17,6 +17,12 @@ _SUBPIXEL = 0.25
 _MOST_LAYERS = 12
 
 
+def with_defocus(projector: SliceProjector, convergence: float) -> SliceProjector | DefocusedProjector:
+    """The projector with blur where there is any to see, or else the one in focus itself. Raises as `DefocusedProjector`."""
+    blurred = DefocusedProjector(projector, convergence)
+    return blurred if len(blurred.blurs) > 1 else projector
+
+
 class DefocusedProjector:
     """Line integrals through a converging beam that is in focus on the tilt axis; takes the place of a `SliceProjector`.
 
@@ -46,10 +52,13 @@ class DefocusedProjector:
         farthest = convergence * math.hypot(self.depth - 1, self.width - 1) / 2
         count = min(most_layers, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))
         edges = np.linspace(_SUBPIXEL, max(farthest, _SUBPIXEL), count + 1)
-        self.blurs = [0.0, *((edges[1:] + edges[:-1]) / 2).tolist()]
+        self.convergence, self.blurs = convergence, [0.0, *((edges[1:] + edges[:-1]) / 2).tolist()]
         self._layers = [projector]
         if count:
             self._layers = projector.layers(lambda distance: np.searchsorted(edges[:-1], convergence * abs(distance)))
+
+    def __repr__(self) -> str:
+        return f"DefocusedProjector({self._layers[0]!r}, convergence {self.convergence:g}, {len(self.blurs)} layers)"
 
     def project(self, columns: Tensor) -> Tensor:
         """Native layout: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""

@@ -60,6 +60,10 @@ class Transmission(Described):
         """Incident intensity, (1,) or (tilts,)."""
         return self.log_intensity.detach().exp().reshape(-1)
 
+    def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
+        """Incident intensity and offset of every tilt, detector units."""
+        return {"intensity": _each(self.intensity, num_tilts), "offset": _each(self.offset, num_tilts)}
+
 
 class Linear(Described):
     """HAADF or EDX: signal = gain·beam·line integral + offset.
@@ -118,6 +122,15 @@ class Linear(Described):
     def offset(self) -> Tensor:
         """Detector units, (1,) or (tilts,)."""
         return (self.gain * self.scaled_offset.detach()).reshape(-1)
+
+    def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
+        """Relative intensity (geometric mean one) and offset, detector units, of every tilt."""
+        beam = torch.ones(1) if self.log_beam is None else _relative(self.log_beam.detach()).reshape(-1)
+        return {"relative intensity": _each(beam, num_tilts), "offset": _each(self.offset, num_tilts)}
+
+
+def _each(values: Tensor, num_tilts: int) -> list[float]:
+    return [float(value) for value in values.reshape(-1).expand(num_tilts)]
 
 
 def _range(values: Tensor) -> str:

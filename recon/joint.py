@@ -19,6 +19,7 @@ from noiseflow import FitResult, Gaussian, fit
 from noiseflow.described import described
 from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
 from recon.coarse_start import coarse_start, learning_rate
+from recon.defocused_projector import with_defocus
 from recon.fields import Field, MultiresolutionField
 from recon.first_guess import (
     attenuation_scale,
@@ -77,7 +78,8 @@ class JointReconstructor:
         make_field: makes the field from shape and scale.
         num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
-        skip_vacuum: whether voxels are left out where there is nothing.
+        skip_vacuum: whether voxels are left out where there is nothing; without defocus.
+        defocus: blur to model, pixels per voxel out of the plane of focus, see `recon.defocused_projector.DefocusedProjector`.
         slab: slices used to choose.
         settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
         seed: of every random choice.
@@ -91,6 +93,7 @@ class JointReconstructor:
     num_steps: int = 120
     estimate_response: bool = True
     skip_vacuum: bool = True
+    defocus: float = 0.0
     slab: int = 24
     settled: TomographySignal | None = None
     seed: int = 0
@@ -123,13 +126,14 @@ class JointReconstructor:
             raise ValueError(
                 f"the volume is {grid.height} voxels high and the images {height} pixels; they must be equal"
             )
-        projector = SliceProjector(
+        in_focus = SliceProjector(
             tilt_angles=tilt_series.tilt_angles,
             depth=grid.depth,
             width=grid.width,
             detector_width=width,
             device=self.device,
         )
+        projector = with_defocus(in_focus, self.defocus)
         response = estimate_response(tilt_series, estimate=self.estimate_response)
         generator = torch.Generator().manual_seed(self.seed)
         rough = coarse_start(tilt_series, response, grid, generator=generator).to(self.device)
@@ -145,7 +149,7 @@ class JointReconstructor:
         field.start_from(rough)
         rate = learning_rate(rough, field)
         occupancy = None
-        if self.skip_vacuum:
+        if self.skip_vacuum and projector is in_focus:
             occupancy = Occupancy(rough / field.scale, grid.shape).to(self.device)
             occupancy = occupancy if occupancy.share < _WORTHWHILE else None
         return TomographySignal(

@@ -13,11 +13,13 @@ from torch import nn
 from noiseflow import Digitisation, Digitised, FitResult, Gaussian, fit
 from noiseflow.described import described
 from recon.classical import LineIntegralProblem, best_num_iterations, best_window
+from recon.defocused_projector import DefocusedProjector
 from recon.denoise import find_denoiser
 from recon.fields import VoxelField
 from recon.joint import JointReconstructor, Reconstruction
 from recon.laplace import Laplace
 from recon.presets import PRESETS
+from recon.projector import SliceProjector
 from recon.sirt import sirt
 from recon.stages import Repeated, RunStage, run_stage
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -39,6 +41,7 @@ class Outcome:
         noise_model: of the joint fit.
         choices: what was chosen or estimated, by name.
         weights_tried: weight → held-out negative log-likelihood, where the weight was chosen by it.
+        response: of fitted methods, intensity and offset of every tilt, see `recon.image_formation`.
     """
 
     volume: Volume
@@ -48,6 +51,7 @@ class Outcome:
     noise_model: nn.Module | None
     choices: dict[str, float | str]
     weights_tried: dict[float, float] = field(default_factory=dict)
+    response: dict[str, list[float]] = field(default_factory=dict)
 
 
 @described()
@@ -61,13 +65,14 @@ class Settings:
         noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
         window: of the back-projection, one of `recon.wbp.WINDOWS`.
         denoiser: see `recon.denoise.find_denoiser`.
+        defocus: blur that fitted methods model, pixels per voxel out of the plane of focus.
         seed: of every random choice.
         device: where to compute.
         progress: called with the steps done and a note.
         run_fit, run_stage: run every fit and every other long piece of work; a `Journal` keeps what each has reached.
 
     Raises:
-        ValueError: a negative weight, no steps, or an unknown window.
+        ValueError: a negative weight, no steps, a defocus outside 0 to 1, or an unknown window.
     """
 
     weight: float | None = None
@@ -75,6 +80,7 @@ class Settings:
     noise_model: nn.Module | None = None
     window: str | None = None
     denoiser: str = "nlm"
+    defocus: float = 0.0
     seed: int = 0
     device: torch.device | str = "cpu"
     progress: Progress | None = None
@@ -86,6 +92,8 @@ class Settings:
             raise ValueError(f"--weight {self.weight} must be zero or more")
         if self.num_steps is not None and self.num_steps < 1:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
+        if not 0 <= self.defocus <= 1:
+            raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
         if self.window is not None and self.window not in WINDOWS:
             raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
 
@@ -119,7 +127,10 @@ def reconstruct(tilt_series: TiltSeries, grid: VolumeGrid, *, method: str = "aut
     """
     if method not in METHODS:
         raise ValueError(f"--method {method}: choose one of {', '.join(METHODS)}")
-    return METHODS[method](tilt_series, grid, Settings(**settings))
+    chosen = Settings(**settings)
+    if chosen.defocus and (method.startswith(("sirt", "wbp")) or method in PRESETS):
+        raise ValueError(f"--defocus: method {method} models none; use --method joint, l2, l1, tv or explicit")
+    return METHODS[method](tilt_series, grid, chosen)
 
 
 @method("auto")
@@ -254,6 +265,7 @@ def _fitted(name: str, tilt_series: TiltSeries, grid: VolumeGrid, settings: Sett
         "device": settings.device,
         "run_fit": settings.run_fit,
         "weight": settings.weight,
+        "defocus": settings.defocus,
     }
     if settings.num_steps is not None:
         options["num_steps"] = settings.num_steps
@@ -265,8 +277,20 @@ def _fitted(name: str, tilt_series: TiltSeries, grid: VolumeGrid, settings: Sett
         "noise model": describe(result.noise_model),
         learnt: float(getattr(response, learnt).mean()),
     }
+    choices |= describe_defocus(settings.defocus, result.signal_model.projector)
     tried = result.weight_choice.tried if result.weight_choice is not None else {}
-    return Outcome(result.volume, result.projections, name, result.fit_result, result.noise_model, choices, tried)
+    found = result.volume, result.projections, name, result.fit_result, result.noise_model
+    return Outcome(*found, choices, tried, result.signal_model.response())
+
+
+def describe_defocus(defocus: float, projector: SliceProjector | DefocusedProjector) -> dict[str, str]:
+    """What was modelled of a defocus, for `Outcome.choices`; nothing where none was asked for."""
+    if not defocus:
+        return {}
+    what = "below a quarter of a pixel, left out"
+    if isinstance(projector, DefocusedProjector):
+        what = f"blurs up to {projector.blurs[-1]:.2g} pixels"
+    return {"defocus": f"{defocus:g}, {what}"}
 
 
 def describe(noise_model: nn.Module) -> str:

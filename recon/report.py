@@ -54,6 +54,7 @@ def reconstruction_report(
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
     _add_volume(report, outcome.volume)
     _add_tilts(report, tilt_series, outcome)
+    _add_response(report, tilt_series, outcome)
     _add_noise(report, tilt_series, outcome)
     _add_course(report, outcome)
     _add_resolution(report, outcome.volume, halves, reference)
@@ -169,6 +170,26 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> Non
         f"A good fit leaves noise without structure in the residuals; waves along the tilts mean misalignment. {words}"
     )
     report.widget("tilts", data, caption=caption)
+
+
+def _add_response(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+    """Charts of what differs from tilt to tilt; what is one for all stands among the choices."""
+    order, charts = np.argsort(tilt_series.tilt_angles), []
+    for name, values in outcome.response.items():
+        if len(set(values)) > 1:
+            unit = "" if name == "relative intensity" else ", detector units"
+            figure, axis = new_chart(f"{name.capitalize()} of each tilt", x="tilt, degrees", y=name + unit)
+            axis.plot(
+                tilt_series.tilt_angles[order],
+                np.array(values)[order],
+                color=COLOURS["accent"],
+                marker="o",
+                markersize=3,
+            )
+            charts.append(figure)
+    if charts:
+        report.heading("Beam and detector")
+        report.charts(charts, caption="Estimated from the images, then learnt in the fit.")
 
 
 def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:

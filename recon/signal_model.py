@@ -9,7 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.modules import Described
+from recon.defocused_projector import DefocusedProjector
 from recon.fields import Field
+from recon.image_formation import Linear, Transmission
 from recon.occupancy import Occupancy
 from recon.projector import SliceProjector, from_columns
 from recon.regularisers import total_variation
@@ -29,13 +31,16 @@ class TomographySignal(Described):
             voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
         learning_rate: of a field of voxels; the detector's response learns at a twentieth of it.
-        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None.
+        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a `SliceProjector`.
+
+    Raises:
+        ValueError: an occupancy for another projector.
     """
 
     def __init__(
         self,
         field: Field,
-        projector: SliceProjector,
+        projector: SliceProjector | DefocusedProjector,
         image_formation: nn.Module,
         *,
         weight: float = 1.0,
@@ -44,6 +49,8 @@ class TomographySignal(Described):
         occupancy: Occupancy | None = None,
     ) -> None:
         super().__init__()
+        if occupancy is not None and not isinstance(projector, SliceProjector):
+            raise ValueError("vacuum is left out of a SliceProjector only; give no occupancy with this projector")
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
         self.occupancy = occupancy
@@ -79,7 +86,7 @@ class TomographySignal(Described):
     def _project(self, values: Tensor) -> Tensor:
         """Line integrals; what the data wants where the lattice counts as empty is tested as gradients pass."""
         occupancy, projector = self.occupancy, self.projector
-        if occupancy is None:
+        if occupancy is None or not isinstance(projector, SliceProjector):
             return projector.project(values)
         rays = self.tiles.project(values)
         if rays.requires_grad:
@@ -94,7 +101,7 @@ class TomographySignal(Described):
         Raises:
             ValueError: there is no occupancy.
         """
-        if self.occupancy is None:
+        if self.occupancy is None or not isinstance(self.projector, SliceProjector):
             raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
         mask = self.occupancy.mask
         if self._tiles is None or self._tiles[0] != mask._version:
@@ -137,6 +144,11 @@ class TomographySignal(Described):
         response = copy.deepcopy(self.image_formation)
         options = {"weight": self.weight, "smoothing": self.smoothing, "learning_rate": self.learning_rate}
         return TomographySignal(field, self.projector, response, occupancy=None, **options)
+
+    def response(self) -> dict[str, list[float]]:
+        """Intensity and offset of every tilt as they are; nothing for an image formation of another kind."""
+        formation = self.image_formation
+        return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam."""

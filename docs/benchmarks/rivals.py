@@ -148,10 +148,7 @@ def ablations(folder: Path) -> str:
             parts += [f"### {group.capitalize()}", _table(header[1:], [row[1:] for row in rows if row[0] == group])]
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), _machines([content])]
-    gaps = (
-        "- Defocus modelled or not, and skipping of vacuum on or off: this benchmark has no such rows yet.\n"
-        "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
-    )
+    gaps = "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
     return _joined([*parts, _nothing(folder, "ablations", " --size 64"), "## Not measured", gaps])
 
 

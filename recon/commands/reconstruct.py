@@ -74,6 +74,13 @@ def reconstruct(
     keep_tilts: Annotated[
         bool, typer.Option("--keep-tilts", help="Leave no tilt out, though it does not fit the others.")
     ] = False,
+    defocus: Annotated[
+        float,
+        typer.Option(
+            help="Blur to model in fitted methods: pixels per voxel out of the plane of focus, such as 0.02; left out if below "
+            "a quarter of a pixel."
+        ),
+    ] = 0.0,
     slices_at_once: Annotated[
         int | None, typer.Option(min=1, help="Reconstruct in blocks of so many slices, where memory is short.")
     ] = None,
@@ -130,7 +137,7 @@ def reconstruct(
             raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
         truth = None if reference is None else read_reference(reference, grid)
         options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
-        options |= {"window": window, "denoiser": denoiser}
+        options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         fixed = load_noise_model(noise_model)
         options |= {"noise_model": fixed, "device": choose_device(device)}

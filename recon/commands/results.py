@@ -76,6 +76,7 @@ class Targets:
         output.result(
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
+            | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
             | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
         )

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from noiseflow import Gaussian
 from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals
 from recon.benchmark import Results, in_turn, make_scene, plain
+from recon.benchmark_defocus import defocused_scene
 from recon.benchmark_network import fit_network
 from recon.benchmark_rivals import Effort, best_cutoff, curves, own_sirt, summary, table
 from recon.benchmark_search import Best, best, best_fit
@@ -224,10 +225,21 @@ def test_every_ablation_is_named_once_and_runs(tmp_path, monkeypatch):
     results = Results(tmp_path / "r.json", "ablations")
     monkeypatch.setattr(benchmark_ablations, "JointReconstructor", Perfect)
     chosen = {("field", "voxels, L2, no TV"), ("parts", "clipping ignored"), ("denoiser, then WBP", "wiener")}
+    chosen |= {("defocus", "modelled"), ("skipping of vacuum", "off")}
     benchmark_ablations.fill([v for v in made if (v.group, v.name) in chosen], results, lambda text: None)
     header, rows = benchmark_ablations.table(results.cells)
     assert {row[:2] for row in rows} == chosen
     assert all(len(row) == len(header) for row in rows)
+
+
+def test_defocus_blurs_a_scene_and_nothing_else():
+    scene = make_scene(24, phantom="shells", noise="clipped", tilts="-60:60:20")
+    same, blurred = defocused_scene(scene, 0.0), defocused_scene(scene, 0.2)
+    np.testing.assert_allclose(same.clean.images, scene.clean.images, atol=1e-5)
+    np.testing.assert_allclose(same.noisy.images, scene.noisy.images, atol=1e-5)
+    roughness = [np.abs(np.diff(each.clean.images, axis=1)).mean() for each in (same, blurred)]
+    assert roughness[1] < 0.9 * roughness[0]
+    np.testing.assert_array_equal(blurred.truth, scene.truth)
 
 
 def test_network_on_the_lattice_learns():

@@ -49,6 +49,16 @@ def test_every_method_writes_a_volume_and_a_report(series, tmp_path, method):
     assert run("compare", out, series / "truth.mrc", "--json")["errors"]["affine"]["psnr"] > 5
 
 
+def test_response_of_every_tilt_is_told(series, tmp_path):
+    command = ["reconstruct", series / "tilts.mrc", "-o", tmp_path / "v.npy", "--method", "l2", "--weight", 0.3]
+    result = run(*command, "--steps", 20, "--defocus", 0.1, "--json")
+    told = result["response"]
+    assert len(told["tilt_angles"]) == len(told["intensity"]) == len(told["offset"]) == 21
+    assert all(0.8 < value < 1.2 for value in told["intensity"])
+    assert result["choices"]["defocus"].startswith("0.1, blurs up to")
+    assert run(*command[:3], tmp_path / "s.npy", "--method", "sirt", "--steps", 3, "--json")["response"] is None
+
+
 def test_same_seed_same_volume(series, tmp_path):
     for name in ("a.npy", "b.npy"):
         run(

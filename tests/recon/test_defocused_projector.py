@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from recon.defocused_projector import DefocusedProjector, jittered_projection
+from recon import methods
+from recon.benchmark import make_scene
+from recon.benchmark_defocus import defocused_scene
+from recon.blocks import reconstruct_in_blocks
+from recon.defocused_projector import DefocusedProjector, jittered_projection, with_defocus
+from recon.joint import JointReconstructor
+from recon.metrics import compare
 from recon.projector import SliceProjector
 from recon.sirt import sirt
+from recon.tilt_series import VolumeGrid
 
 ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]
 
@@ -88,3 +95,41 @@ def test_knowing_the_blur_sharpens_the_reconstruction():
 def test_impossible_convergence_is_refused():
     with pytest.raises(ValueError, match="convergence"):
         DefocusedProjector(projector(), -0.1)
+
+
+def test_blur_below_a_quarter_of_a_pixel_leaves_the_projector_as_it_is():
+    sharp = projector()
+    assert with_defocus(sharp, 0.01) is sharp
+    assert isinstance(with_defocus(sharp, 0.1), DefocusedProjector)
+
+
+@pytest.fixture(scope="module")
+def defocused():
+    return defocused_scene(make_scene(32, phantom="shells", noise="skewed", tilts="-60:60:5"), 0.15)
+
+
+def test_joint_fit_that_knows_the_defocus_finds_the_better_volume(defocused):
+    psnr = {}
+    for defocus in (0.0, 0.15):
+        fit = JointReconstructor(weight=0.3, noise_model=lambda: defocused.noise_model, defocus=defocus)
+        psnr[defocus] = compare(fit(defocused.noisy).volume.attenuation, defocused.truth).psnr
+    assert psnr[0.15] > psnr[0.0] + 0.4
+
+
+def test_methods_model_it_or_refuse_and_say_what_they_did(tmp_path):
+    defocused = defocused_scene(make_scene(12, phantom="shells", noise="skewed", tilts="-60:60:20"), 0.3)
+    grid, options = VolumeGrid.of(defocused.noisy), {"weight": 0.3, "num_steps": 4}
+    outcome = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.3, **options)
+    assert outcome.choices["defocus"].startswith("0.3, blurs up to 2.")
+    left_out = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.001, **options)
+    assert "left out" in left_out.choices["defocus"]
+    blocks = reconstruct_in_blocks(
+        defocused.noisy, grid, tmp_path / "v.npy", method="l2", rows_at_once=8, defocus=0.3, **options
+    )
+    assert blocks.choices["defocus"] == outcome.choices["defocus"]
+    with pytest.raises(ValueError, match="--defocus"):
+        methods.reconstruct(defocused.noisy, grid, method="sirt", defocus=0.3)
+    with pytest.raises(ValueError, match="--defocus"):
+        reconstruct_in_blocks(defocused.noisy, grid, tmp_path / "w.npy", method="wbp", rows_at_once=9, defocus=0.3)
+    with pytest.raises(ValueError, match="0 to 1"):
+        methods.reconstruct(defocused.noisy, grid, method="l2", defocus=-0.1)

@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from recon.image_formation import Linear
+from recon.image_formation import Linear, Transmission
 from recon.joint import JointReconstructor
+from recon.methods import Outcome
 from recon.metrics import compare
 from recon.phantoms import make_phantom
+from recon.report import reconstruction_report
 from recon.screening import screen
 from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.tilt_series import Volume
 
 ANGLES = np.arange(-60, 61, 3.0)
 
@@ -81,14 +85,24 @@ def test_reconstruction_with_the_beam_is_nearly_as_good_as_without_drift():
 
 
 def test_linear_response_learns_the_beam_up_to_its_mean():
-    import torch
-
     beam = torch.tensor([0.8, 1.0, 1.25])
     response = Linear(2.0, offset=1.0, beam=beam)
     rays = torch.rand(3, 4, 5)
     torch.testing.assert_close(response.invert(response(rays)), rays)
     torch.testing.assert_close(response(rays), 2 * beam[:, None, None] * rays + 1)
     torch.testing.assert_close(Linear(2.0, offset=1.0, beam=3 * beam)(rays), response(rays))
+
+
+def test_intensity_and_offset_of_every_tilt_are_in_the_report(tmp_path):
+    response = Linear(2.0, offset=torch.tensor([1.0, 3.0]), beam=torch.tensor([0.5, 2.0]))
+    assert response.per_tilt(2) == {"relative intensity": pytest.approx([0.5, 2.0]), "offset": [1.0, 3.0]}
+    assert Transmission(4.0, offset=1.0).per_tilt(2) == {"intensity": pytest.approx([4.0, 4.0]), "offset": [1.0, 1.0]}
+    _, clean, _ = scene(size=16)
+    volume, steady = Volume(np.zeros((16, 16, 16), np.float32)), [0.0] * clean.num_tilts
+    for changing, found in ((steady, False), (np.linspace(1, 2, clean.num_tilts).tolist(), True)):
+        outcome = Outcome(volume, clean.images, "l2", None, None, {}, {}, {"intensity": changing, "offset": steady})
+        page = reconstruction_report(clean, outcome, []).save(tmp_path / "page.html")
+        assert ("Beam and detector" in page.read_text(encoding="utf-8")) is found
 
 
 def test_command_leaves_the_tilt_out_and_says_so(tmp_path, run):
