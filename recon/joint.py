@@ -21,11 +21,7 @@ from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
 from recon.coarse_start import coarse_start, learning_rate
 from recon.defocused_projector import with_defocus
 from recon.fields import Field, MultiresolutionField
-from recon.first_guess import (
-    attenuation_scale,
-    contrast_slab,
-    estimate_response,
-)
+from recon.first_guess import attenuation_scale, contrast_slab, estimate_response
 from recon.occupancy import Occupancy
 from recon.projector import SliceProjector, from_rays
 from recon.signal_model import TomographySignal
@@ -112,10 +108,12 @@ class JointReconstructor:
         signal_model = self.prepare(tilt_series, grid)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            noise_model, choice = self._choose(tilt_series, signal_model)
+            noise_model, choice, quiet = self._choose(tilt_series, signal_model)
         if choice is not None:
             signal_model.weight = choice.weight
         task = self._task(signal_model, tilt_series)
+        if quiet and not isinstance(noise_model, Gaussian):
+            task.settle(progress=progress)
         result = task.alternate(noise_model, num_steps=self.num_steps, progress=progress)
         return _finished(signal_model, noise_model, result, grid, choice)
 
@@ -161,11 +159,10 @@ class JointReconstructor:
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
         return _Task(signal_model, observation, use, self.seed, self.run_fit)
 
-    def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None]:
-        """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
+    def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None, bool]:
+        """Noise model and weight, found on a slab, and whether there is little noise; the response learnt there is where the
+        whole starts."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        if given is not None and self.weight is not None and not learns(given):
-            return given, None
         rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
         field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
@@ -173,7 +170,9 @@ class JointReconstructor:
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
-        task.settle()
+        quiet = task.settle()
+        if given is not None and self.weight is not None and not learns(given):
+            return given, None, quiet
         noise_model = (
             _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
         )
@@ -189,7 +188,7 @@ class JointReconstructor:
         # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
         task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
-        return noise_model, choice
+        return noise_model, choice, quiet
 
 
 class _Task:
@@ -217,15 +216,18 @@ class _Task:
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
-    def settle(self) -> None:
+    def settle(self, *, progress: Progress | None = None) -> bool:
         """Least squares, longer and longer until held-out pixels gain little: what an unfinished signal misses would pass for
-        noise, and be left as it is. Little noise takes long."""
-        reached = math.inf
+        noise, and be left as it is. Returns whether it took long, as it does where there is little noise."""
+        reached, taken = math.inf, 0
         for num_steps in _SETTLING:
-            nll = self.fit(Gaussian().to(self.observation.device), num_steps=num_steps).held_out_nll
+            model = Gaussian().to(self.observation.device)
+            nll = self.fit(model, num_steps=num_steps, progress=progress).held_out_nll
+            taken += num_steps
             if reached - nll < _SETTLED:
                 break
             reached = nll
+        return taken > sum(_SETTLING[:2])
 
     def alternate(
         self, noise_model: nn.Module, *, num_steps: int, standardise: bool = False, progress: Progress | None = None
