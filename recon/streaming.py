@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from noiseflow.io.partials import clear_leftovers, partial_prefix
 from recon.defocus import defocused
 from recon.phantoms import make_phantom
 from recon.projector import SliceProjector
@@ -76,7 +77,8 @@ class Simulation:
         """
         is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=folder, prefix=".simulate-"))
+        clear_leftovers(folder / "simulate")
+        partial = Path(tempfile.mkdtemp(dir=folder, prefix=partial_prefix("simulate")))
         try:
             unit = _Writer(self, partial, progress).run()
             for path in sorted(partial.iterdir()):

@@ -11,6 +11,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from noiseflow.io.partials import clear_leftovers, partial_prefix
+
 
 def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) -> Path:
     """Fail now, before long work, where a result could not be written; returns the path.
@@ -41,6 +43,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} does not exist; create the folder first")
     _require_writable(path.parent)
+    clear_leftovers(path)
     return path
 
 
@@ -104,7 +107,8 @@ def require_whole(path: Path, num_bytes: int) -> None:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary file beside `path`, renamed onto it when the block succeeds and removed when it fails."""
     path = Path(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    clear_leftovers(path)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=partial_prefix(path.stem), suffix=path.suffix)
     os.close(handle)
     partial = Path(name)
     try:
@@ -119,7 +123,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """A temporary folder beside `path`, which takes its place when the block succeeds and is removed when it fails."""
     path = Path(path)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix))
+    clear_leftovers(path)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=partial_prefix(path.stem), suffix=path.suffix))
     old = partial.with_name(partial.name + ".old")
     try:
         yield partial
