@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,9 @@ from torch import Tensor, nn
 
 from noiseflow.described import described
 from noiseflow.digitisation import Digitisation
+from noiseflow.fit_average import BestState, WeightAverage
 from noiseflow.fit_pixels import FitPixels, thinned
+from noiseflow.fit_steps import adam, take_step
 from noiseflow.observation_table import ObservationTable
 from noiseflow.picked import Signal, needs_image, pick, values_of, window_size
 
@@ -71,7 +74,8 @@ class FitLoop:
 
     def __init__(self, noise_model: nn.Module, signal_model: nn.Module, pixels: FitPixels, result: FitResult) -> None:
         self.noise_model, self.signal_model, self.pixels, self.result = noise_model, signal_model, pixels, result
-        self.best: dict[str, Any] | None = None
+        self.best = BestState()
+        self.average: WeightAverage | None = None
         self.done = 0
         self.table: ObservationTable | None = None
         self.resumed_table: dict[str, Any] | None = None
@@ -84,13 +88,15 @@ class FitLoop:
                 pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
                 self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
         noise = [p for p in self.noise_model.parameters() if p.requires_grad]
-        self.noise_optimiser = _adam([{"params": noise, "lr": learning_rate}]) if noise else None
+        self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
         self.signal_optimiser = None
         if any(p.requires_grad for p in self.signal_model.parameters()):
             everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
             own = getattr(self.signal_model, "parameter_groups", None)
-            self.signal_optimiser = _adam(own() if own is not None else everything)
+            self.signal_optimiser = adam(own() if own is not None else everything)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
+        if noise and self.signal_optimiser is None:
+            self.average = WeightAverage(self.noise_model)
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
     def run(self, schedule: Schedule, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
@@ -129,9 +135,10 @@ class FitLoop:
             if checkpoint is not None:
                 checkpoint(self.state())
             raise
-        if self.best is not None:
-            self._load_models(self.best)
-            self.result.held_out_nll = self.held_out_nll()
+        if self.best.state is not None:
+            self._load_models(self.best.state)
+            scores, count = self.held_out_log_prob()
+            self.result.held_out_nll = -float(scores.sum()) / count
         self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
         return self.result
 
@@ -141,20 +148,25 @@ class FitLoop:
         finite = self._signal_step(schedule.batch_size)
         if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
             for _ in range(schedule.noise_steps if joint else 1):
-                finite &= _step(self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size)))
+                finite &= take_step(self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size)))
+            if self.average is not None and finite:
+                self.average.update()
             if self.table is not None:
                 self.table.rebuild(self.noise_model)
         return finite
 
     def _judge(self, step: int) -> dict[str, Any] | None:
-        nll = self.held_out_nll(_LOOK_COUNT)
-        if not math.isfinite(nll):
-            return None
-        state = self._models()
-        if nll <= min(self.result.history.values(), default=math.inf):
-            self.best, self.result.held_out_nll = state, nll
+        """Look at the held-out pixels with the average of the weights, where there is one; the weights to go back to."""
+        with nullcontext() if self.average is None else self.average.in_place():
+            scores, count = self.held_out_log_prob(_LOOK_COUNT)
+            nll = -float(scores.sum()) / count
+            if not math.isfinite(nll):
+                return None
+            # a joint fit moves on slowly, and each of its looks is as good as its weights: there the best look counts
+            if self.best.judge(self._models(), scores, start=step == 0, strict=self.average is None):
+                self.result.held_out_nll = nll
         self.result.history[step] = nll
-        return state
+        return self._models()
 
     def _never_improves(self, schedule: Schedule) -> bool:
         """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""
@@ -184,7 +196,7 @@ class FitLoop:
             value = self._full_batch_loss() if whole else self._loss(self.pixels.batch(batch_size), learn_signal=True)
             return value + self.signal_model.penalty() if hasattr(self.signal_model, "penalty") else value  # type: ignore[operator]
 
-        return self.signal_optimiser is None or _step(self.signal_optimiser, loss)
+        return self.signal_optimiser is None or take_step(self.signal_optimiser, loss)
 
     @torch.no_grad()
     def _compute_fixed_part(self) -> Tensor | None:
@@ -216,14 +228,23 @@ class FitLoop:
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
         """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""
+        log_prob = self._log_prob(pixels, learn_signal=learn_signal)
+        return -log_prob.mean() if pixels.ndim == 1 else -log_prob.sum() / self._count(pixels)
+
+    def _log_prob(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
+        """Log-likelihood of each pixel, or of each line, (P,)."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
+        found: Tensor
         if self.fixed_part is not None:
-            return -self.noise_model.log_prob_from(signal, self.fixed_part[pixels]).mean()  # type: ignore[operator, no-any-return]
-        observation = self.pixels.observation[pixels]
-        if pixels.ndim == 1:
-            return -self.noise_model(signal).log_prob(observation).mean()  # type: ignore[no-any-return]
-        return -self.noise_model(signal).line_log_prob(observation).sum() / torch.isfinite(observation).sum()  # type: ignore[no-any-return]
+            found = self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[operator]
+            return found
+        distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
+        found = distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
+        return found
+
+    def _count(self, pixels: Tensor) -> int:
+        return int(torch.isfinite(self.pixels.observation[pixels]).sum())
 
     def _signal(self, pixels: Tensor) -> Signal:
         if needs_image(self.noise_model):
@@ -232,15 +253,11 @@ class FitLoop:
         return predicted
 
     @torch.no_grad()
-    def held_out_nll(self, most: int = 100_000) -> float:
-        """Mean negative log-likelihood of at most so many held-out pixels, nats per pixel."""
-        total, count = 0.0, 0
+    def held_out_log_prob(self, most: int = 100_000) -> tuple[Tensor, int]:
+        """Log-likelihoods of at most so many held-out pixels, or of lines of as many, and the number of pixels."""
         pixels = thinned(self.pixels.judge, most)
-        for part in torch.split(pixels, max(1, 32768 // pixels[0].numel())):
-            number = int(torch.isfinite(self.pixels.observation[part]).sum())
-            total += float(self._loss(part).double()) * number
-            count += number
-        return total / count
+        parts = torch.split(pixels, max(1, 32768 // pixels[0].numel()))
+        return torch.cat([self._log_prob(part).double() for part in parts]), self._count(pixels)
 
     def _models(self) -> dict[str, Any]:
         models = {"noise_model": self.noise_model.state_dict()}
@@ -260,6 +277,8 @@ class FitLoop:
                 "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
             )
         self._load_models(good)
+        if self.average is not None:
+            self.average.restart()
         for optimiser in self.optimisers:
             optimiser.state.clear()
 
@@ -272,7 +291,8 @@ class FitLoop:
         """All that is needed to go on from here."""
         return {
             **self._models(),
-            "best": self.best,
+            "best": self.best.saved(),
+            "average": None if self.average is None else self.average.state(),
             "optimisers": copy.deepcopy([o.state_dict() for o in self.optimisers]),
             "generator": self.pixels.generator.get_state(),
             "history": dict(self.result.history),
@@ -288,24 +308,9 @@ class FitLoop:
         for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)
         self.pixels.generator.set_state(state["generator"])
-        self.best, self.done = state["best"], state["done"]
+        self.best.load(state["best"])
+        self.done = state["done"]
+        if self.average is not None:
+            self.average.load_state(state["average"])
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries, self.resumed_table = state["recoveries"], state["table"]
-
-
-def _adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
-    return torch.optim.Adam(list(groups), betas=(0.9, 0.99), fused=True)
-
-
-def _step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> bool:
-    """One step of an optimiser; False, and no step, where loss or gradient is not finite."""
-    optimiser.zero_grad(set_to_none=True)
-    value = loss()
-    if not bool(torch.isfinite(value)):
-        return False
-    value.backward()  # type: ignore[no-untyped-call]
-    gradients = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
-    if not all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
-        return False
-    optimiser.step()
-    return True

@@ -17,6 +17,7 @@ from noiseflow.picked import Signal, require_image, values_of, windows_of
 from noiseflow.standardisation import Standardisation, interpolate_cubic
 from noiseflow.transforms import Affine, Radial, Spline, StudentTail, Transform
 
+_NUM_NODES = 257
 _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 
 
@@ -180,7 +181,19 @@ class ConditionalFlow(ArrayModel):
         return _bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
-        """The maps at each signal coordinate."""
+        """The maps at each signal coordinate: exact at 257 nodes, their parameters linear in between.
+
+        The network so runs on the nodes alone, however many pixels there are.
+        """
+        nodes = torch.linspace(0, 1, _NUM_NODES, dtype=coordinate.dtype, device=coordinate.device)
+        position = coordinate * (_NUM_NODES - 1)
+        row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
+        weight = (position - row).to(self.bias.dtype)
+        maps = zip(self.layers, self.transforms_of_network(nodes), strict=True)
+        return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]
+
+    def transforms_of_network(self, coordinate: Tensor) -> list[Transform]:
+        """The maps that the network gives at each signal coordinate."""
         conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
         built, bias_at, conditional_at = [], 0, 0
         for layer in self.layers:

@@ -24,6 +24,13 @@ class Transform(Protocol):
         """``(x, log dx/dy)`` at `y`."""
         ...
 
+    def between_rows(self, row: Tensor, weight: Tensor) -> Transform:
+        """The maps whose parameters lie between those of the rows `row` and `row` + 1 of this one, by `weight` in [0, 1].
+
+        The parameters of this one have a first axis of rows; those of the result have the shape of `row` and `weight`.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class Affine:
@@ -37,6 +44,9 @@ class Affine:
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
         return self.loc + y * torch.exp(self.log_scale), self.log_scale.expand_as(y)
+
+    def between_rows(self, row: Tensor, weight: Tensor) -> Affine:
+        return Affine(*(_between_rows(each, row, weight) for each in (self.loc, self.log_scale)))
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,9 @@ class Radial:
         x = self.centre + torch.sign(y - self.centre) * distance
         return x, -self._ladj(width / (width + distance))
 
+    def between_rows(self, row: Tensor, weight: Tensor) -> Radial:
+        return Radial(*(_between_rows(each, row, weight) for each in (self.centre, self.log_width, self.log_slope)))
+
     def _ladj(self, near: Tensor) -> Tensor:
         # 1 + (slope − 1)·near², written as a sum of positive terms
         return torch.log((1 - near) * (1 + near) + torch.exp(self.log_slope) * near * near)
@@ -100,6 +113,9 @@ class StudentTail:
         log_ratio = torch.log(_expm1_ratio(t))
         return y * torch.exp(log_ratio / 2), t - log_ratio / 2
 
+    def between_rows(self, row: Tensor, weight: Tensor) -> StudentTail:
+        return StudentTail(*(_between_rows(each, row, weight) for each in (self.left, self.right)))
+
 
 def _log1p_ratio(t: Tensor) -> Tensor:
     """log(1 + t)/t for t ≥ 0, continued to 1 at 0."""
@@ -123,14 +139,17 @@ class Spline:
         x: (..., K+1) increasing knots.
         y: (..., K+1) increasing values at the knots.
         slope: (..., K+1) positive derivatives at the knots; the outermost ones are the slopes of the tails.
+        row, weight: where given, the knots of each element of `row` are between those of this row and the next, by `weight`.
     """
 
     x: Tensor
     y: Tensor
     slope: Tensor
+    row: Tensor | None = None
+    weight: Tensor | None = None
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        inside = torch.minimum(torch.maximum(x, self.x[..., 0]), self.x[..., -1])
+        inside, tail_slope = self._clamped(self.x, x)
         x0, width, y0, height, d0, d1 = self._bin(self.x, inside)
         secant = height / width
         xi = (inside - x0) / width
@@ -138,10 +157,10 @@ class Spline:
         denominator = secant + (d0 + d1 - 2 * secant) * rest
         y = y0 + height * (secant * xi * xi + d0 * rest) / denominator
         ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
-        return y + self._tail(x, inside), ladj
+        return y + (x - inside) * tail_slope, ladj
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        inside = torch.minimum(torch.maximum(y, self.y[..., 0]), self.y[..., -1])
+        inside, tail_slope = self._clamped(self.y, y)
         x0, width, y0, height, d0, d1 = self._bin(self.y, inside)
         secant = height / width
         rise = inside - y0
@@ -152,25 +171,46 @@ class Spline:
         rest = xi * (1 - xi)
         denominator = secant + (d0 + d1 - 2 * secant) * rest
         ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
-        beyond = y - inside
-        tail_slope = torch.where(beyond < 0, self.slope[..., 0], self.slope[..., -1])
-        return x0 + xi * width + beyond / tail_slope, -ladj
+        return x0 + xi * width + (y - inside) / tail_slope, -ladj
 
-    def _tail(self, x: Tensor, inside: Tensor) -> Tensor:
-        beyond = x - inside
-        return beyond * torch.where(beyond < 0, self.slope[..., 0], self.slope[..., -1])
+    def between_rows(self, row: Tensor, weight: Tensor) -> Spline:
+        return Spline(self.x, self.y, self.slope, row, weight)
+
+    def _clamped(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The value brought between the outermost knots, and the slope of the tail on its side."""
+        first = torch.zeros((), dtype=torch.long, device=value.device)
+        last = first + knots.shape[-1] - 1
+        low, high = self._knot(knots, first), self._knot(knots, last)
+        side = torch.where(value < low, first, last)
+        return torch.minimum(torch.maximum(value, low), high), self._knot(self.slope, side)
 
     def _bin(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        count = knots.shape[-1] - 1
-        index = (value[..., None] >= knots[..., 1:-1]).sum(-1, keepdim=True).clamp(max=count - 1)
-        shape = (*value.shape, count + 1)
-        x, y, slope = self.x.expand(shape), self.y.expand(shape), self.slope.expand(shape)
+        index = (value[..., None] >= self._inner(knots.detach())).sum(-1)
+        pairs = [(self._knot(each, index), self._knot(each, index + 1)) for each in (self.x, self.y, self.slope)]
+        (x0, x1), (y0, y1), (d0, d1) = pairs
+        return x0, x1 - x0, y0, y1 - y0, d0, d1
 
-        def pick(table: Tensor, at: Tensor) -> Tensor:
-            return table.gather(-1, at).squeeze(-1)
+    def _inner(self, knots: Tensor) -> Tensor:
+        inner = knots[..., 1:-1]
+        if self.row is None or self.weight is None:
+            return inner
+        left, right = inner[self.row], inner[self.row + 1]
+        return torch.lerp(left, right, self.weight.detach()[..., None])
 
-        x0, y0 = pick(x, index), pick(y, index)
-        return x0, pick(x, index + 1) - x0, y0, pick(y, index + 1) - y0, pick(slope, index), pick(slope, index + 1)
+    def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
+        """The knots of the given numbers."""
+        if self.row is not None and self.weight is not None:
+            at = self.row * knots.shape[-1] + index
+            return _between_rows(knots.reshape(-1), at, self.weight, step=knots.shape[-1])
+        index = index + torch.zeros(knots.shape[:-1], dtype=torch.long, device=index.device)
+        return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
+
+
+def _between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -> Tensor:
+    """Values between table[row] and table[row + step], by `weight`."""
+    flat = row.reshape(-1)
+    left, right = (table.index_select(0, at).reshape(row.shape) for at in (flat, flat + step))
+    return left + weight * (right - left)
 
 
 def _spline_ladj(secant: Tensor, xi: Tensor, rest: Tensor, d0: Tensor, d1: Tensor, denominator: Tensor) -> Tensor:

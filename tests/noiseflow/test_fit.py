@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import noiseflow
+from noiseflow.fit_average import BestState, WeightAverage
 from noiseflow.observation_table import ObservationTable
 
 
@@ -181,3 +182,50 @@ def test_held_out_pixels_do_not_depend_on_noise_of_the_same_seed() -> None:
     observation = noiseflow.Gaussian(0.1)(signal).sample(generator=torch.Generator().manual_seed(0))
     result = noiseflow.fit(noiseflow.Gaussian(0.1).requires_grad_(False), signal, observation, standardise=False)
     assert result.held_out_nll == pytest.approx(0.5 * math.log(2 * math.pi * math.e * 0.01), abs=0.04)
+
+
+@pytest.mark.parametrize("name", ["RadialFlow", "SplineFlow"])
+def test_parameters_between_nodes_are_those_of_the_network(name: str) -> None:
+    signal = gradient_image(128)
+    observation, _ = skewed_noise(signal)
+    model = getattr(noiseflow, name)()
+    noiseflow.fit(model, signal, observation, num_steps=150)
+    coordinate = torch.rand(2000, generator=torch.Generator().manual_seed(0))
+    latent = torch.randn(2000, generator=torch.Generator().manual_seed(1))
+    exact, found = latent, latent
+    with torch.no_grad():
+        for direct, between in zip(
+            reversed(model.transforms_of_network(coordinate)), reversed(model.transforms(coordinate)), strict=True
+        ):
+            exact, found = direct.inverse(exact)[0], between.inverse(found)[0]
+    assert float((found - exact).abs().mean()) < 1e-4  # standard deviations
+
+
+def test_average_settles_where_single_steps_jitter() -> None:
+    model, generator = torch.nn.Linear(1, 1, bias=False), torch.Generator().manual_seed(0)
+    average = WeightAverage(model)
+    for _ in range(400):
+        with torch.no_grad():
+            model.weight.copy_(3 + 0.1 * torch.randn(1, 1, generator=generator))
+        average.update()
+    before = model.weight.detach().clone()
+    with average.in_place():
+        assert model.weight.item() == pytest.approx(3, abs=0.03)
+    assert torch.equal(model.weight, before)
+
+
+@pytest.mark.parametrize(
+    ("means", "strict", "kept"),
+    [
+        ([0.0, 1.0, 0.9999], False, 2),  # the latest, where it is behind by chance
+        ([0.0, 1.0, 0.5], False, 1),  # not where it is behind for sure
+        ([1.0, 0.9999, 0.9999], False, 0),  # the start, where nothing beats it
+        ([0.0, 1.0, 0.9999], True, 1),
+    ],
+)
+def test_the_latest_state_that_no_earlier_one_beats_is_kept(means: list[float], strict: bool, kept: int) -> None:
+    best, generator = BestState(), torch.Generator().manual_seed(0)
+    for step, mean in enumerate(means):
+        noise = torch.randn(5000, generator=generator, dtype=torch.float64)
+        best.judge({"step": step}, mean + 0.1 * (noise - noise.mean()), start=step == 0, strict=strict)
+    assert best.state == {"step": kept}

@@ -1,12 +1,14 @@
 """Laws of the scalar maps: inverse, log-derivative, monotone, over extremes of their parameters."""
 
+from dataclasses import fields
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from noiseflow.flow import radial_layer, spline_layer, tail_layer
+from noiseflow.flow import Layer, affine_layer, radial_layer, spline_layer, tail_layer
 from noiseflow.transforms import Affine, Radial, StudentTail
 from tests.contracts import check_transform
 
@@ -78,3 +80,19 @@ def test_student_tail_turns_student_noise_nearly_normal() -> None:
     weight = torch.tensor(0.2, dtype=torch.float64)
     latent = StudentTail(weight, weight).forward(torch.from_numpy(stats.t(5).ppf(probability)))[0]
     assert torch.allclose(latent, torch.from_numpy(stats.norm.ppf(probability)), rtol=0.06)
+
+
+@pytest.mark.parametrize("layer", [affine_layer(), radial_layer(0.3), spline_layer(8)])
+def test_maps_between_rows_have_parameters_in_between(layer: Layer) -> None:
+    raw = torch.randn(5, len(layer.initial), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows, x = layer.build(raw), torch.linspace(-7, 7, 60, dtype=torch.float64).reshape(3, 20)
+    row, weight = torch.tensor([[0], [2], [3]]), torch.tensor([[0.0], [0.3], [1.0]], dtype=torch.float64)
+    found = rows.between_rows(row, weight)
+    for i, (at, share) in enumerate(zip(row.flatten(), weight.flatten(), strict=True)):
+        parts = (getattr(rows, each.name) for each in fields(rows) if each.name not in ("row", "weight"))
+        expected = type(rows)(*(torch.lerp(part[at], part[at + 1], share) for part in parts))
+        for direction in ("forward", "inverse"):
+            y, ladj = getattr(found, direction)(x)
+            y_expected, ladj_expected = getattr(expected, direction)(x[i])
+            assert torch.allclose(y[i], y_expected, rtol=1e-12, atol=1e-12)
+            assert torch.allclose(ladj[i], ladj_expected, rtol=1e-10, atol=1e-10)

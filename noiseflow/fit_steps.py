@@ -1,0 +1,28 @@
+"""Single steps of an optimiser that a number that is not finite cannot spoil."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
+    """Adam, with a short memory of the gradients' sizes."""
+    return torch.optim.Adam(list(groups), betas=(0.9, 0.99), fused=True)
+
+
+def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> bool:
+    """One step of an optimiser; False, and no step, where loss or gradient is not finite."""
+    optimiser.zero_grad(set_to_none=True)
+    value = loss()
+    if not bool(torch.isfinite(value)):
+        return False
+    value.backward()  # type: ignore[no-untyped-call]
+    gradients = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
+    if not all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+        return False
+    optimiser.step()
+    return True
