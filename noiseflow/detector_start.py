@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from noiseflow.electrons import log_density
+
+if TYPE_CHECKING:
+    from noiseflow.physical import PoissonGaussian
 
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
 _NUM_CLIMBS = 3
+_SETTLED, _SETTLING_STEPS = 49152, 12
+_SHARP = 0.4  # electrons; beyond, the noise hardly tells one electron's shift
 _FLATTEST = 0.04
 
 
@@ -141,6 +147,56 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
         nearest = round((expected - phase) / gain)
         starts += [Detector(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
     return starts
+
+
+def settle(detector: PoissonGaussian, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
+    """Climb the likelihood of (N,) pixels under `noise_model` in ``detector.change``; the detector is part of that model.
+
+    Detectors one electron further up or down tell themselves apart by little, and a maximum of some pixels may be one off: all
+    three are climbed with many pixels.
+    """
+    change = detector.change
+    part = _part(signal, _SETTLED)
+    signal, observation = signal[part], observation[part]
+    start, learns = change.detach().clone(), change.requires_grad
+
+    def loss() -> Tensor:
+        log_prob: Tensor = noise_model(signal).log_prob(observation)
+        return -log_prob.double().mean()
+
+    change.requires_grad_(True)
+    found = [(_settled(change, start, loss), change.detach().clone())]
+    if float(detector.read_noise.detach()) < _SHARP:
+        along_offset = torch.linalg.solve(detector.axes.double(), torch.eye(3, dtype=torch.float64)[1])
+        step = float(detector.gain.detach()) * along_offset.to(change)
+        found += [(_settled(change, start + side * step, loss), change.detach().clone()) for side in (-1, 1)]
+    with torch.no_grad():
+        change.copy_(min(found, key=lambda each: each[0])[1])
+    change.requires_grad_(learns)
+
+
+def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:
+    """Climb from `start`, in place; the loss reached, never above that of the start."""
+    with torch.no_grad():
+        change.copy_(start)
+        first = float(loss())
+    optimiser = torch.optim.LBFGS([change], max_iter=_SETTLING_STEPS, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = loss()
+        value.backward()  # type: ignore[no-untyped-call]
+        return value.detach()
+
+    with torch.enable_grad():
+        optimiser.step(closure)  # type: ignore[no-untyped-call]
+    change.grad = None
+    with torch.no_grad():
+        last = float(loss())
+        if last <= first:
+            return last
+        change.copy_(start)
+    return first if math.isfinite(first) else math.inf
 
 
 def _distinct(ranked: list[Detector]) -> list[Detector]:

@@ -62,6 +62,8 @@ class Digitised(ArrayModel):
             return
         span = {"span": (float(values.min()), float(values.max()))} if hasattr(self.model, "standardisation") else {}
         self.model.standardise(given_to(self.model, signal[clear]), observation[clear], **span)  # type: ignore[operator]
+        if hasattr(self.model, "settle"):  # the converter spoils what it was standardised on; now its part is known
+            self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))  # type: ignore[operator]
 
     def _clear_of_rails(self, signal: Tensor, observation: Tensor) -> Tensor:
         """Pixels among whose 64 equally populated groups by signal hardly any reading is clipped."""
@@ -74,17 +76,28 @@ class Digitised(ArrayModel):
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
         """What of the likelihood of (N,) pixels does not change while the model inside learns; None where everything may."""
-        if self.step == 0 or not hasattr(self.model, "fixed_interval_part"):
+        if not hasattr(self.model, "fixed_interval_part"):
             return None
-        low = torch.where(observation <= self.low, -math.inf, observation - self.step / 2)
-        high = torch.where(observation >= self.high, math.inf, observation + self.step / 2)
-        fixed: Tensor = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
-        return fixed
+        on_low, on_high = observation <= self.low, observation >= self.high
+        below, above = (observation - self.step / 2, observation + self.step / 2)
+        low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
+        if self.step > 0:
+            fixed: Tensor = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
+            return fixed
+        # readings between the rails have a density: their interval is the whole line, and is not used
+        on_rail = on_low | on_high
+        low, high = torch.where(on_rail, low, -math.inf), torch.where(on_rail, high, math.inf)
+        interval = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
+        density = self.model.fixed_part(signal, observation)  # type: ignore[operator]
+        return torch.cat([interval, density, on_rail[:, None].to(interval.dtype)], -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
         """Log-likelihood of pixels by their `fixed_part`."""
-        found: Tensor = self.model.log_interval_prob_from(signal, fixed_part)  # type: ignore[operator]
-        return found
+        found: Tensor = self.model.log_interval_prob_from(signal, fixed_part[:, :3])  # type: ignore[operator]
+        if self.step > 0:
+            return found
+        between = self.model.log_prob_from(signal, fixed_part[:, 3:5])  # type: ignore[operator]
+        return torch.where(fixed_part[:, 5] > 0, found, between)
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -84,6 +84,20 @@ class PoissonGaussian(ArrayModel):
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(found.gain), found.offset, math.log(found.read_noise)]))
             self.axes.copy_(axes)
+        self.settle(signal, observation)
+
+    def settle(
+        self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module] = lambda detector: detector
+    ) -> None:
+        """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
+
+        Args:
+            signal, observation: detector units.
+            behind: puts the detector behind what stands in front of the readings, such as rounding and rails.
+        """
+        from noiseflow.detector_start import settle
+
+        settle(self, behind(self), signal, observation)
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""

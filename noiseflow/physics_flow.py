@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from noiseflow.flow import ConditionalFlow, affine_layer, spline_layer
 from noiseflow.latent_mean import LatentMean
@@ -69,6 +70,10 @@ class PhysicsFlow(ArrayModel):
         """Find the most likely detector for (N,) signals and observations."""
         self.detector.standardise(signal, observation)
         self.correction.standardise(signal, observation)
+
+    def settle(self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module]) -> None:
+        """Move the detector to its most likely parameters; see `PoissonGaussian.settle`."""
+        self.detector.settle(signal, observation, behind)
 
     @torch.no_grad()
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:

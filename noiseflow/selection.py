@@ -25,6 +25,8 @@ _SCREENING_PIXELS = 32768
 _SCREENING_SHARE = 0.2
 _HOPELESS = 0.02
 _SHARE_FROM_MAXIMUM = 0.1
+_NEGLIGIBLE, _MOST_FOR_SIMPLICITY, _LEAST_PIXEL_COST = 2e-4, 5e-4, 8.0
+_SHARE_AGAIN, _RATE_AGAIN = 0.6, 3e-3
 
 
 @described(nll="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
@@ -58,7 +60,9 @@ class Selection:
 
     Attributes:
         candidates: as given, simplest first.
-        chosen: the simplest whose held-out likelihood lies within one standard error of the best.
+        chosen: the simplest whose held-out likelihood lies within one standard error of the best, and within 5e-4 nats (8 nats
+            over the number of judging pixels, where those are few); 2e-4 nats always pass. Its `nll` and `excess` are those of
+            the contest; its model has since learnt from the judging pixels too.
         digitisation: rounding and rails detected, and put around every candidate.
     """
 
@@ -92,7 +96,8 @@ def select(
     """Fit several noise models to the same pixels and choose the simplest that suffices.
 
     Rounding and clipping are detected and put around every candidate. All candidates get a short fit to some of the pixels;
-    those whose held-out likelihood is then hopelessly behind (0.02 nats, and three standard errors) get no long one.
+    those whose held-out likelihood is then hopelessly behind (0.02 nats, and three standard errors) get no long one. The chosen
+    one goes on with all pixels but a tenth, which tells it when to stop.
 
     Args:
         signal, observation: tensors or arrays of equal shapes, detector units.
@@ -108,14 +113,17 @@ def select(
     digitisation = detect_digitisation(observation.detach().cpu().numpy())
     signal, observation = signal.reshape(-1).float(), observation.reshape(-1).float()
     # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge
-    apart = torch.from_numpy(np.random.default_rng(seed).random(signal.shape[0]) < held_out)
+    draw = torch.from_numpy(np.random.default_rng(seed).random(signal.shape[0]))
+    apart, last_apart = draw < held_out, draw < min(held_out, 0.1)
     models = dict(default_candidates() if candidates is None else candidates)
     if digitisation.found:
         models = {name: Digitised(model, *digitisation) for name, model in models.items()}
     contest = _Contest(models, signal[~apart], observation[~apart], signal[apart], observation[apart], seed)
     contest.screen(max(1, round(_SCREENING_SHARE * num_steps)))
     contest.finish(num_steps)
-    return Selection(*contest.judge(), digitisation)
+    candidates_judged, chosen = contest.judge()
+    contest.learn_all(chosen.name, signal, observation, last_apart, num_steps)
+    return Selection(candidates_judged, chosen, digitisation)
 
 
 class _Contest:
@@ -156,9 +164,8 @@ class _Contest:
 
     def _fit(self, name: str, part: slice, num_steps: int, *, standardise: bool) -> None:
         started, model = time.perf_counter(), self.models[name]
-        if getattr(getattr(model, "model", model), "starts_most_likely", False):
+        if self._starts_most_likely(name):
             num_steps = 0 if standardise else max(1, round(_SHARE_FROM_MAXIMUM * num_steps))
-        generator = torch.Generator().manual_seed(self.seed)
         fit(
             model,
             self.signal[part],
@@ -166,10 +173,28 @@ class _Contest:
             num_steps=num_steps,
             digitise=False,
             standardise=standardise,
-            generator=generator,
+            generator=torch.Generator().manual_seed(self.seed),
         )
         self.scores[name] = pixel_log_prob(model, *self.judging)
         self.seconds[name] += time.perf_counter() - started
+
+    def _starts_most_likely(self, name: str) -> bool:
+        return getattr(getattr(self.models[name], "model", self.models[name]), "starts_most_likely", False)
+
+    def learn_all(self, name: str, signal: Tensor, observation: Tensor, judging: Tensor, num_steps: int) -> None:
+        """Go on with the model of that name on all pixels; `judging` (N,) ones, which it has not learnt from, judge."""
+        share = _SHARE_FROM_MAXIMUM if self._starts_most_likely(name) else _SHARE_AGAIN
+        fit(
+            self.models[name],
+            signal,
+            observation,
+            held_out=judging,
+            num_steps=max(1, round(share * num_steps)),
+            learning_rate=_RATE_AGAIN,
+            digitise=False,
+            standardise=False,
+            generator=torch.Generator().manual_seed(self.seed),
+        )
 
     def _best(self) -> Tensor:
         return max(self.scores.values(), key=lambda score: float(score.mean()))
@@ -184,7 +209,10 @@ class _Contest:
                 Candidate(name, self.models[name], -float(score.mean()), excess, error, self.seconds[name], out)
             )
         able = [item for item in found if math.isfinite(item.excess) and not item.screened_out]
-        return tuple(found), next(item for item in able if item.excess <= item.excess_error)
+        most = max(_MOST_FOR_SIMPLICITY, _LEAST_PIXEL_COST / best.numel())
+        return tuple(found), next(
+            item for item in able if item.excess <= max(min(item.excess_error, most), _NEGLIGIBLE)
+        )
 
 
 def _mean_and_error(difference: Tensor) -> tuple[float, float]:

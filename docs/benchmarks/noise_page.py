@@ -56,7 +56,8 @@ def _accuracy(content: dict[str, Any]) -> str:
         f"Each model is fitted to {size}² pixels of a clean and a noisy image, four fifths to fit, one fifth to judge; {steps} "
         "steps for ours. **KL**: divergence from the truth in nats per pixel, on noise drawn afresh four times per pixel. "
         "**NLL gap**: likelihood of the judging fifth against the truth's on the same pixels. **JSD/floor**: marginal "
-        "Jensen–Shannon divergence of fresh residuals over its mean under the model itself; 1 is perfect. One row:\n\n"
+        "Jensen–Shannon divergence of the residuals of the image, drawn afresh, over its mean under the model itself; mean of "
+        "four draws, 1 is perfect. One row:\n\n"
         "```sh\npython docs/benchmarks/noise_models.py accuracy --noise gamma --model SplineFlow\n```"
     )
     parts = [

@@ -250,13 +250,15 @@ def test_physics_flow_preserves_the_mean(gain: float, offset: float, read_noise:
         assert abs(means[1] - expected) > 1e-2 * deviation
 
 
-def test_what_a_fit_keeps_of_the_likelihood_is_the_likelihood() -> None:
+@pytest.mark.parametrize("step", [1 / 16, 0.0])
+def test_what_a_fit_keeps_of_the_likelihood_is_the_likelihood(step: float) -> None:
     model = MODELS["physics and flow, mean-preserving"]().double()
     signal, reading = torch.linspace(0, 1, 50, dtype=torch.float64), torch.linspace(-0.2, 1.3, 50, dtype=torch.float64)
     kept = model.log_prob_from(signal, model.fixed_part(signal, reading))
     assert torch.allclose(kept, model(signal).log_prob(reading), rtol=1e-12)
-    rounded = noiseflow.Digitised(model, step=1 / 16, low=0.0, high=1.0)
+    rounded = noiseflow.Digitised(model, step=step, low=0.0, high=1.0)
     reading = (reading * 16).round().clamp(0, 16) / 16
+    assert bool((reading == 0).any() & (reading == 1).any())
     fixed = rounded.fixed_part(signal, reading)
     assert fixed is not None
     assert torch.allclose(rounded.log_prob_from(signal, fixed), rounded(signal).log_prob(reading), rtol=1e-9)
@@ -340,6 +342,26 @@ def test_fitted_detector_is_the_true_one(rate: float, read_noise: float) -> None
     model = noiseflow.PoissonGaussian()
     noiseflow.fit(model, signal, observation, num_steps=50)
     assert divergence(truth, model, *photons(rate, read_noise, 50_000, seed=2)[1:]) < 0.005
+
+
+def test_detector_of_many_resolved_electrons_is_not_one_electron_off() -> None:
+    truth, signal, observation = photons(50.0, 0.2, 60_000, seed=3)
+    model = noiseflow.PoissonGaussian()
+    model.standardise(signal, observation)
+    found = [float(each.detach()) for each in (model.gain, model.offset, model.read_noise)]
+    expected = [float(each.detach()) for each in (truth.gain, truth.offset, truth.read_noise)]
+    assert found == pytest.approx(expected, rel=0.01, abs=0.02)
+
+
+@pytest.mark.parametrize("step", [0.0, 1 / 64])
+def test_detector_behind_rails_is_found(step: float) -> None:
+    truth = noiseflow.Digitised(noiseflow.PoissonGaussian(0.05, 0.0, 1.5), step=step, low=0.0, high=1.0)
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(20_000, generator=generator, dtype=torch.float64)
+    observation = truth(signal).sample(generator=generator)
+    model = noiseflow.Digitised(noiseflow.PhysicsFlow(), step=step, low=0.0, high=1.0)
+    model.standardise(signal, observation)
+    assert divergence(truth, model, signal, observation) < 0.001
 
 
 @pytest.mark.parametrize(("gain", "read_noise"), [(-1.0, 1.0), (1.0, 0.0)])
