@@ -57,7 +57,7 @@ def judge(
     true, found = (metrics.pixel_log_prob(each, clean[apart], noisy[apart]) for each in (truth, fitted))
     row = {"kl": kl, "kl_error": error, "nll": -float(found.mean()), "nll_gap": float((true - found).mean())}
     mean = {name: sum(getattr(each, name) for each in divergences) / _FRESH for name in ("jsd", "jsd_floor")}
-    return row | mean
+    return row | mean | {"jsd_draws": _FRESH}
 
 
 def fit(

@@ -52,12 +52,13 @@ def _accuracy(content: dict[str, Any]) -> str:
     if not rows:
         return ""
     size, steps = rows[0]["size"], rows[0]["num_steps"]
+    draws = f", mean of {rows[0]['jsd_draws']} draws" if rows[0].get("jsd_draws", 1) > 1 else ""
     text = (
         f"Each model is fitted to {size}² pixels of a clean and a noisy image, four fifths to fit, one fifth to judge; {steps} "
         "steps for ours. **KL**: divergence from the truth in nats per pixel, on noise drawn afresh four times per pixel. "
         "**NLL gap**: likelihood of the judging fifth against the truth's on the same pixels. **JSD/floor**: marginal "
-        "Jensen–Shannon divergence of the residuals of the image, drawn afresh, over its mean under the model itself; mean of "
-        "four draws, 1 is perfect. One row:\n\n"
+        "Jensen–Shannon divergence of fresh residuals over its mean under the model itself"
+        f"{draws}; 1 is perfect. One row:\n\n"
         "```sh\npython docs/benchmarks/noise_models.py accuracy --noise gamma --model SplineFlow\n```"
     )
     parts = [
