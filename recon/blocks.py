@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -75,7 +76,8 @@ def reconstruct_in_blocks(
             f"--slices-at-once does not know --method {method}: choose {', '.join([*_FITTED, 'sirt, wbp'])}"
         )
     volume = np.lib.format.open_memmap(scratch, "w+", np.float32, grid.shape)
-    projections = np.empty(tilt_series.images.shape, np.float32)
+    with tempfile.TemporaryFile(dir=scratch.parent) as file:
+        projections = np.memmap(file, np.float32, "w+", shape=tilt_series.images.shape)
     for rows in _blocks(grid.height, rows_at_once):
         volume[:, rows], projections[:, rows] = solve(rows)
         volume.flush()

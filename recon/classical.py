@@ -147,5 +147,5 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
 
 def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
     """Some tilts and some rows of a series."""
-    some = tilt_series.select(tilts)
-    return replace(some, images=some.images[:, rows], mask=None if some.mask is None else some.mask[:, rows])
+    mask = None if tilt_series.mask is None else tilt_series.mask[:, rows]
+    return replace(tilt_series, images=tilt_series.images[:, rows], mask=mask).select(tilts)

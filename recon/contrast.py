@@ -13,7 +13,7 @@ from recon.first_guess import estimate_response
 from recon.image_formation import Transmission
 from recon.projector import SliceProjector
 from recon.sirt import sirt
-from recon.tilt_series import TiltSeries
+from recon.tilt_series import TiltSeries, block_means
 
 _COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
 _MARGIN = 0.05  # right and inverted phantoms differ by 0.12 or more in what a coarse volume explains
@@ -78,7 +78,5 @@ def _check_intensity(tilt_series: TiltSeries) -> None:
 
 def _coarse(images: NDArray[np.generic]) -> NDArray[np.float32]:
     """Block averages, at most so many pixels wide and high."""
-    tilts, height, width = images.shape
-    down, across = -(-height // _COARSE_HEIGHT), -(-width // _COARSE_WIDTH)
-    whole = images[:, : height // down * down, : width // across * across].astype(np.float32)
-    return np.asarray(whole.reshape(tilts, height // down, down, width // across, across).mean((2, 4)))
+    _, height, width = images.shape
+    return block_means(images, -(-height // _COARSE_HEIGHT), -(-width // _COARSE_WIDTH))

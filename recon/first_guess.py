@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from recon.image_formation import Linear, Transmission
 from recon.projector import SliceProjector
 from recon.sirt import sirt
-from recon.tilt_series import TiltSeries
+from recon.tilt_series import TiltSeries, block_means
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
@@ -23,11 +26,10 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
     Raises:
         ValueError: bright-field images that are nowhere positive.
     """
-    images = tilt_series.images.astype(np.float32)
+    images = tilt_series.images
     beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
     block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
-    tilts, height, width = (images.shape[0], *(size // block * block for size in images.shape[1:]))
-    means = images[:, :height, :width].reshape(tilts, height // block, block, width // block, block).mean((2, 4))
+    means: NDArray[np.floating[Any]] = block_means(images, block, block)
     if tilt_series.mode == "linear":
         return Linear(offset=float(np.quantile(means, 0.02)), beam=beam, estimate=estimate)
     if tilt_series.beam is not None:
@@ -59,7 +61,7 @@ def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
     height = tilt_series.images.shape[1]
     if num_slices >= height:
         return slice(0, height)
-    energy = np.asarray(tilt_series.images, dtype=np.float32).mean(0).var(1)
+    energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
     total = np.convolve(energy, np.ones(num_slices), mode="valid")
     start = int(total.argmax())
     return slice(start, start + num_slices)

@@ -15,7 +15,7 @@ from torch import Tensor
 from recon.first_guess import estimate_response
 from recon.projector import SliceProjector
 from recon.sirt import sirt
-from recon.tilt_series import TiltSeries
+from recon.tilt_series import TiltSeries, block_means
 
 _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
@@ -94,10 +94,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
     """Block averages, at most so many pixels wide and high."""
-    tilts, rows, columns = tilt_series.images.shape
-    down, across = -(-rows // height), -(-columns // width)
-    whole = tilt_series.images[:, : rows // down * down, : columns // across * across].astype(np.float32)
-    return np.asarray(whole.reshape(tilts, rows // down, down, columns // across, across).mean((2, 4)))
+    _, rows, columns = tilt_series.images.shape
+    return block_means(tilt_series.images, -(-rows // height), -(-columns // width))
 
 
 def _fit_beam(

@@ -159,6 +159,7 @@ def read_tilt_series(
     mode: Mode = "transmission",
     mask: NDArray[np.bool_] | None = None,
     mask_nan: bool = False,
+    mapped: bool = False,
 ) -> TiltSeries:
     """Read a stack and its tilt angles.
 
@@ -170,12 +171,13 @@ def read_tilt_series(
         mode: how the images were formed.
         mask: True for the pixels to use, (tilt, y, u) or (y, u) for all tilts.
         mask_nan: leave NaN and infinite pixels out instead of refusing them.
+        mapped: leave the images on the disk, see `noiseflow.io.read`; not with a mask, NaNs or transforms.
 
     Raises:
         FileNotFoundError: no such file, or no angles beside or inside the stack.
         ValueError: a file cannot be read, the mask does not match, or `TiltSeries` refuses what the stack holds.
     """
-    image_file = io.read(path)
+    image_file = io.read(path, mapped=mapped)
     if image_file.data.ndim != 3:
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed"
@@ -200,6 +202,8 @@ def _masked(
     images: NDArray[Any], mask: NDArray[np.bool_] | None, mask_nan: bool, name: str
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     """Images whose unused pixels hold their nearest used neighbour's reading, and the mask of the used ones."""
+    if mask is None and all(np.isfinite(image).all() for image in images):
+        return images, None
     finite = np.isfinite(images)
     if mask is not None and mask.shape not in (images.shape, images.shape[1:]):
         raise ValueError(f"the mask has shape {mask.shape}; {name} needs {images.shape}, or {images.shape[1:]} for all")
@@ -228,6 +232,13 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
         return np.zeros_like(image)
     nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
     return np.asarray(image[tuple(nearest)])
+
+
+def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
+    """Means of blocks of so many pixels, image by image; what is left over at the far edges is left out."""
+    height, width = images.shape[1] // down, images.shape[2] // across
+    whole = (image[: height * down, : width * across].astype(np.float32) for image in images)
+    return np.stack([image.reshape(height, down, width, across).mean((1, 3)) for image in whole])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:

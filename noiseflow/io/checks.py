@@ -23,10 +23,9 @@ def require_finite(data: NDArray[Any], name: str | Path) -> None:
     """Refuse NaN and infinite pixels, naming how many there are and where the first one is."""
     if not np.issubdtype(data.dtype, np.floating):
         return
-    bad = ~np.isfinite(data)
-    count = int(bad.sum())
+    count = sum(part.size - int(np.isfinite(part).sum()) for part in np.atleast_2d(data))
     if count:
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(data))[0])
         raise ValueError(
             f"{name} has {count} NaN or infinite pixels, the first at {where}; replace them or mask them before this step"
         )

@@ -54,13 +54,14 @@ class ImageFile:
         return f"ImageFile({shape} {self.data.dtype}, voxel size {size}{tilts})"
 
 
-def read(path: str | Path) -> ImageFile:
+def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
         path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, or a folder of single images; with the
             extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5. Of a file that holds several images,
             ``FILE::NAME`` names one.
+        mapped: leave the pixels of an MRC or ``.npy`` file on the disk until they are used; changes to them stay in memory.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -77,7 +78,7 @@ def read(path: str | Path) -> ImageFile:
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
-    reader = _reader(path, member or None)
+    reader = _reader(path, member or None, mapped=mapped)
     try:
         image = reader(path)
     except PermissionError:
@@ -142,7 +143,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         require_whole(target, stored.nbytes)
 
 
-def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
+def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path], ImageFile]:
     from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, tiff
 
     suffix = path.suffix.lower()
@@ -159,10 +160,10 @@ def _reader(path: Path, member: str | None) -> Callable[[Path], ImageFile]:
     if member is not None:
         raise ValueError(f"{path}::{member}: a {suffix} file holds one image; leave ::{member} out")
     if suffix in MRC_SUFFIXES:
-        return mrc.read
+        return partial(mrc.read, mapped=mapped)
     if suffix in TIFF_SUFFIXES:
         return tiff.read
-    return ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy
+    return ome_zarr.read if suffix == ".zarr" else partial(numpy_files.read_npy, mapped=mapped)
 
 
 def _checked(image: ImageFile, path: Path) -> ImageFile:

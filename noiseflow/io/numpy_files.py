@@ -16,9 +16,10 @@ from noiseflow.io.microscope import choose_member
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def read_npy(path: Path) -> ImageFile:
-    """Read the array as it is; the memory map refuses claims beyond the file."""
-    return ImageFile(np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
+def read_npy(path: Path, *, mapped: bool = False) -> ImageFile:
+    """Read the array as it is, or leave it in the file, where `mapped`; the memory map refuses claims beyond the file."""
+    data = np.load(path, mmap_mode="c", allow_pickle=False)
+    return ImageFile(data if mapped else np.array(data))
 
 
 def read_npz(path: Path, member: str | None = None) -> ImageFile:

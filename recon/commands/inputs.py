@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ def load_tilt_series(
     invert_contrast: bool,
     mask: Path | None,
     mask_nan: bool,
+    mapped: bool = False,
 ) -> TiltSeries:
     """Read the series as the options of the command say.
 
@@ -44,6 +46,7 @@ def load_tilt_series(
         mode=parse_mode(mode),
         mask=None if mask is None else _read_mask(mask),
         mask_nan=mask_nan,
+        mapped=mapped,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)
@@ -60,15 +63,22 @@ def load_tilt_series(
 
 
 def _warn_of_outliers(series: TiltSeries) -> None:
-    used = series.images[series.used].astype(np.float64)
-    low, high = np.quantile(used[:: max(1, used.size // 1_000_000)], (0.02, 0.98))
-    far = np.abs(used - (low + high) / 2) > 100 * (high - low)
-    if high > low and far.any():
+    step = max(1, series.images.size // 100_000)
+    low, high = np.quantile(np.concatenate([part[::step].copy() for part in _used(series)]), (0.02, 0.98))
+    far = [part[np.abs(part - (low + high) / 2) > 100 * (high - low)] for part in _used(series)]
+    found = np.abs(np.concatenate(far))
+    if high > low and found.size:
         warnings.warn(
-            f"{int(far.sum())} pixels are a hundred times farther out than the others (up to {np.abs(used).max():.3g}) and would "
+            f"{found.size} pixels are a hundred times farther out than the others (up to {found.max():.3g}) and would "
             "spoil the volume; leave them out with --mask FILE, or replace them",
             stacklevel=3,
         )
+
+
+def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
+    """The readings to use, image by image."""
+    for number, image in enumerate(series.images):
+        yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,7 @@ def reconstruct(
             invert_contrast=invert_contrast,
             mask=mask,
             mask_nan=mask_nan,
+            mapped=slices_at_once is not None,
         )
         with step_report(json_mode=json) as progress:
             prepared = prepare(
@@ -194,7 +195,8 @@ def _settings(
     for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam):
         if array is not None:
             digest.update(f"{array.dtype}{array.shape}".encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
+            for part in array:
+                digest.update(np.ascontiguousarray(part).tobytes())
     data = {"tilt series": digest.hexdigest(), "mode": tilt_series.mode, "grid": list(grid.shape)}
     known = noise_model is not None and noise_model.is_file()
     model = hashlib.blake2b(noise_model.read_bytes(), digest_size=16).hexdigest() if noise_model and known else None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import noiseflow
 from noiseflow import io
@@ -89,13 +91,12 @@ def _save_noise_model(outcome: Outcome, path: Path, source: Path) -> None:
 
 
 def _figures(tilt_series: TiltSeries, outcome: Outcome, seconds: float) -> dict[str, str]:
-    residual = tilt_series.images.astype(np.float32) - outcome.projections
     rows = {
         "method": outcome.method,
         "volume (z, y, x)": " x ".join(str(size) for size in outcome.volume.attenuation.shape),
         "voxel size (Å)": "unknown" if outcome.volume.voxel_size is None else f"{outcome.volume.voxel_size:.4g}",
         "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
-        "residual rms": f"{float(np.sqrt(np.mean(residual[tilt_series.used] ** 2))):.4g}",
+        "residual rms": f"{_residual_rms(tilt_series, outcome.projections):.4g}",
     }
     rows |= {
         name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
@@ -103,3 +104,14 @@ def _figures(tilt_series: TiltSeries, outcome: Outcome, seconds: float) -> dict[
     if outcome.fit_result is not None:
         rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
     return rows | {"seconds": f"{seconds:.1f}"}
+
+
+def _residual_rms(tilt_series: TiltSeries, projections: NDArray[np.float32]) -> float:
+    """Image by image: a series may be larger than memory."""
+    total, count = 0.0, 0
+    for number, (image, predicted) in enumerate(zip(tilt_series.images, projections, strict=True)):
+        residual = image.astype(np.float32) - predicted
+        used = residual if tilt_series.mask is None else residual[tilt_series.mask[number]]
+        total += float(np.sum(used**2, dtype=np.float64))
+        count += used.size
+    return math.sqrt(total / count)

@@ -114,7 +114,7 @@ def memory_line(
     if slices_at_once is None:
         return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
     block = block_memory(tilt_series, grid, slices_at_once, fitted=fitted)
-    return require_memory(needed_memory(*block, fitted=fitted) + 2 * tilt_series.images.size * 4, device)
+    return require_memory(needed_memory(*block, fitted=fitted) + tilt_series.images.nbytes, device)
 
 
 @contextlib.contextmanager

@@ -1,14 +1,17 @@
 """Blocks of slices: the same volume as in one go, in the memory of one block."""
 
+import tracemalloc
+
 import mrcfile
 import numpy as np
 import pytest
 
+from noiseflow import io
 from recon.blocks import reconstruct_in_blocks
 from recon.methods import reconstruct
 from recon.phantoms import shells
 from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.tilt_series import TiltSeries, VolumeGrid, write_tilt_series
+from recon.tilt_series import TiltSeries, VolumeGrid, read_tilt_series, write_tilt_series
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +69,41 @@ def test_command_streams_and_leaves_nothing_behind(scene, tmp_path, run, refused
     assert {path.name for path in tmp_path.iterdir()} == {"tilts.mrc", "tilts.rawtlt", "v.mrc"}
     command[command.index("wbp")] = "explicit"
     assert "--slices-at-once" in refused(*command, "--slices-at-once", 6)
+
+
+@pytest.fixture
+def tall(tmp_path):
+    """A series of 14 MiB, of few columns, on the disk."""
+    generator = np.random.default_rng(0)
+    angles = np.arange(-60, 61, 8.0)
+    stack = np.exp(-generator.uniform(0, 1, (len(angles), 7000, 32)).astype(np.float32) / 4)
+    stack[:, :, 12:20] *= 0.5
+    write_tilt_series(tmp_path / "tall.mrc", TiltSeries(stack, angles))
+    return tmp_path / "tall.mrc"
+
+
+def test_command_holds_one_block_in_memory(tall, tmp_path, run):
+    """Neither images nor volume nor projections, of 14, 27 and 14 MiB, are ever whole in memory."""
+    command = ["reconstruct", tall, "-o", tmp_path / "v.npy", "--method", "sirt", "--steps", 2]
+    command += ["--slices-at-once", 7000 // 4]
+    peaks = []
+    for _ in range(2):  # imports count in the first run
+        tracemalloc.start()
+        run(*command)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 13 * 2**20
+
+
+def test_mapped_stack_is_left_on_the_disk_and_unchanged(scene, tmp_path):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    before = (tmp_path / "tilts.mrc").read_bytes()
+    mapped = read_tilt_series(tmp_path / "tilts.mrc", mapped=True)
+    np.testing.assert_array_equal(mapped.images, noisy.images)
+    mapped.images[0, 0, 0] = 7.0
+    assert (tmp_path / "tilts.mrc").read_bytes() == before
+    for name in ("one.npy", "one.mrc"):
+        io.write(tmp_path / name, noisy.images)
+        assert isinstance(io.read(tmp_path / name, mapped=True).data, np.memmap)
+        assert not isinstance(io.read(tmp_path / name).data, np.memmap)
