@@ -55,7 +55,7 @@ class TomographySignal(Described):
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
         self.occupancy = occupancy
         self._values: Tensor | None = None
-        self._tiles: tuple[int, Tiles] | None = None
+        self._tiles: Tiles | None = None
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
 
     def extra_repr(self) -> str:
@@ -104,9 +104,9 @@ class TomographySignal(Described):
         if self.occupancy is None or not isinstance(self.projector, SliceProjector):
             raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
         mask = self.occupancy.mask
-        if self._tiles is None or self._tiles[0] != mask._version:
-            self._tiles = mask._version, Tiles(mask, self.projector)
-        return self._tiles[1]
+        if self._tiles is None or not torch.equal(self._tiles.mask, mask):
+            self._tiles = Tiles(mask, self.projector)
+        return self._tiles
 
     def volume(self) -> Tensor:
         """The attenuation that the signal is made of, (z, y, x), detached."""

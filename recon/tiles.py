@@ -25,12 +25,13 @@ class Tiles:
         projector: of the whole lattice.
 
     Attributes:
+        mask: as given.
         places: (N,) voxels of the list, flat lattice indices (z, x, y).
         occupied: (M,) where in the list the occupied ones stand.
     """
 
     def __init__(self, mask: Tensor, projector: SliceProjector) -> None:
-        self.shape = tuple(mask.shape)
+        self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
         together = max(_TOGETHER, -(-height // _MOST_GROUPS))
         flat = mask.reshape(depth * width, height)
