@@ -8,10 +8,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device
+from noiseflow.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    Progress,
+    SeedOption,
+    StepReport,
+    choose_device,
+    progress_bar,
+    step_report,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
+
+_PIECE = 2**20  # pixels sampled at once
+_BASELINE_STEPS = 500
 
 
 def sample(
@@ -31,7 +44,9 @@ def sample(
     image = io.read(clean)
     io.require_finite(image.data, clean)
     noise_model = noiseflow.load(model).to(choose_device(device))
-    noisy = _sample(noise_model, _tensor(image.data), seed)
+    num_pieces = max(1, -(-image.data.size // _PIECE))
+    with progress_bar("Sampling", num_pieces, json_mode=json) as progress:
+        noisy = _sample(noise_model, _tensor(image.data), seed, progress)
     io.write(output, noisy.numpy(), voxel_size=image.voxel_size)
     out = Output(json)
     standardisation = next((m for m in noise_model.modules() if hasattr(m, "signal_low")), None)
@@ -68,21 +83,24 @@ def evaluate(
 
     out = Output(json)
     where = choose_device(device)
+    models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
     pairs = _read_pairs(signal, observation)
     clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
-    models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
     if baselines:
         # NumPy's stream, not torch's: noise that `sample` drew with the same seed must not decide which pixels judge
         half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
-        for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
-            fitted = noiseflow.fit(
-                baseline.to(where), train_signal, train_observation, generator=torch.Generator().manual_seed(seed)
-            )
-            models[type(baseline).__name__] = fitted.noise_model
-    results = {name: metrics.evaluate(item, clean, noisy, seed=seed) for name, item in models.items()}
+        with step_report(json_mode=json) as report:
+            models |= _fitted_baselines(train_signal, train_observation, seed, report)
+    with progress_bar("Judging", len(models) + len(pairs), json_mode=json) as progress:
+        results, structures = {}, []
+        for name, item in models.items():
+            results[name] = metrics.evaluate(item, clean, noisy, seed=seed)
+            progress(len(results), name)
+        for pair in pairs:
+            structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
+            progress(len(results) + len(structures), "neighbours")
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
-    structures = [spatial_structure(models["model"], *(image.to(where) for image in pair)) for pair in pairs]
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
     out.result(
@@ -94,7 +112,32 @@ def evaluate(
     )
 
 
+def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, report: StepReport) -> dict[str, nn.Module]:
+    import torch
+
+    import noiseflow
+
+    fitted: dict[str, nn.Module] = {}
+    for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
+        name, generator = type(baseline).__name__, torch.Generator().manual_seed(seed)
+
+        def progress(done: int, note: str, title: str = f"Fitting {name}") -> None:
+            report(title, done, _BASELINE_STEPS, note)
+
+        fitted[name] = noiseflow.fit(
+            baseline.to(signal.device),
+            signal,
+            observation,
+            num_steps=_BASELINE_STEPS,
+            generator=generator,
+            progress=progress,
+        ).noise_model
+    return fitted
+
+
 def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Tensor, Tensor]]:
+    import numpy as np
+
     from noiseflow import io
 
     if len(signals) != len(observations):
@@ -110,19 +153,21 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
             raise ValueError(
                 f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes"
             )
+        if np.array_equal(clean, noisy):
+            raise ValueError(f"{paths[0]} and {paths[1]} hold the same pixels; give the noisy image as --observation")
         pairs.append((_tensor(clean), _tensor(noisy)))
     return pairs
 
 
-def _sample(noise_model: nn.Module, signal: Tensor, seed: int) -> Tensor:
+def _sample(noise_model: nn.Module, signal: Tensor, seed: int, progress: Progress) -> Tensor:
     import torch
 
     device = next(noise_model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
-    pieces = [
-        noise_model(piece.to(device)).sample(generator=generator).cpu()
-        for piece in torch.split(signal.reshape(-1), 2**20)
-    ]
+    pieces = []
+    for piece in torch.split(signal.reshape(-1), _PIECE):
+        pieces.append(noise_model(piece.to(device)).sample(generator=generator).cpu())
+        progress(len(pieces), "")
     return torch.cat(pieces).reshape(signal.shape)
 
 

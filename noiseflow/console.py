@@ -77,6 +77,19 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, (str, int, bool, type(None))) else str(value)
 
 
+_SHOWN: ContextVar[bool] = ContextVar("shown", default=False)
+
+
+@contextlib.contextmanager
+def progress_shown() -> Iterator[None]:
+    """Within the block, progress is shown in JSON mode too: of a command that another one runs for its result."""
+    token = _SHOWN.set(True)
+    try:
+        yield
+    finally:
+        _SHOWN.reset(token)
+
+
 @contextlib.contextmanager
 def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
     """Progress of one piece of work of so many steps; see `step_report`."""
@@ -87,7 +100,7 @@ def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator
 @contextlib.contextmanager
 def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
     """Progress with rate and time left: a bar on a terminal, a line now and then in a log, nothing in JSON mode."""
-    if json_mode:
+    if json_mode and not _SHOWN.get():
         yield lambda title, done, total, note: None
     elif not sys.stderr.isatty():
         yield _LogLines()

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from noiseflow.console import JsonOption, Output, SeedOption
+from noiseflow.console import JsonOption, Output, SeedOption, progress_shown
 
 
 def demo(
@@ -78,7 +78,8 @@ class _Runner:
         if command != "compare":
             words += ["--seed", self.seed]
         printed = textio.StringIO()
-        with contextlib.redirect_stdout(printed):
+        shown_progress = contextlib.nullcontext() if self.output.json_mode else progress_shown()
+        with contextlib.redirect_stdout(printed), shown_progress:
             build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
         if result.get("report"):

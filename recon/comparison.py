@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.console import Progress
 from noiseflow.report import Report, new_figure, show_image
 from recon.metrics import SCALINGS, Errors, compare, compare_images, fourier_shell_correlation, match, resolution
 from recon.projector import SliceProjector
@@ -16,6 +17,7 @@ from recon.tilt_series import Mode, Volume
 
 Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
+NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
 
 
@@ -45,7 +47,12 @@ class Comparison:
 
 
 def compare_volumes(
-    volume: Volume, reference: Volume, *, tilt_angles: Array | None = None, mode: Mode = "linear"
+    volume: Volume,
+    reference: Volume,
+    *,
+    tilt_angles: Array | None = None,
+    mode: Mode = "linear",
+    progress: Progress = lambda done, note: None,
 ) -> Comparison:
     """Compare a volume with its reference.
 
@@ -54,20 +61,26 @@ def compare_volumes(
         reference: the truth, on the same lattice.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: what a projection is: line integrals (``linear``), or exp(−line integral).
+        progress: called with the steps done, of `NUM_STEPS`, and a note.
 
     Raises:
         ValueError: sizes or voxel sizes differ, voxels are not finite, or the reference is flat.
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
-    errors = {scaling: compare(first, second, scaling=scaling) for scaling in SCALINGS}
+    errors: dict[str, Errors] = {}
+    for done, scaling in enumerate(SCALINGS):
+        progress(done + 1, f"volumes, {scaling}")
+        errors[scaling] = compare(first, second, scaling=scaling)
     projections: dict[str, Errors] = {}
     if tilt_angles is not None:
+        progress(len(SCALINGS) + 1, "projections")
         images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
         projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
+    progress(NUM_STEPS, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
-    return Comparison(errors, projections, frequency, correlation, crossings)  # type: ignore[arg-type]
+    return Comparison(errors, projections, frequency, correlation, crossings)
 
 
 def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:

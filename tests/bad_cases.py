@@ -72,6 +72,7 @@ sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device cuda | 
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device toaster | choose auto
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | equal sizes
 evaluate {good}/model.safetensors --signal {good}/clean.mrc {good}/clean.mrc --observation {good}/clean.mrc | one of each
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | the same pixels
 evaluate {good}/model.safetensors --signal {bad}/nan2d.npy --observation {good}/clean.mrc | NaN
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/cut.tif | cannot be read
 evaluate {bad}/cut.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | damaged

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow import console
+from noiseflow import commands, console
 from noiseflow.cli import main
 from tests.bad_files import ANGLES, make_good_files
 
@@ -24,8 +24,14 @@ COMMANDS = {
     "calibrate": "--short {good}/050ms.tif --long {good}/long.tif -o {out}/m.safetensors",
     "simulate": "{out}/new --size 32",
     "reconstruct": "{good}/tilts.mrc -o {out}/v.mrc --method l2 --weight 0.1 --steps 12",
+    "sample": "{good}/model.safetensors {good}/tilts.mrc -o {out}/noisy.npy",
+    "evaluate": "{good}/model.safetensors --signal {good}/long.tif --observation {good}/050ms.tif --baselines",
+    "compare": "{good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt",
+    "demo": "--out {out}/demo",
     "sirt": "{good}/tilts.mrc -o {out}/v.mrc --method sirt --steps 30",
 }
+QUICK = ("simulate", "sample", "evaluate", "compare", "reconstruct", "sirt")
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("calibrate", "demo")]
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +40,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_good_files(folder)
     assert len(np.loadtxt(folder / "tilts.rawtlt")) == len(ANGLES)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images are sampled in several pieces, as large ones are."""
+    monkeypatch.setattr(commands, "_PIECE", 1000)
 
 
 def words(name: str, good: Path, out: Path) -> list[str]:
@@ -68,7 +80,7 @@ def _read(terminal: int) -> bytes:
         return b""
 
 
-@pytest.mark.parametrize("name", ["simulate", "reconstruct", "sirt", pytest.param("calibrate", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_bars_fit_a_terminal_and_tell_rate_and_time(name: str, good: Path, tmp_path: Path) -> None:
     shown = on_a_terminal(words(name, good, tmp_path))
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
@@ -79,7 +91,7 @@ def test_bars_fit_a_terminal_and_tell_rate_and_time(name: str, good: Path, tmp_p
     assert not any("…" in line.partition("━")[0] for line in bars), bars[-3:]
 
 
-@pytest.mark.parametrize("name", ["simulate", "reconstruct", "sirt"])
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(console, "_LOG_SECONDS", -1.0)
     for more in ([], ["--json"]):

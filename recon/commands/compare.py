@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.console import JsonOption, Output
+from noiseflow.console import JsonOption, Output, progress_bar
 from recon.commands.options import parse_mode
 
 
@@ -25,7 +25,7 @@ def compare(
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
-    from recon.comparison import THRESHOLDS, compare_volumes, comparison_report, error_table
+    from recon.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
     from recon.tilt_series import Volume
 
     output = Output(json)
@@ -34,7 +34,8 @@ def compare(
     files = [io.read(path) for path in (volume, reference)]
     first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
     tilt_angles = None if angles is None else io.read_angles(angles)
-    comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode))
+    with progress_bar("comparing", NUM_STEPS, json_mode=json) as progress:
+        comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
     header, rows = error_table(comparison)
     output.table(header, rows)
     for threshold in THRESHOLDS:
