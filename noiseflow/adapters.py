@@ -142,6 +142,10 @@ class PolynomialMixture(ArrayModel):
         self.scale = (observation - signal).std(correction=0)
 
     def forward(self, signal: Tensor) -> MixtureDistribution:
+        return MixtureDistribution(signal, self.components_at, model=self)
+
+    def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights, means and log-scales at each signal, (*signal.shape, K)."""
         t = ((signal - self.low) / (self.high - self.low))[..., None, None]
         powers = t ** torch.arange(self.raw.shape[-1], device=signal.device)
         centre, log_weight = ((self.raw[row] * powers).sum(-1) for row in (0, 2))
@@ -149,7 +153,7 @@ class PolynomialMixture(ArrayModel):
         log_weight = torch.log_softmax(log_weight, -1)
         centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)
         log_scale = torch.log(self.scale) + 0.5 * torch.log(variance)
-        return MixtureDistribution(signal, log_weight, signal[..., None] + self.scale * centre, log_scale)
+        return log_weight, signal[..., None] + self.scale * centre, log_scale
 
     def arrays(self) -> dict[str, Any]:
         """The arrays of the file: rows of means, log-variances and log-weights, (3·num_gaussians, num_coefficients)."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+_ROUNDINGS = 8
 
 
 class NoiseDistribution(Distribution):
@@ -76,9 +77,12 @@ class LatentDistribution(NoiseDistribution):
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)
         mass = log_normal_interval(bottom, top)
-        # the difference of latents keeps few digits in a narrow cell; there the slopes at its ends tell the width
+        # the difference of latents keeps few digits in a narrow cell; there the slopes at its ends tell the width, unless they
+        # differ by more than is lost, as about the cusp of a radial layer
         middle, finite = (bottom + top) / 2, torch.isfinite(bottom) & torch.isfinite(top)
-        narrow = finite & (high > low) & (top - bottom < torch.finfo(bottom.dtype).eps ** (1 / 3))
+        width, eps = top - bottom, torch.finfo(bottom.dtype).eps
+        alike = (slope_above - slope_below).abs() * width <= _ROUNDINGS * eps * (1 + middle.abs())
+        narrow = finite & (high > low) & (width < eps ** (1 / 3)) & alike
         zero = torch.zeros_like(middle)
         width = torch.where(narrow, high - low, zero + 1)
         middle, slope = torch.where(narrow, middle, zero), torch.where(narrow, (slope_below + slope_above) / 2, zero)

@@ -93,6 +93,18 @@ def conditioning_features(coordinate: Tensor) -> Tensor:
     return torch.stack([2 * coordinate - 1, 2 * coordinate * coordinate - 1], -1)
 
 
+def signal_nodes(like: Tensor) -> Tensor:
+    """The (257,) signal coordinates at which networks run; in between, what they give is interpolated linearly."""
+    return torch.linspace(0, 1, _NUM_NODES, dtype=like.dtype, device=like.device)
+
+
+def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Number of the node below each signal coordinate, and the weight of the node above."""
+    position = coordinate * (_NUM_NODES - 1)
+    row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
+    return row, (position - row).to(dtype)
+
+
 def _bounded(raw: Tensor, limit: float) -> Tensor:
     return limit * torch.tanh(raw / limit)
 
@@ -185,11 +197,8 @@ class ConditionalFlow(ArrayModel):
 
         The network so runs on the nodes alone, however many pixels there are.
         """
-        nodes = torch.linspace(0, 1, _NUM_NODES, dtype=coordinate.dtype, device=coordinate.device)
-        position = coordinate * (_NUM_NODES - 1)
-        row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
-        weight = (position - row).to(self.bias.dtype)
-        maps = zip(self.layers, self.transforms_of_network(nodes), strict=True)
+        row, weight = between_nodes(coordinate, self.bias.dtype)
+        maps = zip(self.layers, self.transforms_of_network(signal_nodes(coordinate)), strict=True)
         return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]
 
     def transforms_of_network(self, coordinate: Tensor) -> list[Transform]:

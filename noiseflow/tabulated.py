@@ -134,10 +134,11 @@ def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> boo
     return large and not differentiable and not needs_image(noise_model)
 
 
-_likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Columns, Tensor]]] = (
+# the last table of each model, or None where none was accurate enough
+_likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Columns, Tensor] | None]] = (
     weakref.WeakKeyDictionary()
 )
-_quantiles: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Tensor]]] = weakref.WeakKeyDictionary()
+_quantiles: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Tensor] | None]] = weakref.WeakKeyDictionary()
 
 
 def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
@@ -165,10 +166,8 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tol
     kept = _likelihoods.get(noise_model)
     if kept is None or kept[0] != state:
         made = _make_likelihood(noise_model, flat_signal, flat, limits, tolerance)
-        if made is None:
-            return None
         kept = _likelihoods[noise_model] = (state, made)
-    return _look_up(*kept[1], flat_signal, flat).reshape(observation.shape)
+    return None if kept[1] is None else _look_up(*kept[1], flat_signal, flat).reshape(observation.shape)
 
 
 def _make_likelihood(
@@ -224,9 +223,9 @@ def sample(
     kept = _quantiles.get(flow)
     if kept is None or kept[0] != state:
         made = _make_quantiles(flow, flat, limits, tolerance)
-        if made is None:
-            return None
         kept = _quantiles[flow] = (state, made)
+    if kept[1] is None:
+        return None
     rows, table = kept[1]
     drawn = torch.randn(flat.shape, generator=generator, dtype=flat.dtype, device=flat.device)
     for start in range(0, flat.numel(), _CHUNK):

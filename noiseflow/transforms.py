@@ -46,7 +46,7 @@ class Affine:
         return self.loc + y * torch.exp(self.log_scale), self.log_scale.expand_as(y)
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Affine:
-        return Affine(*(_between_rows(each, row, weight) for each in (self.loc, self.log_scale)))
+        return Affine(*(between_rows(each, row, weight) for each in (self.loc, self.log_scale)))
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Radial:
         return x, -self._ladj(width / (width + distance))
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Radial:
-        return Radial(*(_between_rows(each, row, weight) for each in (self.centre, self.log_width, self.log_slope)))
+        return Radial(*(between_rows(each, row, weight) for each in (self.centre, self.log_width, self.log_slope)))
 
     def _ladj(self, near: Tensor) -> Tensor:
         # 1 + (slope − 1)·near², written as a sum of positive terms
@@ -114,7 +114,7 @@ class StudentTail:
         return y * torch.exp(log_ratio / 2), t - log_ratio / 2
 
     def between_rows(self, row: Tensor, weight: Tensor) -> StudentTail:
-        return StudentTail(*(_between_rows(each, row, weight) for each in (self.left, self.right)))
+        return StudentTail(*(between_rows(each, row, weight) for each in (self.left, self.right)))
 
 
 def _log1p_ratio(t: Tensor) -> Tensor:
@@ -201,16 +201,16 @@ class Spline:
         """The knots of the given numbers."""
         if self.row is not None and self.weight is not None:
             at = self.row * knots.shape[-1] + index
-            return _between_rows(knots.reshape(-1), at, self.weight, step=knots.shape[-1])
+            return between_rows(knots.reshape(-1), at, self.weight, step=knots.shape[-1])
         index = index + torch.zeros(knots.shape[:-1], dtype=torch.long, device=index.device)
         return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
 
 
-def _between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -> Tensor:
-    """Values between table[row] and table[row + step], by `weight`."""
-    flat = row.reshape(-1)
-    left, right = (table.index_select(0, at).reshape(row.shape) for at in (flat, flat + step))
-    return left + weight * (right - left)
+def between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -> Tensor:
+    """Values between table[row] and table[row + step], by `weight`; (*row.shape, …) for tables of more axes."""
+    flat, shape = row.reshape(-1), (*row.shape, *table.shape[1:])
+    left, right = (table.index_select(0, at).reshape(shape) for at in (flat, flat + step))
+    return left + weight.reshape(*weight.shape, *(1,) * (table.ndim - 1)) * (right - left)
 
 
 def _spline_ladj(secant: Tensor, xi: Tensor, rest: Tensor, d0: Tensor, d1: Tensor, denominator: Tensor) -> Tensor:
