@@ -210,7 +210,7 @@ def between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -
     """Values between table[row] and table[row + step], by `weight`; (*row.shape, …) for tables of more axes."""
     flat, shape = row.reshape(-1), (*row.shape, *table.shape[1:])
     left, right = (table.index_select(0, at).reshape(shape) for at in (flat, flat + step))
-    return left + weight.reshape(*weight.shape, *(1,) * (table.ndim - 1)) * (right - left)
+    return left + weight.reshape((*weight.shape, *(1,) * (table.ndim - 1))) * (right - left)
 
 
 def _spline_ladj(secant: Tensor, xi: Tensor, rest: Tensor, d0: Tensor, d1: Tensor, denominator: Tensor) -> Tensor:
