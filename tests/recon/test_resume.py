@@ -27,7 +27,8 @@ def series(tmp_path_factory):
 
 
 def command(series, out, *more):
-    return ["reconstruct", series, "-o", out, "--method", "l2", "--steps", 60, "--checkpoint-interval", 0.1, *more]
+    options = ["--method", "l2", "--weight", 0.4, "--steps", 60, "--checkpoint-interval", 0.1]
+    return ["reconstruct", series, "-o", out, *options, *more]
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +128,8 @@ def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
     assert process.exitcode == 130, log.read_text()
     assert not out.exists()
     last = log.read_text().strip().splitlines()[-1]
-    assert (
-        f"noiseflow reconstruct {series} --out {out} --method l2 --steps 60 --checkpoint-interval 0.1 --resume" in last
-    )
+    options = "--method l2 --weight 0.4 --steps 60 --checkpoint-interval 0.1"
+    assert f"noiseflow reconstruct {series} --out {out} {options} --resume" in last
     finish(command(series, out, "--resume"), log)
     assert_same(np.load(out), whole[0])
 
