@@ -113,7 +113,7 @@ class JointReconstructor:
             signal_model.weight = choice.weight
         task = self._task(signal_model, tilt_series)
         if quiet and not isinstance(noise_model, Gaussian):
-            task.settle(progress=progress)
+            task.settle(thoroughly=True, progress=progress)
         result = task.alternate(noise_model, num_steps=self.num_steps, progress=progress)
         return _finished(signal_model, noise_model, result, grid, choice)
 
@@ -160,8 +160,7 @@ class JointReconstructor:
         return _Task(signal_model, observation, use, self.seed, self.run_fit)
 
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None, bool]:
-        """Noise model and weight, found on a slab, and whether there is little noise; the response learnt there is where the
-        whole starts."""
+        """Noise model and weight, found on a slab like the response at the start, and whether there is little noise."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -173,17 +172,14 @@ class JointReconstructor:
         quiet = task.settle()
         if given is not None and self.weight is not None and not learns(given):
             return given, None, quiet
-        noise_model = (
-            _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
-        )
+        noise_model = given if given is not None else _best_noise_model(task, noise_candidates(tilt_series.images))
         task.alternate(noise_model, num_steps=80, standardise=given is not None)
         task.refine(noise_model)
         choice = None
-        if self.weight is None:
-            with _frozen(noise_model):
+        with _frozen(noise_model):
+            if self.weight is None:
                 choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
-        else:
-            with _frozen(noise_model):
+            else:
                 task.fit(noise_model, num_steps=80, standardise=False)
         # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
         task.refine(noise_model)
@@ -216,18 +212,20 @@ class _Task:
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
         return self.run_fit(noise_model, signal, self.observation, **options)
 
-    def settle(self, *, progress: Progress | None = None) -> bool:
+    def settle(self, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:
         """Least squares, longer and longer until held-out pixels gain little: what an unfinished signal misses would pass for
-        noise, and be left as it is. Returns whether it took long, as it does where there is little noise."""
-        reached, taken = math.inf, 0
+        noise, and be left as it is. Returns whether it took long, as it does where there is little noise; then `thoroughly`
+        goes all the way, by smaller and smaller steps, as large ones may stop gaining long before the end."""
+        reached, rate = math.inf, self.signal_model.learning_rate
         for num_steps in _SETTLING:
-            model = Gaussian().to(self.observation.device)
-            nll = self.fit(model, num_steps=num_steps, progress=progress).held_out_nll
-            taken += num_steps
-            if reached - nll < _SETTLED:
+            nll = self.fit(Gaussian().to(self.observation.device), num_steps=num_steps, progress=progress).held_out_nll
+            if thoroughly:
+                self.signal_model.learning_rate *= _NEXT_TURN
+            elif reached - nll < _SETTLED:
                 break
             reached = nll
-        return taken > sum(_SETTLING[:2])
+        self.signal_model.learning_rate = rate
+        return num_steps > _SETTLING[1]
 
     def alternate(
         self, noise_model: nn.Module, *, num_steps: int, standardise: bool = False, progress: Progress | None = None

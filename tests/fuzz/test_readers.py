@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 import noiseflow
 from noiseflow import io
+from tests.test_formats import velox_emd
 
 EXAMPLES = int(os.environ.get("NOISEFLOW_FUZZ_EXAMPLES", "60"))
 SPARE_MEMORY = 600 * 2**20
@@ -74,6 +75,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         file.create_dataset("exchange/data", data=STACK.astype(np.float32), chunks=(1, 16, 20), compression="gzip")
         file["exchange/theta"] = np.arange(3.0)
     noiseflow.save(noiseflow.RadialFlow(2), folder / "a.safetensors")
+    velox_emd(folder)
     return {path.suffix: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -107,7 +109,7 @@ def read_or_refuse(path: Path, content: bytes) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".tif", ".tiff", ".h5", ".safetensors"])
+@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".tif", ".tiff", ".h5", ".emd", ".safetensors"])
 @fuzz
 @given(wounds=st.lists(damage, min_size=1, max_size=4))
 def test_damaged_files_are_read_or_refused(
