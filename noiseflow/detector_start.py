@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
 _NUM_CLIMBS = 3
-_SETTLED, _SETTLING_STEPS = 49152, 12
+_SETTLED, _SETTLED_BEHIND, _SETTLING_STEPS = 49152, 16384, 12
 _SHARP = 0.4  # electrons; beyond, the noise hardly tells one electron's shift
 _FLATTEST = 0.04
 
@@ -156,7 +156,7 @@ def settle(detector: PoissonGaussian, noise_model: nn.Module, signal: Tensor, ob
     three are climbed with many pixels.
     """
     change = detector.change
-    part = _part(signal, _SETTLED)
+    part = _part(signal, _SETTLED if noise_model is detector else _SETTLED_BEHIND)  # intervals cost more
     signal, observation = signal[part], observation[part]
     start, learns = change.detach().clone(), change.requires_grad
 
@@ -167,7 +167,7 @@ def settle(detector: PoissonGaussian, noise_model: nn.Module, signal: Tensor, ob
     change.requires_grad_(True)
     found = [(_settled(change, start, loss), change.detach().clone())]
     if float(detector.read_noise.detach()) < _SHARP:
-        along_offset = torch.linalg.solve(detector.axes.double(), torch.eye(3, dtype=torch.float64)[1])
+        along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         found += [(_settled(change, start + side * step, loss), change.detach().clone()) for side in (-1, 1)]
     with torch.no_grad():
