@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Mapping
@@ -26,7 +27,6 @@ _SCREENING_SHARE = 0.2
 _HOPELESS = 0.02
 _SHARE_FROM_MAXIMUM = 0.1
 _NEGLIGIBLE, _MOST_FOR_SIMPLICITY, _LEAST_PIXEL_COST = 2e-4, 5e-4, 8.0
-_SHARE_AGAIN, _RATE_AGAIN = 0.6, 3e-3
 
 
 @described(nll="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
@@ -97,7 +97,7 @@ def select(
 
     Rounding and clipping are detected and put around every candidate. All candidates get a short fit to some of the pixels;
     those whose held-out likelihood is then hopelessly behind (0.02 nats, and three standard errors) get no long one. The chosen
-    one goes on with all pixels but a tenth, which tells it when to stop.
+    one is fitted again to all pixels but a tenth, which tells when to stop.
 
     Args:
         signal, observation: tensors or arrays of equal shapes, detector units.
@@ -142,14 +142,20 @@ class _Contest:
         self.signal, self.observation = signal, observation
         self.judging = judging_signal, judging_observation
         self.scores: dict[str, Tensor] = {}
+        self.starts: dict[str, dict[str, Any]] = {}
         self.seconds = dict.fromkeys(models, 0.0)
         self.screened_out: set[str] = set()
 
     def screen(self, num_steps: int) -> None:
         """A short fit of every model to some of the pixels; those far behind the best are screened out."""
         part = slice(None, None, max(1, self.signal.numel() // _SCREENING_PIXELS))
-        for name in self.models:
-            self._fit(name, part, num_steps, standardise=True)
+        for name, model in self.models.items():
+            started = time.perf_counter()
+            self._fit(name, self.signal[part], self.observation[part], 0, standardise=True)
+            self.starts[name] = copy.deepcopy(model.state_dict())
+            if not self._starts_most_likely(name):
+                self._fit(name, self.signal[part], self.observation[part], num_steps)
+            self._score(name, started)
         best = self._best()
         for name, score in self.scores.items():
             excess, error = _mean_and_error(best - score)
@@ -157,44 +163,50 @@ class _Contest:
                 self.screened_out.add(name)
 
     def finish(self, num_steps: int) -> None:
-        """The long fit of those that are left, from where the short one ended."""
+        """The long fit of those that are left."""
         for name in self.models:
             if name not in self.screened_out:
-                self._fit(name, slice(None), num_steps, standardise=False)
+                started = time.perf_counter()
+                self._fit_anew(name, self.signal, self.observation, num_steps)
+                self._score(name, started)
 
-    def _fit(self, name: str, part: slice, num_steps: int, *, standardise: bool) -> None:
-        started, model = time.perf_counter(), self.models[name]
+    def learn_all(self, name: str, signal: Tensor, observation: Tensor, judging: Tensor, num_steps: int) -> None:
+        """Fit the model of that name to all pixels but the `judging` (N,) ones; where these like it less, it stays as it was."""
+        model, pixels = self.models[name], (signal[judging], observation[judging])
+        before, kept = pixel_log_prob(model, *pixels), copy.deepcopy(model.state_dict())
+        self._fit_anew(name, signal, observation, num_steps, held_out=judging)
+        loss, error = _mean_and_error(before - pixel_log_prob(model, *pixels))
+        if not loss <= error:
+            model.load_state_dict(kept)
+
+    def _fit_anew(self, name: str, signal: Tensor, observation: Tensor, num_steps: int, **options: Any) -> None:
+        """A fit from the standardised start; a few steps more where that is nearly the end."""
         if self._starts_most_likely(name):
-            num_steps = 0 if standardise else max(1, round(_SHARE_FROM_MAXIMUM * num_steps))
-        fit(
-            model,
-            self.signal[part],
-            self.observation[part],
-            num_steps=num_steps,
-            digitise=False,
-            standardise=standardise,
-            generator=torch.Generator().manual_seed(self.seed),
-        )
-        self.scores[name] = pixel_log_prob(model, *self.judging)
+            num_steps = max(1, round(_SHARE_FROM_MAXIMUM * num_steps))
+        else:  # not on from the short fit: fresh steps of the optimiser leave what weights have learnt
+            self.models[name].load_state_dict(self.starts[name])
+        self._fit(name, signal, observation, num_steps, **options)
+
+    def _fit(
+        self,
+        name: str,
+        signal: Tensor,
+        observation: Tensor,
+        num_steps: int,
+        *,
+        standardise: bool = False,
+        **options: Any,
+    ) -> None:
+        generator = torch.Generator().manual_seed(self.seed)
+        options |= {"num_steps": num_steps, "digitise": False, "standardise": standardise, "generator": generator}
+        fit(self.models[name], signal, observation, **options)
+
+    def _score(self, name: str, started: float) -> None:
+        self.scores[name] = pixel_log_prob(self.models[name], *self.judging)
         self.seconds[name] += time.perf_counter() - started
 
     def _starts_most_likely(self, name: str) -> bool:
         return getattr(getattr(self.models[name], "model", self.models[name]), "starts_most_likely", False)
-
-    def learn_all(self, name: str, signal: Tensor, observation: Tensor, judging: Tensor, num_steps: int) -> None:
-        """Go on with the model of that name on all pixels; `judging` (N,) ones, which it has not learnt from, judge."""
-        share = _SHARE_FROM_MAXIMUM if self._starts_most_likely(name) else _SHARE_AGAIN
-        fit(
-            self.models[name],
-            signal,
-            observation,
-            held_out=judging,
-            num_steps=max(1, round(share * num_steps)),
-            learning_rate=_RATE_AGAIN,
-            digitise=False,
-            standardise=False,
-            generator=torch.Generator().manual_seed(self.seed),
-        )
 
     def _best(self) -> Tensor:
         return max(self.scores.values(), key=lambda score: float(score.mean()))
