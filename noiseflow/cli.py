@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _in_one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
+    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
     if isinstance(error, (ValueError, ModuleNotFoundError)):
         return text or type(error).__name__
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":

@@ -135,7 +135,11 @@ def _of_user(name: str) -> Denoiser:
         raise ValueError(f"denoiser {name}: cannot be imported ({error}); give package.module:function") from error
 
     def denoise(image: Array) -> Array:
-        result = np.asarray(function(image))
+        try:
+            result = np.asarray(function(image), dtype=np.float64)
+        except Exception as error:  # whatever another's code raises
+            problem = f"it failed on an image of shape {image.shape} with {type(error).__name__} ({error})"
+            raise ValueError(f"denoiser {name}: {problem}; it must take an image and return one") from error
         if result.shape != image.shape or not np.isfinite(result).all():
             raise ValueError(
                 f"denoiser {name}: it must return a finite image of shape {image.shape}; it gave {result.shape}"

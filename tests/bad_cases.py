@@ -120,6 +120,10 @@ reconstruct {bad}/nan.npy -o {out}/v.mrc | NaN
 reconstruct {bad}/inf.npy -o {out}/v.mrc | infinite
 reconstruct {bad}/flat.npy -o {out}/v.mrc | flat
 reconstruct {good}/tilts.mrc --angles {bad}/missing.tlt -o {out}/v.mrc | does not exist
+reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is no file
+reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is not an angle
+reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:system | it failed on an image
+reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:name | it failed on an image
 reconstruct {good}/tilts.mrc --angles {bad}/empty.tlt -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/blank.tlt -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/words.tlt -o {out}/v.mrc | line 1

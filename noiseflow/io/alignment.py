@@ -24,7 +24,9 @@ def read_transforms(path: str | Path) -> NDArray[np.float64]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"alignment file {path} does not exist; check the path")
+        raise FileNotFoundError(
+            f"alignment file {path} {'is no file' if path.exists() else 'does not exist'}; check the path"
+        )
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         if not line.strip():

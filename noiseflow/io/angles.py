@@ -27,7 +27,9 @@ def read_angles(path: str | Path) -> NDArray[np.float64]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"angle file {path} does not exist; check the path")
+        raise FileNotFoundError(
+            f"angle file {path} {'is no file' if path.exists() else 'does not exist'}; check the path"
+        )
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
     if not values:

@@ -85,7 +85,7 @@ def reconstruct(
         int | None, typer.Option(min=1, help="Reconstruct in blocks of so many slices, where memory is short.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
-    checkpoint_interval: Annotated[float, typer.Option(help="Seconds between checkpoints.")] = 60.0,
+    checkpoint_interval: Annotated[float, typer.Option(min=0, help="Seconds between checkpoints.")] = 60.0,
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
     fsc: Annotated[
         bool,
