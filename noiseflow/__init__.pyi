@@ -22,3 +22,5 @@ from .protocols import SignalModel as SignalModel
 from .scan_noise import ScanNoise as ScanNoise
 from .signal_models import KnownSignal as KnownSignal
 from .signal_models import StaticScene as StaticScene
+
+__version__: str

@@ -271,3 +271,11 @@ def test_package_modules_are_found_lazily() -> None:
     code = "import sys, noiseflow, recon, calibration; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "False", done.stdout + done.stderr
+
+
+def test_version_is_told_by_the_package_as_by_the_program(capsys: pytest.CaptureFixture[str]) -> None:
+    from noiseflow.cli import main
+
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out.split() == ["noiseflow", noiseflow.__version__]
