@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from noiseflow.modules import ArrayModel
 from noiseflow.picked import Signal, given_to, values_of
 
 _MOMENT_NODES = 257
+_MOMENT_COUNT = 2**18
 _LEAST_CLEAR, _RAILED = 256, 0.02
 
 
@@ -185,13 +187,17 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def mean(self) -> Tensor:
-        return self._moment(torch.zeros(()), 1)
+        return torch.stack([values.sum(0) for values in self._quantiles()]).sum(0) / _MOMENT_NODES
 
     @property
     def variance(self) -> Tensor:
-        return self._moment(self.mean, 2)
+        parts = list(self._quantiles())
+        mean = torch.stack([values.sum(0) for values in parts]).sum(0) / _MOMENT_NODES
+        return torch.stack([((values - mean) ** 2).sum(0) for values in parts]).sum(0) / _MOMENT_NODES
 
-    def _moment(self, about: Tensor, power: int) -> Tensor:
+    def _quantiles(self) -> Iterator[Tensor]:
+        """Readings at equally likely places, (some, *batch) at a time."""
         nodes = (torch.arange(_MOMENT_NODES, dtype=torch.float64) + 0.5) / _MOMENT_NODES
-        values = [self.icdf(torch.full(self.batch_shape, float(node))) for node in nodes]
-        return torch.stack([(value - about) ** power for value in values]).mean(0)
+        at_once = max(1, _MOMENT_COUNT // max(1, math.prod(self.batch_shape)))
+        for part in torch.split(nodes.float(), at_once):
+            yield self.icdf(part.view(-1, *[1] * len(self.batch_shape)).expand(-1, *self.batch_shape))

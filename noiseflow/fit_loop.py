@@ -29,6 +29,7 @@ _LOOK_COUNT = 20_000
 _FIXED_COUNT = 2**20
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
+_LEAST_BETWEEN_LOOKS = 4
 
 
 @described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
@@ -108,7 +109,7 @@ class FitLoop:
             self.table = self._make_table()
         if not joint and self.pixels.train.ndim == 1:
             self.fixed_part = self._compute_fixed_part()
-        check_every = max(1, num_steps // 20)
+        check_every = max(_LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
         if self.done == 0:
             self._judge(0)  # a good start must not be lost to worse steps
@@ -174,21 +175,25 @@ class FitLoop:
         return self.done >= 0.4 * schedule.num_steps and history.get(0, math.inf) <= min(history.values(), default=0.0)
 
     def _check_table(self, *, rarely: bool) -> None:
-        """A model that learns may outgrow its table; that is slow, and seen in every fifth look."""
+        """Signals may leave the table; a model that learns may outgrow it, but slowly: seen in every fifth look."""
         table = self.table
         if table is None:
             return
+        table.cover(self.noise_model, self._some_signals())
         if self.noise_optimiser is not None and (not rarely or len(self.result.history) % 5 == 0):
             table.check(self.noise_model)
         self.result.table_error = table.error
 
     def _make_table(self) -> ObservationTable:
-        with torch.no_grad():
-            signal = values_of(self._signal(thinned(self.pixels.train, 100_000)))
+        signal = self._some_signals()
         observed = self.pixels.observation[self.pixels.train]
         low = float(torch.minimum(signal.min(), observed.min()))
         high = float(torch.maximum(signal.max(), observed.max()))
         return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=self.resumed_table)
+
+    @torch.no_grad()
+    def _some_signals(self) -> Tensor:
+        return values_of(self._signal(thinned(self.pixels.train, 100_000)))
 
     def _signal_step(self, batch_size: int) -> bool:
         def loss() -> Tensor:

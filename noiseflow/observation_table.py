@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from noiseflow.tabulated import SIZES, Columns, Rows, interpolate, log_likelihood, mean_error
 
 _MAX_LEVELS = 1024
+_STRAY, _MARGIN = 1e-3, 0.2
 
 
 class ObservationTable:
@@ -80,6 +81,17 @@ class ObservationTable:
                 return
         self._size = min(errors, key=lambda size: errors[size])
         self.error = self._build(noise_model, *self._choices[self._size])
+
+    def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
+        """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
+        likelihood has no curvature, and where rails hide the observations nothing else would hold a signal back."""
+        low, high = (float(value) for value in torch.quantile(signal, signal.new_tensor([_STRAY, 1 - _STRAY])))
+        if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
+            return
+        margin = _MARGIN * max(self.high - self.low, high - low)
+        self.low = low - margin if low < self.low else self.low
+        self.high = high + margin if high > self.high else self.high
+        self._refine(noise_model)
 
     def check(self, noise_model: nn.Module) -> float:
         """Measure the error again, and refine the table where the model has outgrown it."""

@@ -95,7 +95,8 @@ class Columns:
         inside = inside if inside.numel() else observation
         start, stop = float(inside.min()) - rows.high, float(inside.max()) - rows.low
         coarse = torch.linspace(rows.low, rows.high, 65, dtype=observation.dtype, device=observation.device)
-        reach = 100 * float(noise_model(coarse).variance.detach().max().sqrt())
+        undigitised = getattr(noise_model, "model", noise_model)
+        reach = 100 * float(undigitised(coarse).variance.detach().max().sqrt())
         wide = stop - start > reach  # a few far outliers must not take the resolution from all others
         if wide:
             start, stop = max(start, -reach / 2), min(stop, reach / 2)

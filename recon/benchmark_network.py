@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Gaussian, fit
+from recon.alternation import block_mask
 from recon.fields import Field
-from recon.joint import JointReconstructor, block_mask
+from recon.joint import JointReconstructor
 from recon.paper_network import CoordinateDensity
 from recon.signal_model import TomographySignal
 from recon.tilt_series import TiltSeries, VolumeGrid

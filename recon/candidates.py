@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow import (
+    Digitisation,
     Digitised,
+    Gaussian,
     Mixture,
     PoissonGaussian,
     RadialFlow,
@@ -30,11 +32,21 @@ def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
     """
     digitisation = detect_digitisation(images)
     models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian()]
-    if float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) < _CLIPPED:
-        models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
-    else:
+    if _clipped(images, digitisation):
         models.append(RadialFlow(6, num_conditional=0, mean_preserving=True))
+    else:
+        models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
+
+
+def first_noise(images: NDArray[Any]) -> nn.Module:
+    """Simple noise to start a fit with: where clipping hides readings, least squares would take their mean for the signal."""
+    digitisation = detect_digitisation(images)
+    return Digitised(SignalDependentGaussian(), *digitisation) if _clipped(images, digitisation) else Gaussian()
+
+
+def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
+    return float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) >= _CLIPPED
 
 
 def learns(noise_model: nn.Module) -> bool:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import FitResult, Gaussian, fit
+from noiseflow import FitResult, fit
 from noiseflow.described import described
-from recon.candidates import learns, noise_candidates, num_steps_of, rate_of
+from recon.alternation import WARM, Alternation, Progress, frozen
+from recon.candidates import first_noise, learns, noise_candidates, num_steps_of
 from recon.coarse_start import coarse_start, learning_rate
 from recon.defocused_projector import with_defocus
 from recon.fields import Field, MultiresolutionField
@@ -28,12 +26,8 @@ from recon.signal_model import TomographySignal
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.weight import WeightChoice, choose_weight
 
-Progress = Callable[[int, str], None]
 _FIRST_WEIGHT = 0.4
 _TOLERATED = 0.003
-_SETTLING, _SETTLED = (40, 80, 160, 320), 0.03  # steps of least squares; nats per pixel
-_FIRST_TURN, _NEXT_TURN = 0.6, 0.5  # share of the steps; learning rate relative to the turn before
-_MOST_TURNS = 6
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
 
 
@@ -112,9 +106,9 @@ class JointReconstructor:
         if choice is not None:
             signal_model.weight = choice.weight
         task = self._task(signal_model, tilt_series)
-        if quiet and not isinstance(noise_model, Gaussian):
-            task.settle(thoroughly=True, progress=progress)
-        result = task.alternate(noise_model, num_steps=self.num_steps, progress=progress)
+        result = task.begin_and_alternate(
+            first_noise(tilt_series.images), noise_model, num_steps=self.num_steps, quiet=quiet, progress=progress
+        )
         return _finished(signal_model, noise_model, result, grid, choice)
 
     def prepare(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
@@ -154,13 +148,14 @@ class JointReconstructor:
             field, projector, image_formation, weight=weight, learning_rate=rate, occupancy=occupancy
         )
 
-    def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> _Task:
+    def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> Alternation:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
-        return _Task(signal_model, observation, use, self.seed, self.run_fit)
+        return Alternation(signal_model, observation, use, self.seed, self.run_fit)
 
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None, bool]:
-        """Noise model and weight, found on a slab like the response at the start, and whether there is little noise."""
+        """Noise model and weight, found on a slab, and whether there is little noise; the response learnt there is where the
+        whole starts."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -169,104 +164,24 @@ class JointReconstructor:
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
-        quiet = task.settle()
+        quiet = task.settle(first_noise(tilt_series.images))
         if given is not None and self.weight is not None and not learns(given):
             return given, None, quiet
-        noise_model = given if given is not None else _best_noise_model(task, noise_candidates(tilt_series.images))
-        task.alternate(noise_model, num_steps=80, standardise=given is not None)
-        task.refine(noise_model)
+        noise_model = (
+            _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
+        )
+        task.alternate(noise_model, num_steps=80, rate=WARM, standardise=given is not None)
         choice = None
-        with _frozen(noise_model):
-            if self.weight is None:
+        if self.weight is None:
+            with frozen(noise_model):
                 choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
-            else:
-                task.fit(noise_model, num_steps=80, standardise=False)
         # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
         task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
         return noise_model, choice, quiet
 
 
-class _Task:
-    """A signal model with its observations, those of them to use, and the pixels that judge it."""
-
-    def __init__(
-        self,
-        signal_model: TomographySignal,
-        observation: Tensor,
-        use: Tensor | None,
-        seed: int,
-        run_fit: Callable[..., FitResult],
-    ) -> None:
-        self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
-        self.generator = torch.Generator().manual_seed(seed)
-        self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
-
-    def fit(self, noise_model: nn.Module, *, known: bool = False, **options: Any) -> FitResult:
-        """Fit volume and noise model; with `known`, the noise model alone on the signal as it is."""
-        signal: Tensor | nn.Module = self.signal_model
-        if known:
-            with torch.no_grad():
-                signal = self.signal_model.signal().view_as(self.observation)
-        options = {"batch_size": 4096, "learning_rate": rate_of(noise_model)} | options
-        options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
-        return self.run_fit(noise_model, signal, self.observation, **options)
-
-    def settle(self, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:
-        """Least squares, longer and longer until held-out pixels gain little: what an unfinished signal misses would pass for
-        noise, and be left as it is. Returns whether it took long, as it does where there is little noise; then `thoroughly`
-        goes all the way, by smaller and smaller steps, as large ones may stop gaining long before the end."""
-        reached, rate = math.inf, self.signal_model.learning_rate
-        for num_steps in _SETTLING:
-            nll = self.fit(Gaussian().to(self.observation.device), num_steps=num_steps, progress=progress).held_out_nll
-            if thoroughly:
-                self.signal_model.learning_rate *= _NEXT_TURN
-            elif reached - nll < _SETTLED:
-                break
-            reached = nll
-        self.signal_model.learning_rate = rate
-        return num_steps > _SETTLING[1]
-
-    def alternate(
-        self, noise_model: nn.Module, *, num_steps: int, standardise: bool = False, progress: Progress | None = None
-    ) -> FitResult:
-        """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: twice, and on while
-        held-out pixels gain much, as they do where there is little noise.
-
-        Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
-        again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
-        wander with the few outliers of each batch, and drags the signal along.
-
-        Args:
-            noise_model: fitted in place.
-            num_steps: of the signal, the first two turns together.
-            standardise: fit the noise model from scratch first.
-            progress: called with the steps done and a note.
-        """
-        if standardise:
-            self.refine(noise_model, standardise=True)
-        rate, done, reached = self.signal_model.learning_rate, 0, math.inf
-        for turn in range(_MOST_TURNS):
-            share = _FIRST_TURN if turn == 0 else 1 - _FIRST_TURN
-            later = None if progress is None else partial(_continue, progress, done)
-            self.signal_model.learning_rate = rate * _NEXT_TURN**turn
-            with _frozen(noise_model):
-                result = self.fit(noise_model, num_steps=round(share * num_steps), standardise=False, progress=later)
-            done += result.num_steps
-            if turn > 0 and reached - result.held_out_nll < _SETTLED:
-                break
-            reached = result.held_out_nll
-            self.refine(noise_model)
-        self.signal_model.learning_rate = rate
-        return result
-
-    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
-        """Fit a noise model that learns to the signal as it is."""
-        if learns(noise_model):
-            self.fit(noise_model, known=True, num_steps=num_steps_of(noise_model, 60), standardise=standardise)
-
-
-def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module:
+def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
     """The simplest that predicts held-out pixels nearly as well as the best: what a richer one gains beyond may be a bias of the
     signal that it took for noise."""
     device = task.observation.device
@@ -276,33 +191,10 @@ def _best_noise_model(task: _Task, candidates: Sequence[nn.Module]) -> nn.Module
     return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
 
 
-def _continue(progress: Progress, done: int, step: int, note: str) -> None:
-    progress(done + step, note)
-
-
-def _held_out_nll(task: _Task, noise_model: nn.Module, weight: float) -> float:
+def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:
     task.signal_model.weight = weight
-    history = task.fit(noise_model, num_steps=100, standardise=False).history
+    history = task.fit_signal(noise_model, num_steps=80, rate=WARM).history
     return list(history.values())[-1]
-
-
-@contextmanager
-def _frozen(model: nn.Module) -> Iterator[None]:
-    learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    for parameter in learning:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in learning:
-            parameter.requires_grad_(True)
-
-
-def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
-    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away."""
-    tilts, *sides = shape
-    coarse = torch.rand((tilts, *(-(-side // block) for side in sides)), generator=generator) < share
-    return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:

@@ -8,11 +8,12 @@ import torch
 
 import noiseflow
 from recon import benchmark_needle
+from recon.alternation import block_mask
 from recon.candidates import noise_candidates
 from recon.fields import VoxelField
 from recon.first_guess import estimate_response
 from recon.image_formation import Linear, Transmission
-from recon.joint import JointReconstructor, block_mask
+from recon.joint import JointReconstructor
 from recon.metrics import compare
 from recon.phantoms import shells
 from recon.projector import SliceProjector

@@ -1,0 +1,170 @@
+"""Signal and noise model fitted by turns, each with the other held still."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow import FitResult
+from recon.candidates import learns, num_steps_of, rate_of
+from recon.signal_model import TomographySignal
+
+Progress = Callable[[int, str], None]
+# Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
+_SECOND, WARM = 0.5, 0.25
+_SETTLING = ((40, 1.0), (80, _SECOND), (160, _SECOND), (320, _SECOND))  # steps; learning rate
+_SETTLED = 0.03  # nats per pixel
+_STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
+_LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
+_MOST_TURNS = 6
+
+
+class Alternation:
+    """A signal model with its observations, those of them to use, and the pixels that judge it."""
+
+    def __init__(
+        self,
+        signal_model: TomographySignal,
+        observation: Tensor,
+        use: Tensor | None,
+        seed: int,
+        run_fit: Callable[..., FitResult],
+    ) -> None:
+        self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
+        self.generator = torch.Generator().manual_seed(seed)
+        self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
+
+    def fit(self, noise_model: nn.Module, *, known: bool = False, **options: Any) -> FitResult:
+        """Fit volume and noise model; with `known`, the noise model alone on the signal as it is."""
+        signal: Tensor | nn.Module = self.signal_model
+        if known:
+            with torch.no_grad():
+                signal = self.signal_model.signal().view_as(self.observation)
+        options = {"batch_size": 4096, "learning_rate": rate_of(noise_model)} | options
+        options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
+        return self.run_fit(noise_model, signal, self.observation, **options)
+
+    def fit_signal(self, noise_model: nn.Module, *, rate: float, **options: Any) -> FitResult:
+        """Fit volume and noise model at so many times the usual learning rate of the volume."""
+        usual = self.signal_model.learning_rate
+        self.signal_model.learning_rate = usual * rate
+        try:
+            return self.fit(noise_model, standardise=False, **options)
+        finally:
+            self.signal_model.learning_rate = usual
+
+    def begin_and_alternate(
+        self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, quiet: bool, progress: Progress | None
+    ) -> FitResult:
+        """A third of the steps with simple noise, which pulls at a rough signal steadily, and the rest with the model of choice.
+        Where there is little noise, the simple one settles the signal first."""
+        begun = min(_SETTLING[0][0], num_steps // 3)
+        with frozen(self.signal_model.image_formation):  # a rough volume would spoil it
+            if quiet:
+                self.settle(first, progress=progress)
+            elif begun:
+                self.settle(first, ((begun, 1.0),), progress=progress)
+        rate = WARM if quiet else _SECOND
+        return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
+
+    def settle(
+        self,
+        noise_model: nn.Module,
+        stages: Sequence[tuple[int, float]] = _SETTLING,
+        *,
+        progress: Progress | None = None,
+    ) -> bool:
+        """A fit with simple noise, longer and longer until held-out pixels gain little: what an unfinished signal misses would
+        pass for noise, and be left as it is. Returns whether it took all there is, as it does where there is little noise.
+
+        Args:
+            noise_model: the simple noise; learnt as well.
+            stages: steps and their learning rate, relative to the usual one.
+            progress: called with the steps of a stage and a note.
+        """
+        noise_model = noise_model.to(self.observation.device)
+        self.refine(noise_model, standardise=True)
+        reached = math.inf
+        for num_steps, rate in stages:
+            nll = self.fit_signal(noise_model, num_steps=num_steps, rate=rate, progress=progress).held_out_nll
+            if reached - nll < _SETTLED:
+                return False
+            reached = nll
+        return True
+
+    def alternate(
+        self,
+        noise_model: nn.Module,
+        *,
+        num_steps: int,
+        rate: float,
+        begun: int = 0,
+        standardise: bool = False,
+        progress: Progress | None = None,
+    ) -> FitResult:
+        """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: until the new signal
+        leaves the noise model as it was, or held-out pixels gain little.
+
+        Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
+        again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
+        wander with the few outliers of each batch, and drags the signal along.
+
+        Args:
+            noise_model: fitted in place.
+            num_steps: of the signal in the first turn; the next take less than half as many.
+            rate: of the first turn, relative to the usual learning rate.
+            begun: steps taken before.
+            standardise: fit the noise model from scratch first.
+            progress: called with the steps done and a note.
+        """
+        if standardise:
+            self.refine(noise_model, standardise=True)
+        done, reached = begun, math.inf
+        for turn in range(_MOST_TURNS):
+            steps = num_steps if turn == 0 else round(_LATER_TURN * num_steps)
+            later = None if progress is None else partial(_continue, progress, done)
+            with frozen(noise_model):
+                result = self.fit_signal(noise_model, num_steps=steps, rate=rate * _NEXT_RATE**turn, progress=later)
+            done += result.num_steps
+            if turn > 0 and reached - result.held_out_nll < _SETTLED:
+                break
+            reached = result.held_out_nll
+            if result.held_out_nll - self.refine(noise_model) < _STEADY:
+                break
+        return result
+
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> float:
+        """Fit a noise model that learns to the signal as it is; the held-out NLL reached, or −inf if it does not learn."""
+        if not learns(noise_model):
+            return -math.inf
+        options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
+        return self.fit(noise_model, known=True, **options).held_out_nll
+
+
+def _continue(progress: Progress, done: int, step: int, note: str) -> None:
+    progress(done + step, note)
+
+
+@contextmanager
+def frozen(model: nn.Module) -> Iterator[None]:
+    learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
+
+
+def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
+    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away."""
+    tilts, *sides = shape
+    coarse = torch.rand((tilts, *(-(-side // block) for side in sides)), generator=generator) < share
+    return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]
