@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -18,8 +18,9 @@ from recon.signal_model import TomographySignal
 Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
 _SECOND, WARM = 0.5, 0.25
-_SETTLING = ((40, 1.0), (80, _SECOND), (160, _SECOND), (320, _SECOND))  # steps; learning rate
+_SETTLING = (40, 80, 160, 320)  # steps
 _SETTLED = 0.03  # nats per pixel
+_QUIET = 0.2  # noise relative to contrast
 _STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
@@ -63,40 +64,46 @@ class Alternation:
         self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, quiet: bool, progress: Progress | None
     ) -> FitResult:
         """A third of the steps with simple noise, which pulls at a rough signal steadily, and the rest with the model of choice.
-        Where there is little noise, the simple one settles the signal first."""
-        begun = min(_SETTLING[0][0], num_steps // 3)
-        with frozen(self.signal_model.image_formation):  # a rough volume would spoil it
-            if quiet:
-                self.settle(first, progress=progress)
-            elif begun:
-                self.settle(first, ((begun, 1.0),), progress=progress)
+
+        Args:
+            first: the simple noise, learnt.
+            noise_model: the model of choice, learnt; fitted further in place.
+            num_steps: of the signal, unless it takes more turns.
+            quiet: whether there is little noise; the simple one then settles the signal first.
+            progress: called with the steps done and a note.
+        """
+        begun = min(_SETTLING[0], num_steps // 3)
+        if quiet:
+            self.settle(first, thoroughly=True, progress=progress)
+        elif begun:
+            with frozen(first):
+                self.fit_signal(first, num_steps=begun, rate=1.0, progress=progress)
         rate = WARM if quiet else _SECOND
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
 
-    def settle(
-        self,
-        noise_model: nn.Module,
-        stages: Sequence[tuple[int, float]] = _SETTLING,
-        *,
-        progress: Progress | None = None,
-    ) -> bool:
+    def settle(self, first: nn.Module, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:
         """A fit with simple noise, longer and longer until held-out pixels gain little: what an unfinished signal misses would
-        pass for noise, and be left as it is. Returns whether it took all there is, as it does where there is little noise.
+        pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before the end.
 
         Args:
-            noise_model: the simple noise; learnt as well.
-            stages: steps and their learning rate, relative to the usual one.
+            first: the simple noise; fitted in place.
+            thoroughly: go all the way.
             progress: called with the steps of a stage and a note.
+
+        Returns:
+            Whether there is little noise: what is left is small beside the contrast of the signal.
         """
-        noise_model = noise_model.to(self.observation.device)
-        self.refine(noise_model, standardise=True)
+        self.refine(first, standardise=True)
         reached = math.inf
-        for num_steps, rate in stages:
-            nll = self.fit_signal(noise_model, num_steps=num_steps, rate=rate, progress=progress).held_out_nll
-            if reached - nll < _SETTLED:
-                return False
+        for stage, num_steps in enumerate(_SETTLING):
+            nll = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress).held_out_nll
+            if not thoroughly and reached - nll < _SETTLED:
+                break
             reached = nll
-        return True
+        with torch.no_grad():
+            signal = self.signal_model.signal().view_as(self.observation)
+            residual = signal - self.observation if self.use is None else (signal - self.observation)[self.use]
+            return bool(residual.square().mean().sqrt() < _QUIET * signal.std())
 
     def alternate(
         self,

@@ -102,14 +102,14 @@ class JointReconstructor:
         signal_model = self.prepare(tilt_series, grid)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            noise_model, choice, quiet = self._choose(tilt_series, signal_model)
-        if choice is not None:
-            signal_model.weight = choice.weight
+            chosen = self._choose(tilt_series, signal_model)
+        if chosen.weight_choice is not None:
+            signal_model.weight = chosen.weight_choice.weight
         task = self._task(signal_model, tilt_series)
         result = task.begin_and_alternate(
-            first_noise(tilt_series.images), noise_model, num_steps=self.num_steps, quiet=quiet, progress=progress
+            chosen.first_noise, chosen.noise_model, num_steps=self.num_steps, quiet=chosen.quiet, progress=progress
         )
-        return _finished(signal_model, noise_model, result, grid, choice)
+        return _finished(signal_model, chosen, result, grid)
 
     def prepare(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The signal model before any fit: an almost empty field on the scale of the data."""
@@ -153,9 +153,8 @@ class JointReconstructor:
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
         return Alternation(signal_model, observation, use, self.seed, self.run_fit)
 
-    def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[nn.Module, WeightChoice | None, bool]:
-        """Noise model and weight, found on a slab, and whether there is little noise; the response learnt there is where the
-        whole starts."""
+    def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> _Chosen:
+        """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         rows = contrast_slab(tilt_series, self.slab)
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -164,12 +163,11 @@ class JointReconstructor:
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
-        quiet = task.settle(first_noise(tilt_series.images))
+        first = first_noise(tilt_series.images).to(self.device)
+        quiet = task.settle(first)
         if given is not None and self.weight is not None and not learns(given):
-            return given, None, quiet
-        noise_model = (
-            _best_noise_model(task, noise_candidates(tilt_series.images)) if given is None else given.to(self.device)
-        )
+            return _Chosen(given, None, first, quiet)
+        noise_model = given if given is not None else _best_noise_model(task, noise_candidates(tilt_series.images))
         task.alternate(noise_model, num_steps=80, rate=WARM, standardise=given is not None)
         choice = None
         if self.weight is None:
@@ -178,7 +176,17 @@ class JointReconstructor:
         # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
         task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
-        return noise_model, choice, quiet
+        return _Chosen(noise_model, choice, first, quiet)
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """What a slab tells: the noise model of choice, simple noise to begin with, and whether there is little of it."""
+
+    noise_model: nn.Module
+    weight_choice: WeightChoice | None
+    first_noise: nn.Module
+    quiet: bool
 
 
 def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
@@ -202,11 +210,9 @@ def _native(images: NDArray[Any], dtype: Any) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1), dtype=dtype))
 
 
-def _finished(
-    model: TomographySignal, noise_model: nn.Module, result: FitResult, grid: VolumeGrid, choice: WeightChoice | None
-) -> Reconstruction:
+def _finished(model: TomographySignal, chosen: _Chosen, result: FitResult, grid: VolumeGrid) -> Reconstruction:
     with torch.no_grad():
         volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
         shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
         projections = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-    return Reconstruction(volume, projections, noise_model, model, result, choice)
+    return Reconstruction(volume, projections, chosen.noise_model, model, result, chosen.weight_choice)

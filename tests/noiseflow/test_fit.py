@@ -177,6 +177,21 @@ def test_table_agrees_with_the_exact_likelihood(clipped: bool) -> None:
     assert float((found_slope - slope).abs().mean()) < 0.1 * float(slope.abs().mean())
 
 
+def test_table_widens_where_signals_leave_it() -> None:
+    model = noiseflow.Digitised(noiseflow.SignalDependentGaussian(), step=0.0, high=1.0)
+    signal = torch.linspace(0.2, 1.0, 5000)
+    observation = (signal + 0.2 * torch.randn(5000, generator=torch.Generator().manual_seed(0))).clamp(max=1.0)
+    model.standardise(signal, observation)
+    table = ObservationTable(model, observation, 0.2, 1.0)
+    brighter = (signal + 0.3).requires_grad_()
+    table.cover(model, brighter.detach())
+    exact = model(brighter).log_prob(observation)
+    (slope,) = torch.autograd.grad(exact.sum(), brighter)
+    (found,) = torch.autograd.grad(table.log_prob(brighter).sum(), brighter)
+    assert (table.log_prob(brighter) - exact).detach().abs().mean() < 2e-3
+    assert (found - slope).abs().mean() < 0.02 * slope.abs().mean()
+
+
 def test_held_out_pixels_do_not_depend_on_noise_of_the_same_seed() -> None:
     signal = gradient_image()
     observation = noiseflow.Gaussian(0.1)(signal).sample(generator=torch.Generator().manual_seed(0))
