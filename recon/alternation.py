@@ -82,8 +82,9 @@ class Alternation:
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
 
     def settle(self, first: nn.Module, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:
-        """A fit with simple noise, longer and longer until held-out pixels gain little: what an unfinished signal misses would
-        pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before the end.
+        """A fit with simple noise, longer and longer until held-out pixels gain little in its second half: what an unfinished
+        signal misses would pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before
+        the end.
 
         Args:
             first: the simple noise; fitted in place.
@@ -94,12 +95,11 @@ class Alternation:
             Whether there is little noise: what is left is small beside the contrast of the signal.
         """
         self.refine(first, standardise=True)
-        reached = math.inf
         for stage, num_steps in enumerate(_SETTLING):
-            nll = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress).held_out_nll
-            if not thoroughly and reached - nll < _SETTLED:
+            result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
+            history = list(result.history.values())
+            if not thoroughly and stage > 0 and history[len(history) // 2] - min(history) < _SETTLED:
                 break
-            reached = nll
         with torch.no_grad():
             signal = self.signal_model.signal().view_as(self.observation)
             residual = signal - self.observation if self.use is None else (signal - self.observation)[self.use]

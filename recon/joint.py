@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import FitResult, fit
+from noiseflow import FitResult, Gaussian, fit
 from noiseflow.described import described
 from recon.alternation import WARM, Alternation, Progress, frozen
 from recon.candidates import first_noise, learns, noise_candidates, num_steps_of
@@ -163,18 +163,18 @@ class JointReconstructor:
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
-        first = first_noise(tilt_series.images).to(self.device)
+        first = given if isinstance(given, Gaussian) else first_noise(tilt_series.images).to(self.device)
         quiet = task.settle(first)
         if given is not None and self.weight is not None and not learns(given):
             return _Chosen(given, None, first, quiet)
         noise_model = given if given is not None else _best_noise_model(task, noise_candidates(tilt_series.images))
-        task.alternate(noise_model, num_steps=80, rate=WARM, standardise=given is not None)
+        task.alternate(noise_model, num_steps=60, rate=WARM, standardise=given is not None)
         choice = None
         if self.weight is None:
             with frozen(noise_model):
                 choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
-        # only now is the signal as good as the fit of the whole will begin with: a worse one bends the noise at its bright end
-        task.refine(noise_model)
+            # only now is the signal as good as that of the whole will be: a worse one bends the noise at its bright end
+            task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
         return _Chosen(noise_model, choice, first, quiet)
 
@@ -191,12 +191,17 @@ class _Chosen:
 
 def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
     """The simplest that predicts held-out pixels nearly as well as the best: what a richer one gains beyond may be a bias of the
-    signal that it took for noise."""
-    device = task.observation.device
-    nll = [
-        task.fit(model.to(device), known=True, num_steps=num_steps_of(model, 100)).held_out_nll for model in candidates
-    ]
-    return next(model for model, each in zip(candidates, nll, strict=True) if each <= min(nll) + _TOLERATED)
+    signal that it took for noise. Where the richest gains nothing, those between are not tried."""
+    simplest, *between, richest = (model.to(task.observation.device) for model in candidates)
+
+    def nll(model: nn.Module) -> float:
+        return task.fit(model, known=True, num_steps=num_steps_of(model, 100)).held_out_nll
+
+    found = {simplest: nll(simplest), richest: nll(richest)}
+    if found[simplest] <= found[richest] + _TOLERATED:
+        return simplest
+    found = {model: found.get(model) or nll(model) for model in (simplest, *between, richest)}
+    return next(model for model, each in found.items() if each <= min(found.values()) + _TOLERATED)
 
 
 def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:
