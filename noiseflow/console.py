@@ -109,14 +109,15 @@ def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
 
 
 class _Rate:
-    """Steps per second of the work at hand; a new title starts a new measurement."""
+    """Steps per second of the work at hand; a new title, or a count that falls, starts a new measurement."""
 
-    title, first, started = "", 0, 0.0
+    title, first, last, started = "", 0, 0, 0.0
 
     def __call__(self, title: str, done: int) -> float:
         now = time.monotonic()
-        if title != self.title:
+        if title != self.title or done < self.last:
             self.title, self.first, self.started = title, done - 1, now
+        self.last = done
         return (done - self.first - 1) / (now - self.started) if now > self.started else 0.0
 
 

@@ -80,7 +80,8 @@ class Targets:
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
-            | ({"held_out_nll": fit.held_out_nll, "seconds": fit.seconds} if fit else {})
+            | {"seconds": seconds}
+            | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
 
 
