@@ -17,7 +17,7 @@ from recon.signal_model import TomographySignal
 
 Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
-_SECOND, WARM = 0.5, 0.25
+SECOND, WARM = 0.5, 0.25
 _SETTLING = (40, 80, 160, 320)  # steps
 _SETTLED = 0.03  # nats per pixel
 _QUIET = 0.2  # noise relative to contrast
@@ -78,7 +78,7 @@ class Alternation:
         elif begun:
             with frozen(first):
                 self.fit_signal(first, num_steps=begun, rate=1.0, progress=progress)
-        rate = WARM if quiet else _SECOND
+        rate = WARM if quiet else SECOND
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
 
     def settle(self, first: nn.Module, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:

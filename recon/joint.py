@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, Gaussian, fit
 from noiseflow.described import described
-from recon.alternation import WARM, Alternation, Progress, frozen
+from recon.alternation import SECOND, WARM, Alternation, Progress, frozen
 from recon.candidates import first_noise, learns, noise_candidates, num_steps_of
 from recon.coarse_start import coarse_start, learning_rate
 from recon.defocused_projector import with_defocus
@@ -206,7 +206,7 @@ def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.
 
 def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:
     task.signal_model.weight = weight
-    history = task.fit_signal(noise_model, num_steps=80, rate=WARM).history
+    history = task.fit_signal(noise_model, num_steps=80, rate=SECOND).history
     return list(history.values())[-1]
 
 

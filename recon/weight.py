@@ -26,31 +26,35 @@ class WeightChoice:
 def choose_weight(
     held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8
 ) -> WeightChoice:
-    """Find the weight of the lowest held-out NLL: bracket it on a geometric ladder, then the vertex of a parabola.
+    """Find the weight of the lowest held-out NLL: a geometric ladder brackets it, then half rungs, then the vertex of a parabola.
 
     Args:
         held_out_nll: fits with a weight and returns its held-out NLL.
         first: where to start.
         factor: between neighbouring rungs.
-        most: fits to spend; the lowest rung counts where they do not suffice to bracket.
+        most: fits to spend on the ladder; the lowest rung counts where they do not suffice to bracket.
     """
-    tried: dict[int, float] = {}
+    tried: dict[float, float] = {}
 
-    def visit(rung: int) -> float:
-        if rung not in tried:
-            nll = held_out_nll(first * factor**rung)
-            tried[rung] = nll if math.isfinite(nll) else math.inf
-        return tried[rung]
+    def visit(rung: float) -> None:
+        nll = held_out_nll(first * factor**rung)
+        tried[rung] = nll if math.isfinite(nll) else math.inf
 
-    visit(0)
-    best = 0
+    def lowest() -> float:
+        return min(tried, key=lambda rung: tried[rung])
+
+    visit(0.0)
     while len(tried) < most:
-        missing = [rung for rung in (best + 1, best - 1) if rung not in tried]
+        middle = lowest()
+        missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
         if not missing:
+            # the NLL rises faster above than below: a parabola through whole rungs would lean to weights too low
+            for side in (-0.5, 0.5):
+                visit(middle + side)
             break
         visit(missing[0])
-        best = min(tried, key=lambda rung: tried[rung])
-    weight = first * factor ** (best + _vertex(*(tried.get(best + side, math.inf) for side in (-1, 0, 1))))
+    best = lowest()
+    weight = first * factor ** (best + 0.5 * _vertex(*(tried.get(best + side, math.inf) for side in (-0.5, 0.0, 0.5))))
     return WeightChoice(weight, {first * factor**rung: nll for rung, nll in tried.items()})
 
 

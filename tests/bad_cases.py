@@ -143,7 +143,6 @@ reconstruct {good}/tilts.mrc --thickness 0 -o {out}/v.mrc | thickness
 reconstruct {good}/tilts.mrc --thickness -4 -o {out}/v.mrc | thickness
 reconstruct {good}/tilts.mrc --weight -1 -o {out}/v.mrc | zero or more
 reconstruct {good}/tilts.mrc --weight nan -o {out}/v.mrc | zero or more
-reconstruct {good}/tilts.mrc --checkpoint-interval nan -o {out}/v.mrc | number of seconds
 reconstruct {good}/tilts.mrc --noise-model {bad}/missing.safetensors -o {out}/v.mrc | does not exist
 reconstruct {good}/tilts.mrc --noise-model {bad}/future.safetensors -o {out}/v.mrc | update noiseflow
 reconstruct {good}/tilts.mrc --report {bad}/empty.mrc -o {out}/v.mrc | is a file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -144,8 +143,6 @@ def reconstruct(
         fixed = load_noise_model(noise_model)
         options |= {"noise_model": fixed, "device": choose_device(device)}
         output.line(memory_line(tilt_series, grid, method, options["device"], slices_at_once))
-        if not math.isfinite(checkpoint_interval):
-            raise ValueError(f"--checkpoint-interval {checkpoint_interval:g}: give a number of seconds")
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
         with stoppable(journal, context), scratch_beside(out) as scratch:
