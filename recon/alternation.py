@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult
-from recon.candidates import learns, num_steps_of, rate_of
+from recon.candidates import is_stiff, learns, num_steps_of, rate_of
 from recon.signal_model import TomographySignal
 
 Progress = Callable[[int, str], None]
@@ -120,7 +120,8 @@ class Alternation:
 
         Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
         again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
-        wander with the few outliers of each batch, and drags the signal along.
+        wander with the few outliers of each batch, and drags the signal along. Noise of a fixed shape cannot, and learns with the
+        signal: behind a rail its width and the incident intensity go together, and by turns they would take for ever.
 
         Args:
             noise_model: fitted in place.
@@ -136,7 +137,7 @@ class Alternation:
         for turn in range(_MOST_TURNS):
             steps = num_steps if turn == 0 else round(_LATER_TURN * num_steps)
             later = None if progress is None else partial(_continue, progress, done)
-            with frozen(noise_model):
+            with nullcontext() if is_stiff(noise_model) else frozen(noise_model):
                 result = self.fit_signal(noise_model, num_steps=steps, rate=rate * _NEXT_RATE**turn, progress=later)
             done += result.num_steps
             if turn > 0 and reached - result.held_out_nll < _SETTLED:

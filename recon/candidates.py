@@ -54,6 +54,12 @@ def learns(noise_model: nn.Module) -> bool:
     return any(parameter.requires_grad for parameter in noise_model.parameters())
 
 
+def is_stiff(noise_model: nn.Module) -> bool:
+    """Whether the noise has one shape and only its width is learnt."""
+    base = noise_model.model if isinstance(noise_model, Digitised) else noise_model
+    return isinstance(base, Gaussian | SignalDependentGaussian)
+
+
 def num_steps_of(noise_model: nn.Module, usual: int) -> int:
     """The exact sum over electrons takes long, but it starts at its most likely parameters."""
     exact = any(isinstance(module, PoissonGaussian) for module in noise_model.modules())
