@@ -145,7 +145,7 @@ class PolynomialMixture(ArrayModel):
         return MixtureDistribution(signal, self.components_at, model=self)
 
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, (*signal.shape, K)."""
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``."""
         t = ((signal - self.low) / (self.high - self.low))[..., None, None]
         powers = t ** torch.arange(self.raw.shape[-1], device=signal.device)
         centre, log_weight = ((self.raw[row] * powers).sum(-1) for row in (0, 2))

@@ -53,7 +53,7 @@ class Mixture(ArrayModel):
         return MixtureDistribution(signal, self.components_at, model=self)
 
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, (*signal.shape, K); means and scales in detector units."""
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``; means and scales in detector units."""
         coordinate = self.standardisation.coordinate(signal)
         location, log_scale = self.standardisation(coordinate)
         with torch.autocast(coordinate.device.type, enabled=False):
