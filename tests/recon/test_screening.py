@@ -73,7 +73,7 @@ def test_drift_of_the_beam_is_estimated(noise, error):
 @pytest.mark.slow
 def test_reconstruction_with_the_beam_is_nearly_as_good_as_without_drift():
     truth, clean, noisy = scene("gaussian", size=32)
-    beam = np.exp(0.1 * np.random.default_rng(2).normal(size=len(ANGLES)))
+    beam = np.exp(0.2 * np.random.default_rng(2).normal(size=len(ANGLES)))
     drifting = noisy(replace(clean, images=(clean.images * beam[:, None, None]).astype(np.float32)))
     passed = screen(drifting).passed(drifting)
     psnr = {}
