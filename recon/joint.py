@@ -200,8 +200,9 @@ def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.
     found = {simplest: nll(simplest), richest: nll(richest)}
     if found[simplest] <= found[richest] + _TOLERATED:
         return simplest
-    found = {model: found.get(model) or nll(model) for model in (simplest, *between, richest)}
-    return next(model for model, each in found.items() if each <= min(found.values()) + _TOLERATED)
+    found |= {model: nll(model) for model in between}
+    good_enough = min(found.values()) + _TOLERATED
+    return next(model for model in (simplest, *between, richest) if found[model] <= good_enough)
 
 
 def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:
