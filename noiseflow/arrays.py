@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -11,15 +11,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Given = TypeVar("Given", Tensor, NDArray[Any])
+
+
+class Kind(Protocol):
+    """What has a number type and a device, as tensors do."""
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+    @property
+    def device(self) -> torch.device: ...
+
+
 _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
 
 
-def as_tensor(data: Tensor | NDArray[Any], *, like: Tensor | None = None) -> Tensor:
+def as_tensor(data: Tensor | NDArray[Any], *, like: Kind | None = None) -> Tensor:
     """A tensor of a tensor or an array; memory is shared where it can be.
 
     Args:
         data: real numbers or booleans, any shape; a tensor is returned as it is.
-        like: take the number type and device of this tensor over, for arrays alone.
+        like: take the number type and device of this tensor or projector over, for arrays alone.
 
     Raises:
         ValueError: the array's numbers are not real.

@@ -85,7 +85,8 @@ class ObservationTable:
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
         """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
         likelihood has no curvature, and where rails hide the observations nothing else would hold a signal back."""
-        low, high = (float(value) for value in torch.quantile(signal, signal.new_tensor([_STRAY, 1 - _STRAY])))
+        stray = int(_STRAY * signal.numel())
+        low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
         if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
             return
         margin = _MARGIN * max(self.high - self.low, high - low)

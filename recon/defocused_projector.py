@@ -47,7 +47,8 @@ class DefocusedProjector:
     def __init__(self, projector: SliceProjector, convergence: float, *, most_layers: int = _MOST_LAYERS) -> None:
         if not 0 <= convergence < math.inf:
             raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
-        self.tilt_angles, self.num_tilts, self.matrix = projector.tilt_angles, projector.num_tilts, projector.matrix
+        self.tilt_angles, self.num_tilts = projector.tilt_angles, projector.num_tilts
+        self.dtype, self.device = projector.dtype, projector.device
         self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
         farthest = convergence * math.hypot(self.depth - 1, self.width - 1) / 2
         count = min(most_layers, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))

@@ -45,7 +45,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
 def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
     """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
     images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.matrix.device)
+    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.device)
     with torch.no_grad():
         return sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
+from recon.sparse import PanelledMatrix
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+_PANEL = 32  # layers along z, or tilts
 
 
 class SliceProjector:
@@ -66,17 +65,34 @@ class SliceProjector:
         self.depth, self.width, self.detector_width = depth, width, detector_width
         self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
         rays, voxels, weights = _joseph(angles, self.detector_offset, depth, width, detector_width)
-        shape = (angles.size * detector_width, depth * width)
-        self.matrix = _csr(rays, voxels, weights, shape).to(device=device, dtype=dtype)
-        self.transposed = _csr(voxels, rays, weights, shape[::-1]).to(device=device, dtype=dtype)
+        self._set_entries(rays, voxels, weights, device=device, dtype=dtype)
 
     def __repr__(self) -> str:
         low, high = self.tilt_angles.min(), self.tilt_angles.max()
-        kind = str(self.matrix.dtype).removeprefix("torch.")
+        kind = str(self.dtype).removeprefix("torch.")
         return (
             f"SliceProjector({self.num_tilts} tilts {low:g}° to {high:g}°, {self.depth} x {self.width} voxels (z, x) to "
-            f"{self.detector_width} pixels, {kind} on {self.matrix.device})"
+            f"{self.detector_width} pixels, {kind} on {self.device})"
         )
+
+    def _set_entries(
+        self, rays: NDArray[np.int64], voxels: NDArray[np.int64], weights: NDArray[np.float64], **kind: Any
+    ) -> None:
+        shape = (self.num_tilts * self.detector_width, self.depth * self.width)
+        whole = torch.device(kind["device"]).type != "cpu"
+        panels = shape[::-1] if whole else (_PANEL * self.width, _PANEL * self.detector_width)
+        self.matrix = PanelledMatrix.of(rays, voxels, weights, shape, panel=panels[0]).to(**kind)
+        self.transposed = PanelledMatrix.of(voxels, rays, weights, shape[::-1], panel=panels[1]).to(**kind)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the matrix lives."""
+        return self.matrix.panels[0].device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number type of the matrix."""
+        return self.matrix.panels[0].dtype
 
     @property
     def num_tilts(self) -> int:
@@ -95,13 +111,13 @@ class SliceProjector:
 
     def __call__(self, attenuation: Given) -> Given:
         """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
-        volume = as_tensor(attenuation, like=self.matrix)
+        volume = as_tensor(attenuation, like=self)
         _require(volume, "attenuation (z, y, x)", self.depth, self.width)
         return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
 
     def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
         """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
-        images = as_tensor(line_integrals, like=self.matrix)
+        images = as_tensor(line_integrals, like=self)
         _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
         return alike(from_columns(self.backproject(to_rays(images)), self.depth), line_integrals)
 
@@ -111,28 +127,21 @@ class SliceProjector:
         Args:
             layer_of: from distances along the beam beyond the tilt axis, voxels, to the numbers of layers, 0 and up.
         """
-        rays = np.repeat(np.arange(self.matrix.shape[0]), self.matrix.crow_indices().diff().cpu().numpy())
-        voxels = self.matrix.col_indices().cpu().numpy().astype(np.int64)
-        weights = self.matrix.values().double().cpu().numpy()
+        rays, voxels, weights = self.matrix.entries()
         theta = np.deg2rad(self.tilt_angles)[rays // self.detector_width]
         z, x = voxels // self.width - (self.depth - 1) / 2, voxels % self.width - (self.width - 1) / 2
         layer = layer_of(z * np.cos(theta) - x * np.sin(theta))
         parts = []
         for number in range(int(layer.max(initial=0)) + 1):
             here, part = layer == number, copy.copy(self)
-            part.matrix = _csr(rays[here], voxels[here], weights[here], self.matrix.shape).to(self.matrix)
-            part.transposed = _csr(voxels[here], rays[here], weights[here], self.transposed.shape).to(self.matrix)
+            part._set_entries(rays[here], voxels[here], weights[here], device=self.device, dtype=self.dtype)
             parts.append(part)
         return parts
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """The matrix of some columns of the lattice, (n,) indices z·width + x, and its transpose."""
-        from scipy.sparse import csr_array
-
-        back = self.transposed
-        parts = (part.cpu().numpy() for part in (back.values(), back.col_indices(), back.crow_indices()))
-        chosen = csr_array(tuple(parts), shape=tuple(back.shape))[columns.cpu().numpy()]
-        return _as_tensor(chosen.T.tocsr()).to(self.matrix), _as_tensor(chosen).to(self.matrix)
+        transposed, matrix = self.transposed.some_rows(columns)
+        return matrix, transposed
 
 
 def to_columns(volume: Tensor) -> Tensor:
@@ -155,7 +164,7 @@ class _Product(torch.autograd.Function):
     """Sparse times dense; its gradient is the transposed product, and the gradient's gradient the product again."""
 
     @staticmethod
-    def forward(ctx: Any, dense: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
+    def forward(ctx: Any, dense: Tensor, matrix: PanelledMatrix, transposed: PanelledMatrix) -> Tensor:
         ctx.matrices = matrix, transposed
         return matrix @ dense
 
@@ -190,26 +199,6 @@ def _joseph(
             voxels.append(row * width + across if along_z else across * width + row)
             weights.append(share[inside] * step)
     return np.concatenate(rays), np.concatenate(voxels), np.concatenate(weights)
-
-
-def _csr(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[np.float64], shape: tuple[int, ...]
-) -> Tensor:
-    from scipy.sparse import csr_array
-
-    return _as_tensor(csr_array((values, (rows, columns)), shape=shape))
-
-
-def _as_tensor(matrix: csr_array) -> Tensor:
-    matrix.sort_indices()
-    with warnings.catch_warnings():  # torch announces that CSR is in beta
-        warnings.simplefilter("ignore")
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int32)),
-            torch.from_numpy(matrix.indices.astype(np.int32)),
-            torch.from_numpy(matrix.data),
-            size=matrix.shape,
-        )
 
 
 def _require(tensor: Tensor, what: str, first: int, last: int) -> None:

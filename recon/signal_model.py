@@ -120,11 +120,14 @@ class TomographySignal(Described):
         if torch.is_grad_enabled():
             return self.signal()[pixels]
         # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
-        version = tuple(parameter._version for parameter in self.parameters())
-        if self._seen is None or self._seen[0] != version:
-            signal = self.signal()
-            self._seen = version, signal
+        if self._seen is None or self._seen[0] != self._changes:
+            signal = self.signal()  # which may set a response that is matched to it
+            self._seen = self._changes, signal
         return self._seen[1][pixels]
+
+    @property
+    def _changes(self) -> tuple[int, ...]:
+        return tuple(parameter._version for parameter in self.parameters())
 
     def penalty(self) -> Tensor:
         """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""

@@ -30,12 +30,12 @@ def sirt(
         (z, y, x) attenuation per voxel, of the kind given.
     """
     A = projector
-    y = as_tensor(line_integrals, like=A.matrix)
+    y = as_tensor(line_integrals, like=A)
     ones = torch.ones((A.depth, 1, A.width), dtype=y.dtype, device=y.device)
     R = _inverse(A(ones))
     C = _inverse(A.T(torch.ones_like(R)))
     empty = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device)
-    x = empty if start is None else as_tensor(start, like=A.matrix)
+    x = empty if start is None else as_tensor(start, like=A)
     for _ in range(num_iterations):
         x = x + C * A.T(R * (y - A(x)))
         if minimum is not None:

@@ -44,7 +44,7 @@ def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp
         raise ValueError(f"window '{window}': choose one of {', '.join(WINDOWS)}")
     if not 0 < cutoff <= 1:
         raise ValueError(f"cutoff {cutoff} must be above 0 and at most 1, a fraction of the Nyquist frequency")
-    images = as_tensor(line_integrals, like=projector.matrix)
+    images = as_tensor(line_integrals, like=projector)
     count = images.shape[-1]
     padded = 2 ** math.ceil(math.log2(2 * count))
     response = _filter(padded, window, cutoff, like=images)

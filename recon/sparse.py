@@ -1,0 +1,108 @@
+"""A sparse matrix that is multiplied panel by panel, so that what a row gathers stays within reach."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from itertools import accumulate, pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_WIDEST = 256
+
+
+class PanelledMatrix:
+    """Panels of neighbouring columns in compressed rows, stored one by one; together they are the matrix.
+
+    A row of the whole matrix would gather lines from all over a volume larger than any cache, each from another page of memory.
+    A row of a panel gathers from few, and its neighbour gathers from nearly the same ones: at 256³ that is four times faster.
+
+    Args:
+        panels: sparse CSR tensors of as many rows, side by side.
+    """
+
+    def __init__(self, panels: Sequence[Tensor]) -> None:
+        self.panels = list(panels)
+        ends = accumulate((panel.shape[1] for panel in self.panels), initial=0)
+        self._spans = [slice(*span) for span in pairwise(ends)]
+
+    @staticmethod
+    def of(
+        rows: NDArray[np.int64],
+        columns: NDArray[np.int64],
+        values: NDArray[np.floating[Any]],
+        shape: tuple[int, ...],
+        *,
+        panel: int,
+    ) -> PanelledMatrix:
+        """The matrix of some entries, those of the same place added up, in panels of `panel` columns."""
+        from scipy.sparse import csr_array
+
+        number, panels = columns // panel, []
+        for start in range(0, shape[1], panel):
+            here = number == start // panel
+            size = (shape[0], min(panel, shape[1] - start))
+            panels.append(_as_tensor(csr_array((values[here], (rows[here], columns[here] - start)), shape=size)))
+        return PanelledMatrix(panels)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.panels[0].shape[0], self._spans[-1].stop
+
+    @property
+    def num_entries(self) -> int:
+        """How many entries are stored."""
+        return sum(panel.values().numel() for panel in self.panels)
+
+    def to(self, *, device: torch.device | str, dtype: torch.dtype) -> PanelledMatrix:
+        """The same on another device, with numbers of another type."""
+        return PanelledMatrix([panel.to(device=device, dtype=dtype) for panel in self.panels])
+
+    def __matmul__(self, dense: Tensor) -> Tensor:
+        """(columns, n) -> (rows, n)."""
+        if dense.shape[0] != self.shape[1]:
+            raise ValueError(f"{dense.shape[0]} rows do not match the matrix's {self.shape[1]} columns")
+        result = dense.new_empty(self.shape[0], dense.shape[1])
+        for start in range(0, dense.shape[1], _WIDEST):
+            part = result[:, start : start + _WIDEST]
+            for number, (panel, span) in enumerate(zip(self.panels, self._spans, strict=True)):
+                torch.addmm(part, panel, dense[span, start : start + _WIDEST], beta=min(number, 1), out=part)
+        return result
+
+    def entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Row, column and value of every entry."""
+        found = []
+        for panel, span in zip(self.panels, self._spans, strict=True):
+            rows = np.repeat(np.arange(self.shape[0]), panel.crow_indices().diff().cpu().numpy())
+            found.append((rows, panel.col_indices().cpu().numpy() + np.int64(span.start), panel.values().cpu().numpy()))
+        rows, columns, values = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return rows, columns, values.astype(np.float64)
+
+    def some_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The matrix of some rows, (n,) indices, and its transpose; CSR tensors in one piece, for few rows reach few lines."""
+        from scipy.sparse import csr_array, hstack
+
+        chosen = []
+        for panel in self.panels:
+            parts = tuple(p.cpu().numpy() for p in (panel.values(), panel.col_indices(), panel.crow_indices()))
+            chosen.append(csr_array(parts, shape=tuple(panel.shape))[rows.cpu().numpy()])
+        whole = hstack(chosen, format="csr")
+        like = self.panels[0]
+        return _as_tensor(whole).to(like), _as_tensor(whole.T.tocsr()).to(like)
+
+
+def _as_tensor(matrix: Any) -> Tensor:
+    matrix.sort_indices()
+    with warnings.catch_warnings():  # torch announces that CSR is in beta
+        warnings.simplefilter("ignore")
+        return torch.sparse_csr_tensor(
+            torch.from_numpy(matrix.indptr.astype(np.int32)),
+            torch.from_numpy(matrix.indices.astype(np.int32)),
+            torch.from_numpy(matrix.data),
+            size=matrix.shape,
+        )
