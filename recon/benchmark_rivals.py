@@ -247,7 +247,7 @@ def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
     """Error against time on one set of axes; the oracle's best is a line."""
     from noiseflow.report import new_figure
 
-    figure, axes = new_figure(1, width=8.5, height=5.2)
+    figure, axes = new_figure(1, width=10.5, height=5.2)
     axis = axes[0][0]
     colours = iter(["#0b5fa5", "#d1495b", "#2a9d5c", "#e08e0b", "#7b4fb0", "#3d3d3d", "#0aa3a3", "#b05f7b", "#8a8a00"])
     for name, points in curves_of_methods.items():
@@ -257,12 +257,19 @@ def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
         if name == "oracle":
             axis.axhline(max(psnr), color="black", linestyle="--", linewidth=1, label="oracle: true noise known")
         elif name.startswith("WBP"):
-            axis.plot(seconds, psnr, "x", color="grey", markersize=5, label=f"{name}" if name == "WBP hann" else None)
+            axis.plot(
+                seconds,
+                psnr,
+                "x",
+                color="grey",
+                markersize=5,
+                label="WBP, window by window" if name == "WBP hann" else None,
+            )
         else:
             bold = name == "joint"
             style = {"linewidth": 2.6 if bold else 1.3, "marker": "o", "markersize": 5 if bold else 3.5}
             axis.plot(seconds, psnr, color=next(colours), label=name, **style)
     axis.set(xscale="log", xlabel="wall time (s)", ylabel="PSNR of the volume, affinely matched (dB)", title=title)
     axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=8, loc="lower right")
+    axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure

@@ -15,6 +15,7 @@ from recon.rays import march, view_matrices, view_rays
 
 _SUBPIXEL = 0.25
 _MOST_LAYERS = 12
+_REACH = 6  # standard deviations at which a kernel ends
 
 
 def with_defocus(projector: SliceProjector, convergence: float) -> SliceProjector | DefocusedProjector:
@@ -60,6 +61,11 @@ class DefocusedProjector:
 
     def __repr__(self) -> str:
         return f"DefocusedProjector({self._layers[0]!r}, convergence {self.convergence:g}, {len(self.blurs)} layers)"
+
+    @property
+    def reach(self) -> int:
+        """How many slices away the blur is felt."""
+        return _reach(max(self.blurs))
 
     def project(self, columns: Tensor) -> Tensor:
         """Native layout: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
@@ -119,9 +125,13 @@ def jittered_projection(
     return total / num_rays
 
 
+def _reach(deviation: float) -> int:
+    return math.ceil(_REACH * deviation) + 1
+
+
 def _gaussian_matrix(size: int, deviation: float, *, like: Tensor) -> Tensor:
     """Symmetric (size, size): a sampled Gaussian of unit sum; what it carries over the edges is lost."""
-    reach = torch.arange(-math.ceil(6 * deviation) - 1, math.ceil(6 * deviation) + 2, dtype=torch.float64)
+    reach = torch.arange(-_reach(deviation), _reach(deviation) + 1, dtype=torch.float64)
     position = torch.arange(size, dtype=torch.float64)
     weights = torch.exp(-((position[:, None] - position) ** 2) / (2 * deviation**2))
     return (weights / torch.exp(-(reach**2) / (2 * deviation**2)).sum()).to(like)

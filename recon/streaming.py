@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.io.partials import clear_leftovers, partial_prefix
-from recon.defocus import defocused
+from recon.defocused_projector import DefocusedProjector, with_defocus
 from recon.phantoms import make_phantom
 from recon.projector import SliceProjector
 from recon.simulation import Acquisition, draw_noise, stored_type
@@ -38,7 +38,7 @@ class Simulation:
         acquisition: how images are formed.
         noise_model: the noise on the ``clean`` stack, or None.
         seed: of the phantom and of the noise.
-        defocus: blur of the ``clean`` stack away from the tilt axis, see `recon.defocus.defocus_widths`; the others stay sharp.
+        defocus: blur of the ``clean`` stack by depth, see `recon.defocused_projector.DefocusedProjector`; the others stay sharp.
     """
 
     phantom: str
@@ -112,16 +112,19 @@ class _Writer:
         return unit
 
     def _project(self, name: str, truth: Array) -> float:
-        """Line integrals of one stack, and the largest of them; only the first stack's sets the unit."""
+        """Line integrals of one stack, and the largest of them in focus; only the first stack's sets the unit."""
         plan, angles, highest = self.simulation, self.simulation.angles[name], 0.0
         with self._new(name, (len(angles), plan.size, plan.size), np.float32) as stack:
             for start in range(0, len(angles), plan._together):
                 part = angles[start : start + plan._together]
                 projector = SliceProjector(tilt_angles=part, depth=plan.size, width=plan.size)
+                blurred = with_defocus(projector, plan.defocus if name == "clean" else 0.0)
                 for rows in plan._blocks():
-                    images = projector(torch.from_numpy(np.array(truth[:, rows]))).numpy()
-                    stack.data[start : start + len(part), rows] = images
-                    highest = max(highest, float(images.max()))
+                    images = sharp = projector(torch.from_numpy(np.array(truth[:, rows])))
+                    if isinstance(blurred, DefocusedProjector):
+                        images = _with_rim(blurred, truth, rows)
+                    stack.data[start : start + len(part), rows] = images.numpy()
+                    highest = max(highest, float(sharp.max()))
                     self._step("projecting")
         write_angles(self.folder / f"{name}.rawtlt", angles)
         return highest if name == "clean" else 0.0
@@ -129,10 +132,8 @@ class _Writer:
     def _read_out(self, name: str, factor: float) -> None:
         plan = self.simulation
         with mrcfile.mmap(self.folder / f"{name}.mrc", "r+") as clean:
-            for image, angle in zip(clean.data, plan.angles[name], strict=True):
+            for image in clean.data:
                 image[:] = plan.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
-                if name == "clean":
-                    image[:] = defocused(image, float(angle), plan.defocus)
                 self._step("reading out")
             if name == "clean":
                 self._add_noise(clean.data)
@@ -151,3 +152,11 @@ class _Writer:
     def _step(self, note: str) -> None:
         self.done += 1
         self.progress(self.done, note)
+
+
+def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:
+    """Images (tilt, y, u) of some slices, into which their neighbours are blurred."""
+    rim = projector.reach
+    start, stop = max(0, rows.start - rim), min(volume.shape[1], rows.stop + rim)
+    images = projector(torch.from_numpy(np.array(volume[:, start:stop])))
+    return images[:, rows.start - start : rows.stop - start]

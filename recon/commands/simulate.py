@@ -37,7 +37,7 @@ def simulate(
     defocus: Annotated[
         float,
         typer.Option(
-            help="Blur of the tilts, growing with tilt and distance from the axis: pixels per pixel out of focus, such as 0.02."
+            help="Blur of the tilts by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."
         ),
     ] = 0.0,
     mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
@@ -53,7 +53,7 @@ def simulate(
     if size < 4:
         raise ValueError(f"--size {size}: give at least 4 voxels")
     if not 0 <= defocus <= 1:
-        raise ValueError(f"--defocus {defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
+        raise ValueError(f"--defocus {defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
     angles = tilt_range(tilts)
     if len(angles) < 2:
         raise ValueError(f"--tilts {tilts}: a tilt series needs at least two tilts")

@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 import noiseflow
 from recon import streaming
 from recon.commands.simulate import simulate
-from recon.defocus import defocused
+from recon.defocused_projector import DefocusedProjector
 from recon.phantoms import make_phantom
+from recon.projector import SliceProjector
 from recon.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range
 from recon.streaming import Simulation
 from recon.tilt_series import read_tilt_series
@@ -120,12 +121,16 @@ def test_angles_between_tilts_are_spread_evenly():
     assert len(angles_between(np.array([0.0, 1.0, 2.0]), 10, share=0.5)) == 2
 
 
-def test_defocus_blurs_the_tilts_and_not_the_images_to_judge_by(tmp_path):
+def test_defocus_blurs_the_tilts_by_depth_and_not_the_images_to_judge_by(tmp_path, monkeypatch):
+    monkeypatch.setattr(streaming, "_BLOCK_VOXELS", 5 * 24**2)  # blocks of five slices, less than the blur reaches
     for name, options in (("sharp", []), ("blurred", ["--defocus", 0.2])):
         run(tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options, "--json")
-    sharp, blurred = (data(tmp_path / name / "clean.mrc") for name in ("sharp", "blurred"))
-    np.testing.assert_array_equal(blurred[2], sharp[2])
-    np.testing.assert_allclose(blurred[0], defocused(sharp[0], -60.0, 0.2), rtol=1e-5)
-    assert np.abs(blurred[0] - sharp[0]).max() > 0.05
+    truth, sharp, blurred = (
+        data(tmp_path / name) for name in ("sharp/truth.mrc", "sharp/clean.mrc", "blurred/clean.mrc")
+    )
+    projector = SliceProjector(tilt_angles=np.arange(-60, 61, 30.0), depth=24, width=24)
+    expected = np.exp(-DefocusedProjector(projector, 0.2)(torch.from_numpy(truth)).numpy())
+    np.testing.assert_allclose(blurred, expected, rtol=1e-5)
+    assert np.abs(blurred - sharp).max() > 0.05
     np.testing.assert_array_equal(data(tmp_path / "blurred" / "test.mrc"), data(tmp_path / "sharp" / "test.mrc"))
     np.testing.assert_array_equal(data(tmp_path / "blurred" / "tilts.mrc"), blurred)
