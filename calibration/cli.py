@@ -143,6 +143,8 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
 
 
 def _registration(pair: AlignedPair) -> dict[str, Any]:
+    from calibration.residual import structured_share
+
     found = pair.registration
     names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
     scaling = {
@@ -151,7 +153,7 @@ def _registration(pair: AlignedPair) -> dict[str, Any]:
         "exposure_ratio": 1 / pair.scaling.slope,
     }
     values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
-    return values | scaling | {"masked": vars(pair.counts)}
+    return values | scaling | {"structured_share": structured_share(pair), "masked": vars(pair.counts)}
 
 
 def _figures(score: ModelScore) -> dict[str, Any]:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.aligned import AlignedPair
 from calibration.detector import Detector
 from calibration.exposures import Image
 from calibration.models import ModelScore, Pixels
+from calibration.residual import smoothed_residual
 from noiseflow.report import new_figure, show_image
 
 if TYPE_CHECKING:
@@ -31,17 +31,12 @@ def registration_figure(pair: AlignedPair) -> Figure:
     return figure
 
 
-def residual_figure(pair: AlignedPair, *, blur: float = 3.0) -> Figure:
+def residual_figure(pair: AlignedPair) -> Figure:
     """Smoothed residual over the frame, and its mean along rows and columns with the band that noise alone would keep."""
     figure, axes = new_figure(3, width=12.0, height=3.8)
     spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
     residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
-    scale = 2 * np.sqrt(np.pi) * blur  # a Gaussian of this width shrinks white noise by this factor
-    smooth = np.divide(
-        scale * ndimage.gaussian_filter(residual, blur), weight, out=np.zeros_like(residual), where=weight > 0.1
-    )
-    show_image(axes[0, 0], smooth, f"residual smoothed over {blur:g} px, σ", limits=(-4.0, 4.0))
+    show_image(axes[0, 0], smoothed_residual(pair)[0], "residual smoothed over 3 px, σ", limits=(-4.0, 4.0))
     for axis, along, name in ((axes[0, 1], 1, "row"), (axes[0, 2], 0, "column")):
         number = np.maximum(pair.mask.sum(axis=along), 1)
         axis.plot(residual.sum(axis=along) / number, linewidth=0.8)

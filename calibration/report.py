@@ -20,6 +20,7 @@ from calibration.figures import (
 )
 from calibration.models import ModelScore, simplest_sufficient
 from calibration.pipeline import Findings
+from calibration.residual import structured_share
 from noiseflow.report import Report
 
 LARGEST_MISFIT = 1.3
@@ -31,6 +32,9 @@ LARGEST_MISALIGNMENT = 0.1
 UNKNOWN_READ_NOISE = (
     "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it."
 )
+
+LARGEST_STRUCTURE = 0.05
+"""Share of the residual's variance that may be smooth structure: it biases the gain by as much."""
 
 LEAST_DIVERGENCE = 5e-4
 """Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
@@ -197,7 +201,18 @@ def judge(findings: Findings) -> list[str]:
             f"The exposures lie on each other to {worst:.3f} px"
             + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
+        found.append(_judge_structure(max(structured_share(pair) for pair in findings.pairs)))
     return found
+
+
+def _judge_structure(share: float) -> str:
+    text = f"Of the residual's variance {100 * max(share, 0.0):.1f} % is smooth structure, which is no noise"
+    if share > LARGEST_STRUCTURE:
+        return (
+            text
+            + ": scene or illumination changed between the exposures. Look at the residual map, and take them anew."
+        )
+    return text + ": too little to matter."
 
 
 def unknown_read_noise(detector: Detector) -> bool:
