@@ -68,10 +68,11 @@ class PanelledMatrix:
         if dense.shape[0] != self.shape[1]:
             raise ValueError(f"{dense.shape[0]} rows do not match the matrix's {self.shape[1]} columns")
         result = dense.new_empty(self.shape[0], dense.shape[1])
-        for start in range(0, dense.shape[1], _WIDEST):
-            part = result[:, start : start + _WIDEST]
+        widest = _WIDEST if dense.device.type == "cpu" else max(1, dense.shape[1])
+        for start in range(0, dense.shape[1], widest):
+            part = result[:, start : start + widest]
             for number, (panel, span) in enumerate(zip(self.panels, self._spans, strict=True)):
-                torch.addmm(part, panel, dense[span, start : start + _WIDEST], beta=min(number, 1), out=part)
+                torch.addmm(part, panel, dense[span, start : start + widest], beta=min(number, 1), out=part)
         return result
 
     def entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
