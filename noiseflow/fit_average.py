@@ -67,9 +67,10 @@ class WeightAverage:
 
 
 class BestState:
-    """The state to end at: the latest one that no earlier one beats beyond chance on the held-out pixels.
+    """The state to end at: the latest one that no earlier one beats beyond chance on the held-out pixels, or, `strict`, the best.
 
-    The start is kept while it is the best of all: then there is nothing to learn.
+    A start that is the best of all is kept: then there is nothing to learn. Where looks are strict, it must be so beyond chance:
+    a signal comes from a fit to other noise, and steps that end at a small rate are worth more than a look that tells nothing.
     """
 
     def __init__(self) -> None:
@@ -78,17 +79,14 @@ class BestState:
         self._start_leads = True
 
     def judge(self, state: dict[str, Any], scores: Tensor, *, start: bool, strict: bool) -> bool:
-        """Take a state with its log-likelihoods of the held-out pixels, (P,); whether it is now the one to end at.
-
-        With `strict`, a later state must be the best of all.
-        """
+        """Take a state with its log-likelihoods of the held-out pixels, (P,); whether it is now the one to end at."""
         if self._scores is None:
             self._scores, self._start_leads, self.state = scores, start, state
             return True
         behind = self._scores - scores
         error = float(behind.std(correction=0)) / math.sqrt(behind.numel())
         leads = not float(behind.mean()) > 0
-        if not leads and (strict or self._start_leads or float(behind.mean()) > error):
+        if not leads and (self._start_leads != strict or float(behind.mean()) > error):
             return False
         if leads:
             self._scores, self._start_leads = scores, False

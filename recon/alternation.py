@@ -116,7 +116,8 @@ class Alternation:
         progress: Progress | None = None,
     ) -> FitResult:
         """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: until the new signal
-        leaves the noise model as it was, or held-out pixels gain little.
+        leaves the noise model as it was, or held-out pixels gain little. A turn that was at its best early took steps too large,
+        and another follows.
 
         Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
         again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
@@ -143,7 +144,8 @@ class Alternation:
             if turn > 0 and reached - result.held_out_nll < _SETTLED:
                 break
             reached = result.held_out_nll
-            if result.held_out_nll - self.refine(noise_model) < _STEADY:
+            early = min(result.history, key=lambda step: result.history[step]) < steps / 2
+            if result.held_out_nll - self.refine(noise_model) < _STEADY and not early:
                 break
         return result
 

@@ -235,7 +235,9 @@ def test_average_settles_where_single_steps_jitter() -> None:
         ([0.0, 1.0, 0.9999], False, 2),  # the latest, where it is behind by chance
         ([0.0, 1.0, 0.5], False, 1),  # not where it is behind for sure
         ([1.0, 0.9999, 0.9999], False, 0),  # the start, where nothing beats it
-        ([0.0, 1.0, 0.9999], True, 1),
+        ([0.0, 1.0, 0.9999], True, 1),  # the best, by whatever little
+        ([1.0, 0.9999, 0.9999], True, 2),  # but no start that leads by chance
+        ([1.0, 0.5, 0.5], True, 0),
     ],
 )
 def test_the_latest_state_that_no_earlier_one_beats_is_kept(means: list[float], strict: bool, kept: int) -> None:
