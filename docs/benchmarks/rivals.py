@@ -145,7 +145,10 @@ def ablations(folder: Path) -> str:
         header, rows = benchmark_ablations.table(cells)
         parts.append(f"## {_scene(name)}")
         for group in dict.fromkeys(row[0] for row in rows):
-            parts += [f"### {group.capitalize()}", _table(header[1:], [row[1:] for row in rows if row[0] == group])]
+            parts += [
+                f"### {group[0].upper() + group[1:]}",
+                _table(header[1:], [row[1:] for row in rows if row[0] == group]),
+            ]
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), _machines([content])]
     gaps = "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
