@@ -196,7 +196,8 @@ def needle(folder: Path) -> str:
             words = "every fifth tilt" if left_out == "every fifth" else f"tilts {left_out}"
             parts += [f"## {noise.capitalize()}, {words} left out", _table(header[2:], chosen)]
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
-            parts += [f"Best by PSNR: {chosen[0][0]}.", _absent(absent)]
+            likeliest = min(chosen, key=lambda row: float(row[2]))
+            parts += [f"Best by PSNR: {chosen[0][0]}; by NLL: {likeliest[0]}.", _absent(absent)]
         parts += [_command("needle", name), _machines([content])]
     return _joined([*parts, _nothing(folder, "needle")])
 
