@@ -201,7 +201,8 @@ def judge(findings: Findings) -> list[str]:
             f"The exposures lie on each other to {worst:.3f} px"
             + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
-        found.append(_judge_structure(max(structured_share(pair) for pair in findings.pairs)))
+        shares = [share for share in map(structured_share, findings.pairs) if np.isfinite(share)]
+        found += [_judge_structure(max(shares))] if shares else []
     return found
 
 

@@ -24,6 +24,7 @@ _QUIET = 0.2  # noise relative to contrast
 _STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
+_ENOUGH_LOOKS = 8
 
 
 class Alternation:
@@ -144,8 +145,7 @@ class Alternation:
             if turn > 0 and reached - result.held_out_nll < _SETTLED:
                 break
             reached = result.held_out_nll
-            early = min(result.history, key=lambda step: result.history[step]) < steps / 2
-            if result.held_out_nll - self.refine(noise_model) < _STEADY and not early:
+            if result.held_out_nll - self.refine(noise_model) < _STEADY and not _best_early(result.history):
                 break
         return result
 
@@ -155,6 +155,12 @@ class Alternation:
             return -math.inf
         options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
         return self.fit(noise_model, known=True, **options).held_out_nll
+
+
+def _best_early(history: dict[int, float]) -> bool:
+    """Whether a fit was at its best before its middle, as far as enough looks can tell."""
+    best = min(history, key=lambda step: history[step])
+    return len(history) >= _ENOUGH_LOOKS and best < max(history) / 2
 
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:

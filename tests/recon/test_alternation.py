@@ -8,8 +8,11 @@ import torch
 from noiseflow import FitResult, Gaussian
 from recon.alternation import Alternation
 
+FALLING = {8 * look: 1.1 - 0.01 * look for look in range(11)}
+RISING = {8 * look: 1.0 + 0.01 * look for look in range(11)}
 
-@pytest.mark.parametrize(("history", "turns"), [({0: 1.1, 40: 1.05, 80: 1.0}, 1), ({0: 1.0, 40: 1.05, 80: 1.1}, 2)])
+
+@pytest.mark.parametrize(("history", "turns"), [(FALLING, 1), (RISING, 2), ({0: 1.0, 4: 1.05, 8: 1.1}, 1)])
 def test_a_turn_that_was_best_early_is_followed_by_another(history: dict[int, float], turns: int) -> None:
     rates = []
 
