@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing import Pool
 from pathlib import Path
@@ -87,8 +87,8 @@ def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) ->
     found = [json.loads(line) for line in rows.read_text().splitlines()] if rows.exists() else []
     left = sorted(set(seeds) - {one["seed"] for one in found}) if minutes > 0 else []
     deadline = time.perf_counter() + 60 * minutes
-    with Pool(workers) as pool, rows.open("a") as file:
-        for one in pool.imap_unordered(trial, left):
+    with rows.open("a") as file:
+        for one in _results(trial, left, workers):
             found.append(one)
             file.write(json.dumps(one) + "\n")
             file.flush()
@@ -96,6 +96,15 @@ def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) ->
             if time.perf_counter() > deadline:
                 break
     return sorted(found, key=lambda one: int(one["seed"]))
+
+
+def _results(trial: Trial, seeds: list[int], workers: int) -> Iterator[dict[str, Any]]:
+    """Results as they come; a pool of processes is opened only for several: one that ends as it starts can hang."""
+    if min(workers, len(seeds)) < 2:
+        yield from map(trial, seeds)
+        return
+    with Pool(workers) as pool:
+        yield from pool.imap_unordered(trial, seeds)
 
 
 def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict[str, Any]:
