@@ -129,8 +129,15 @@ class _LogLines:
         rate, now = self.rate(title, done), time.monotonic()
         if now - self.last >= _LOG_SECONDS and rate > 0:
             self.last = now
-            left = f"{(total - done) / rate:.0f} s left"
-            print(f"{title}: {done}/{total}, {rate:.2g} steps/s, {left}, {note}", file=sys.stderr, flush=True)
+            speed = f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
+            left = _duration((total - done) / rate)
+            print(f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}", file=sys.stderr, flush=True)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _bars() -> Iterator[StepReport]:

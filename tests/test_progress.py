@@ -98,7 +98,7 @@ def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Pa
         with pytest.raises(SystemExit):
             main([*words(name, good, tmp_path), *more])
         printed = capsys.readouterr()
-        lines = re.findall(r"^\S.*: \d+/\d+, [\d.e+-]+ steps/s, \d+ s left.*$", printed.err, re.MULTILINE)
+        lines = re.findall(r"^\S.*: \d+/\d+, [\d.e-]+ steps/s, [\d.]+ (?:s|min|h) left.*$", printed.err, re.MULTILINE)
         assert bool(lines) != bool(more), printed.err
         assert "\x1b" not in printed.out + printed.err
         if more:
