@@ -45,6 +45,9 @@ def build_app() -> typer.Typer:
 class _Group(TyperGroup):
     """The program itself: Ctrl-C ends whatever it runs with one line and exit code 130."""
 
+    def get_params(self, ctx: Any) -> Any:
+        return _flags_without_type(super().get_params(ctx))
+
     def make_context(self, *words: Any, **more: Any) -> Any:
         try:
             return super().make_context(*words, **more)
@@ -63,6 +66,9 @@ class _ListCommand(TyperCommand):
 
     ``--short a b c`` stands for ``--short a --short b --short c``.
     """
+
+    def get_params(self, ctx: Any) -> Any:
+        return _flags_without_type(super().get_params(ctx))
 
     def invoke(self, ctx: Any) -> Any:
         given = {name: ctx.get_parameter_source(name).name not in _UNASKED for name in ctx.params}
@@ -83,6 +89,14 @@ class _ListCommand(TyperCommand):
             spread.append(argument)
         rest: list[str] = super().parse_args(ctx, spread)
         return rest
+
+
+def _flags_without_type(parameters: list[Any]) -> list[Any]:
+    """The help shows a flag as what is typed, ``--resume``: without a type, which would look like a value to give."""
+    for parameter in parameters:
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    return parameters
 
 
 def _show_version(asked: bool) -> None:
