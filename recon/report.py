@@ -26,6 +26,7 @@ _NAMES = {
     "transmission": "bright field, I₀·exp(−line integral)",
     "linear": "linear (HAADF, EDX), line integral + offset",
 }
+_UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per voxel"}
 
 
 def reconstruction_report(
@@ -52,7 +53,7 @@ def reconstruction_report(
     name = Path(inputs[0]).name if inputs else "tilt series"
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
-    _add_volume(report, outcome.volume)
+    _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
     _add_tilts(report, tilt_series, outcome)
     _add_response(report, tilt_series, outcome)
     _add_noise(report, tilt_series, outcome)
@@ -130,7 +131,7 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _add_volume(report: Report, volume: Volume) -> None:
+def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     values = volume.attenuation
     sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
     low, high = float(np.percentile(values, 0.5)), float(np.percentile(values, 99.8))
@@ -141,7 +142,7 @@ def _add_volume(report: Report, volume: Volume) -> None:
         "original": list(values.shape),
         "limits": [low, high],
         "voxelSize": size,
-        "unit": "attenuation per voxel",
+        "unit": unit,
     }
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
@@ -255,9 +256,20 @@ def _add_resolution(
         axis.axhline(level, color=colour, linewidth=1, linestyle="--")
         least = min(least, float(correlation.min()))
         below = np.flatnonzero(correlation[1:] < level)
-        reach = f"falls below {level} at {frequency[below[0] + 1]:.3f} cycles per voxel" if below.size else ""
-        words.append(f"Between {what} it {reach or f'stays above {level} at all frequencies'}.")
+        reach = f"stays above {level} at all frequencies"
+        if below.size:
+            limit = float(frequency[below[0] + 1])
+            reach = f"falls below {level} at {limit:.3f} cycles per voxel{_as_length(volume.voxel_size, limit)}"
+        words.append(f"Between {what} it {reach}.")
     axis.set_ylim(least, 1.05)
     add_legend(axis)
     report.heading("Resolution")
     report.charts([figure], caption=" ".join(words))
+
+
+def _as_length(voxel_size: float | None, frequency: float) -> str:
+    """The period of a frequency, cycles per voxel of so many Å, in brackets; nothing where the size is not known."""
+    if voxel_size is None:
+        return ""
+    period = voxel_size / frequency
+    return f" ({period / 10:.3g} nm)" if period >= 10 else f" ({period:.3g} Å)"
