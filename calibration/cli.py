@@ -64,7 +64,8 @@ def calibrate(
     )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
-    page = None if report is None else write_report(report, findings)
+    inputs = [*short, *(long or []), *(dark or []), *(flat or [])]
+    page = None if report is None else write_report(report, findings, inputs=inputs, seed=seed)
     provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
     noiseflow.save(best.model, output, units="counts", provenance=provenance)
     out = Output(json)

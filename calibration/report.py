@@ -21,7 +21,7 @@ from calibration.figures import (
 from calibration.models import ModelScore, simplest_sufficient
 from calibration.pipeline import Findings
 from calibration.residual import structured_share
-from noiseflow.report import Report
+from noiseflow.report import Report, provenance
 
 LARGEST_MISFIT = 1.3
 """χ² per degree of freedom above which the readings do not come from a Poisson-Gaussian detector."""
@@ -95,7 +95,7 @@ def describe_detector(detector: Detector) -> str:
     """Gain, offset and read noise with their 90 % intervals, and what they rest on."""
     found = detector.posterior
     parts = [
-        f"{name} {value.median:.4g} {unit} (90 %: {value.q05:.4g} … {value.q95:.4g})"
+        f"{name} {value.median:#.4g} {unit} (90 %: {value.q05:#.4g} … {value.q95:#.4g})"
         for name, unit, value in (
             ("gain", "counts/e⁻", found.gain),
             ("offset", "counts", found.offset),
@@ -148,8 +148,23 @@ def describe_registration(pair: AlignedPair) -> str:
     )
 
 
-def write_report(folder: str | Path, findings: Findings, *, title: str = "Detector calibration") -> Path:
-    """Write ``report.html`` into a folder, which is made if need be; returns its path."""
+def write_report(
+    folder: str | Path,
+    findings: Findings,
+    *,
+    title: str = "Detector calibration",
+    inputs: Sequence[str | Path] = (),
+    seed: int | None = None,
+) -> Path:
+    """Write ``report.html`` into a folder, which is made if need be; returns its path.
+
+    Args:
+        folder: where to write.
+        findings: what to tell.
+        title: of the page.
+        inputs: files that were read, for their checksums.
+        seed: of the random choices.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     page = Report(title)
@@ -160,6 +175,8 @@ def write_report(folder: str | Path, findings: Findings, *, title: str = "Detect
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
+    page.heading("Provenance")
+    page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
     return page.save(folder / "report.html")
 
 
@@ -172,7 +189,7 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
             ("Offset", "counts", found.offset),
             ("Read noise", "e⁻ rms", found.read_noise),
         ):
-            facts.append((f"{name}, {unit}", f"{value.median:.4g} ({value.q05:.4g} … {value.q95:.4g})"))
+            facts.append((f"{name}, {unit}", f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"))
     facts.append(("Noise model that suffices", LABELS[simplest_sufficient(findings.scores).name]))
     return facts
 

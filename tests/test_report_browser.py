@@ -5,9 +5,11 @@ The tests of the page itself need Chromium and Playwright (the extra `test`, and
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -107,6 +109,16 @@ def test_provenance_gives_the_checksum_of_the_input(tmp_path):
         rows["input: input.bin"] == "5 bytes, SHA-256 efe2a5c09e6d49d7eb735c9875f77404be5b887bb3f56378038968d4e3ff8198"
     )
     assert "torch" in rows["versions"]
+
+
+def test_provenance_of_a_folder_is_that_of_its_images(tmp_path):
+    for number in (10, 9):
+        np.save(tmp_path / f"{number}.npy", np.full((4, 4), number))
+    (tmp_path / "notes.txt").write_text("not read")
+    both = (tmp_path / "9.npy").read_bytes() + (tmp_path / "10.npy").read_bytes()
+    expected = f"2 files, {len(both)} bytes, SHA-256 {hashlib.sha256(both).hexdigest()}"
+    assert dict(provenance([tmp_path]))[f"input: {tmp_path.name}"] == expected
+    assert dict(provenance([f"{tmp_path}/9.npy::image"]))["input: 9.npy::image"].startswith(f"{len(both) // 2} bytes")
 
 
 def test_included_report_keeps_its_pictures_under_its_own_title(tmp_path):
@@ -313,10 +325,13 @@ def test_page_names_its_contents_and_its_file_as_text(open_page):
 def test_resolution_is_drawn_of_halves_and_reference_alike(scene, tmp_path):
     noisy, outcome = scene
     half = Volume(outcome.volume.attenuation[:, ::-1].copy())
+    outcome = replace(outcome, volume=replace(outcome.volume, voxel_size=20.0))
     report = reconstruction_report(noisy, outcome, [], halves=(half, outcome.volume), reference=half)
     page = report.save(tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Between even and odd tilts it" in page
     assert "Between volume and reference it" in page
+    cycles, period = map(float, re.findall(r"at (0\.\d+) cycles per voxel \(([\d.]+) nm\)", page)[0])
+    assert period == pytest.approx(2.0 / cycles, rel=0.02)
 
 
 def test_legends_hide_no_data():

@@ -2,6 +2,7 @@
 
 from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
+from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of
 from .checks import as_array as as_array
@@ -11,6 +12,7 @@ from .files import atomic_path as atomic_path
 from .files import check_folder as check_folder
 from .files import check_output as check_output
 from .files import require_other as require_other
+from .folder import files_of as files_of
 from .images import SUFFIXES as SUFFIXES
 from .images import ImageFile as ImageFile
 from .images import read as read

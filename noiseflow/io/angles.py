@@ -53,21 +53,30 @@ def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
         FileNotFoundError: neither is there.
         ValueError: the angle file cannot be read.
     """
-    stack = Path(str(stack).partition("::")[0])
-    stack = stack.resolve() if stack.is_dir() else stack
-    inside = [f for s in (*RAW_FIRST, ".mdoc") for f in stack.glob(f"*{s}")] if stack.is_dir() else []
-    candidates = [*_beside(stack), *(inside if len(inside) == 1 else [])]
-    for candidate in candidates:
-        if candidate.is_file():
-            angles = read_angles(candidate)
-            _compare(angles, image.tilt_angles, candidate, stack)
-            return angles
+    if (angle_file := angle_file_of(stack)) is not None:
+        angles = read_angles(angle_file)
+        _compare(angles, image.tilt_angles, angle_file, Path(stack))
+        return angles
     if image.tilt_angles is not None:
         return image.tilt_angles
-    names = ", ".join(candidate.name for candidate in candidates[:2])
+    names = ", ".join(candidate.name for candidate in _candidates(stack)[:2])
     raise FileNotFoundError(
         f"no tilt angles: {stack} holds none and there is no {names} or .mdoc beside it; give the file with --angles"
     )
+
+
+def angle_file_of(stack: str | Path) -> Path | None:
+    """The angle file that `tilt_angles_of` takes; None where there is none."""
+    return next((candidate for candidate in _candidates(stack) if candidate.is_file()), None)
+
+
+def _candidates(stack: str | Path) -> list[Path]:
+    stack = Path(str(stack).partition("::")[0])
+    if not stack.is_dir():
+        return _beside(stack)
+    stack = stack.resolve()
+    inside = [file for suffix in (*RAW_FIRST, ".mdoc") for file in stack.glob(f"*{suffix}")]
+    return [*_beside(stack), *(inside if len(inside) == 1 else [])]
 
 
 def _beside(stack: Path) -> list[Path]:

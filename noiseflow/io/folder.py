@@ -22,15 +22,12 @@ def read_folder(folder: Path) -> ImageFile:
     Raises:
         ValueError: fewer than two images, or images of different sizes.
     """
-    from tifffile import natural_sorted
-
-    files = [f for f in folder.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    files = files_of(folder)
     if len(files) < 2:
         found = f"with one image only, {files[0].name}" if files else "without images"
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
-    suffix, _ = Counter(file.suffix.lower() for file in files).most_common(1)[0]
-    names = natural_sorted(file.name for file in files if file.suffix.lower() == suffix)
-    images = [read(folder / name) for name in names]
+    names = [file.name for file in files]
+    images = [read(file) for file in files]
     sections: list[NDArray[Any]] = []
     for name, image in zip(names, images, strict=True):
         section = image.data[0] if image.data.ndim == 3 and len(image.data) == 1 else image.data
@@ -45,6 +42,20 @@ def read_folder(folder: Path) -> ImageFile:
     angles = [image.tilt_angles for image in images if image.tilt_angles is not None]
     inside = np.concatenate(angles) if len(angles) == len(images) else None
     return ImageFile(np.stack(sections), images[0].voxel_size, inside if inside is not None else angles_in_names(names))
+
+
+def files_of(path: str | Path) -> list[Path]:
+    """The files that `read` opens: a folder's images of the commonest type in natural order, all files of a ``.zarr``."""
+    from tifffile import natural_sorted
+
+    path = Path(str(path).partition("::")[0])
+    if not path.is_dir():
+        return [path]
+    if path.suffix.lower() == ".zarr":
+        return sorted(file for file in path.rglob("*") if file.is_file())
+    files = [f for f in path.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    suffixes = Counter(file.suffix.lower() for file in files).most_common(1)
+    return [path / name for name in natural_sorted(f.name for f in files if f.suffix.lower() == suffixes[0][0])]
 
 
 def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:

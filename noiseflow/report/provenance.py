@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from noiseflow.console import invocation
+from noiseflow.io import files_of
 
 _PACKAGES = ("noiseflow", "torch", "numpy", "scipy")
 
@@ -20,13 +21,13 @@ def provenance(
     """Rows (what, value) that let a reader repeat a result.
 
     Args:
-        inputs: files that were read; each is listed with its size and SHA-256.
+        inputs: files and folders of images that were read; each is listed with its size and SHA-256.
         seed: of the random choices.
         more: other rows to add, such as the device.
     """
     called = invocation()
     rows = [("command", called.command_line if called is not None else "called from Python")]
-    rows += [(f"input: {Path(path).name}", _checksum(Path(path))) for path in inputs if Path(path).is_file()]
+    rows += [(f"input: {Path(path).name}", text) for path in inputs if (text := _checksum(path)) is not None]
     rows += [("seed", str(seed))] if seed is not None else []
     rows += list((more or {}).items())
     rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *map(_version, _PACKAGES)])))
@@ -35,10 +36,16 @@ def provenance(
     return rows
 
 
-def _checksum(path: Path) -> str:
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return f"{path.stat().st_size:,} bytes, SHA-256 {digest}"
+def _checksum(path: str | Path) -> str | None:
+    """Size and digest of a file, or of a folder's images one after the other; None where nothing is."""
+    files = [file for file in files_of(path) if file.is_file()]
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: digest)
+    count = f"{len(files)} files, " if len(files) > 1 else ""
+    size = sum(file.stat().st_size for file in files)
+    return f"{count}{size:,} bytes, SHA-256 {digest.hexdigest()}" if files else None
 
 
 def _version(package: str) -> str:

@@ -62,6 +62,11 @@ def load_tilt_series(
     return series
 
 
+def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[Path]:
+    """The stack, its angle file, given or found beside it, and the other files that were given."""
+    return [path for path in (tilts, angles or io.angle_file_of(tilts), *others) if path is not None]
+
+
 def _warn_of_outliers(series: TiltSeries) -> None:
     step = max(1, series.images.size // 100_000)
     low, high = np.quantile(np.concatenate([part[::step].copy() for part in _used(series)]), (0.02, 0.98))

@@ -103,7 +103,7 @@ def reconstruct(
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
     from noiseflow.io import require_other
-    from recon.commands.inputs import load_tilt_series, prepare
+    from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.report import read_reference
     from recon.tilt_series import VolumeGrid
@@ -155,7 +155,7 @@ def reconstruct(
                 tilt_series,
                 outcome,
                 seconds=time.perf_counter() - started,
-                inputs=[path for path in (tilts, angles, noise_model) if path is not None],
+                inputs=files_read(tilts, angles, transforms, mask, noise_model),
                 seed=seed,
                 prepared=prepared,
                 halves=halves,
