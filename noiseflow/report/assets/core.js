@@ -74,7 +74,8 @@ function contrastSliders(sprites, limits, change) {
   const unit = (grey) => sprites.low + grey * (sprites.high - sprites.low) / 255;
   const grey = (value) => Math.min(255, Math.max(0, Math.round(255 * (value - sprites.low) / (sprites.high - sprites.low))));
   let black = grey(limits[0]), white = Math.max(grey(limits[1]), grey(limits[0]) + 1);
-  const text = (value) => Number(unit(value).toPrecision(3)).toString();
+  const step = (sprites.high - sprites.low) / 1000;
+  const text = (value) => Number((Math.round(unit(value) / step) * step).toPrecision(3)).toString();
   const update = () => change(contrastCurve(black, white), black, white);
   const low = slider("black", { min: 0, max: 255, value: black, text, change: (value) => {
     black = Math.min(value, white - 1); low.set(black); update();

@@ -4,7 +4,7 @@ widgets.tilts = async (root, options) => {
   const data = await unpack(sprites);
   const [sections, height, width] = sprites.shape;
   const count = sections / 2, size = height * width;
-  let tilt = options.start, row = height >> 1, curve = contrastCurve(0, 255), gain = 1;
+  let tilt = options.start, row = height >> 1, curve = contrastCurve(0, 255);
 
   const [before, after, left, sinogram] = Array.from({ length: 4 }, () => element("canvas"));
   before.ariaLabel = names[0];
@@ -19,7 +19,11 @@ widgets.tilts = async (root, options) => {
   swipe.addEventListener("input", split);
   split();
 
-  // what is left, grey where nothing is; both are on the same grey scale
+  // what is left, grey where nothing is, black and white at four times its rms; at least a grey value a step
+  let squares = 0;
+  for (let index = 0; index < count * size; index++) squares += (data[index] - data[index + count * size]) ** 2;
+  const reach = Math.min(128, Math.max(4, 4 * Math.sqrt(squares / (count * size)))), gain = 128 / reach;
+  const span = Number((reach * (sprites.high - sprites.low) / 255).toPrecision(2));
   const residual = (index) => {
     const shade = Math.min(255, Math.max(0, Math.round(128 + gain * (data[index] - data[index + count * size]))));
     return (255 << 24 | shade << 16 | shade << 8 | shade) >>> 0;
@@ -43,17 +47,16 @@ widgets.tilts = async (root, options) => {
     draw();
   }, false);
   const rowControl = slider("row", { min: 0, max: height - 1, value: row, change: (index) => { row = index; drawRow(); } });
-  const contrast = contrastSliders(sprites, limits, (next, black, white) => {
+  const contrast = contrastSliders(sprites, limits, (next) => {
     curve = next;
-    gain = 160 / (white - black);
     draw();
-    drawRow();
   });
+  drawRow();
   const controls = element("div", { className: "controls" }, control.node, element("div", {}, motion.button));
   const sinogramStage = stageOf(width, height, sinogram);
   const panes = element("div", { className: "panes" },
     pane("data and prediction", element("span", { textContent: "swipe" }), stage, controls),
-    pane("residual of this tilt", element("span", { textContent: "data − prediction" }), stageOf(width, height, left)),
+    pane("residual of this tilt", element("span", { textContent: `data − prediction, ± ${span}` }), stageOf(width, height, left)),
     pane("residual of one row in all tilts", element("span", { textContent: "u →  tilt ↓" }), sinogramStage, rowControl.node));
   root.prepend(panes, element("div", { className: "controls" }, ...contrast, element("span", { className: "note", textContent: unit })));
 };
