@@ -244,7 +244,8 @@ def _add_detector(page: Report, findings: Findings) -> None:
     if findings.detector is None:
         page.text(f"Not measured: {findings.no_detector}")
         return
-    page.text(describe_detector(findings.detector))
+    words = describe_detector(findings.detector)
+    page.text(words[0].upper() + words[1:])
     page.figure(
         photon_transfer_figure(findings.detector),
         caption="Photon transfer: variance against signal; band: 90 % of the posterior.",

@@ -137,6 +137,15 @@ def resolution(frequency: Array, correlation: Array, threshold: float) -> float:
     return float(frequency[last - 1] + share * (frequency[last] - frequency[last - 1]))
 
 
+def reach_in_words(crossing: float, threshold: float, voxel_size: float | None) -> str:
+    """What `resolution` found, and as a length where the voxels (Å) are known."""
+    words = f"stays above {threshold:g} up to {crossing:.3f} cycles per voxel"
+    if not voxel_size or not crossing:
+        return words
+    period = voxel_size / crossing
+    return words + (f" ({period / 10:.3g} nm)" if period >= 10 else f" ({period:.3g} Å)")
+
+
 def _dssim(result: Array, reference: Array, span: float) -> float:
     from skimage.metrics import structural_similarity
 

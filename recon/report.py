@@ -13,7 +13,7 @@ from noiseflow.console import invocation
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
 from noiseflow.spatial import SpatialStructure, spatial_structure
 from recon.methods import Outcome
-from recon.metrics import fourier_shell_correlation
+from recon.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.report_noise import noise_charts
 from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -99,6 +99,8 @@ def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, 
         for name, (value, given) in (called.options if called else {}).items()
         if name not in _NOT_SETTINGS and (given or value is not None) and name not in outcome.choices
     ]
+    if "denoised" not in outcome.method:
+        rows = [row for row in rows if row[0] != "denoiser"]
     depth = outcome.volume.attenuation.shape[0]
     if not any(name == "thickness" for name, _, _ in rows):
         rows.append(("thickness", f"{depth} voxels", "as deep as the images are wide, where nothing else is asked for"))
@@ -111,7 +113,7 @@ def _evidence(name: str, outcome: Outcome) -> str:
     if called is not None and called.options.get(name, (None, False))[1]:
         return "given"
     if name == "weight" and tried:
-        return f"lowest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
+        return f"highest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
     if name == "noise model" and outcome.method == "joint":
         return (
             "rails and rounding as the readings show them; of the candidates the one that predicts held-out pixels best"
@@ -234,6 +236,8 @@ def _add_course(report: Report, outcome: Outcome) -> None:
         tried = sorted(outcome.weights_tried.items())
         figure, axis = new_chart("Choice of the weight", x="weight of the total variation", y="held-out NLL")
         axis.semilogx(*zip(*tried, strict=True), color=COLOURS["accent"], marker="o", markersize=4)
+        axis.set_xticks([weight for weight, _ in tried], [f"{weight:.2g}" for weight, _ in tried])
+        axis.set_xticks([], minor=True)
         axis.axvline(float(outcome.choices["weight"]), color=COLOURS["warm"], linewidth=1.5)
         charts.append(figure)
     if charts:
@@ -255,21 +259,9 @@ def _add_resolution(
         axis.plot(frequency, correlation, color=colour, label=what)
         axis.axhline(level, color=colour, linewidth=1, linestyle="--")
         least = min(least, float(correlation.min()))
-        below = np.flatnonzero(correlation[1:] < level)
-        reach = f"stays above {level} at all frequencies"
-        if below.size:
-            limit = float(frequency[below[0] + 1])
-            reach = f"falls below {level} at {limit:.3f} cycles per voxel{_as_length(volume.voxel_size, limit)}"
+        reach = reach_in_words(resolution(frequency, correlation, level), level, volume.voxel_size)
         words.append(f"Between {what} it {reach}.")
     axis.set_ylim(least, 1.05)
     add_legend(axis)
     report.heading("Resolution")
     report.charts([figure], caption=" ".join(words))
-
-
-def _as_length(voxel_size: float | None, frequency: float) -> str:
-    """The period of a frequency, cycles per voxel of so many Å, in brackets; nothing where the size is not known."""
-    if voxel_size is None:
-        return ""
-    period = voxel_size / frequency
-    return f" ({period / 10:.3g} nm)" if period >= 10 else f" ({period:.3g} Å)"

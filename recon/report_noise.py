@@ -83,8 +83,8 @@ def _histogram(noise_model: nn.Module, signal: Pixels, observation: Pixels, *, l
     masses = residual_masses(noise_model, torch.from_numpy(signal).to(device), torch.from_numpy(edges))[1:-1]
     counts = np.histogram(residual, inner)[0]
     width = inner[1] - inner[0]
-    span = f"signal {signal.min():.3g} … {signal.max():.3g}"
-    figure, axis = new_chart(span, x="reading − signal", y="density")
+    ends = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (signal.min(), signal.max()))
+    figure, axis = new_chart(f"signal {' … '.join(ends)}", x="reading − signal", y="density")
     axis.stairs(counts / (residual.size * width), inner, fill=True, color=COLOURS["data"], label="data")
     axis.stairs(masses / width, inner, color=COLOURS["accent"], linewidth=1.6, label="model")
     axis.set_yscale("log")

@@ -330,7 +330,7 @@ def test_resolution_is_drawn_of_halves_and_reference_alike(scene, tmp_path):
     page = report.save(tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Between even and odd tilts it" in page
     assert "Between volume and reference it" in page
-    cycles, period = map(float, re.findall(r"at (0\.\d+) cycles per voxel \(([\d.]+) nm\)", page)[0])
+    cycles, period = map(float, re.findall(r"up to (0\.\d+) cycles per voxel \(([\d.]+) nm\)", page)[0])
     assert period == pytest.approx(2.0 / cycles, rel=0.02)
 
 

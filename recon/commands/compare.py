@@ -26,6 +26,7 @@ def compare(
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
     from recon.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
+    from recon.metrics import reach_in_words
     from recon.tilt_series import Volume
 
     output = Output(json)
@@ -39,11 +40,8 @@ def compare(
     header, rows = error_table(comparison)
     output.table(header, rows)
     for threshold in THRESHOLDS:
-        crossing, size = comparison.crossings[threshold], second.voxel_size
-        length = f" ({size / crossing:.3g} Å)" if size and crossing else ""
-        output.line(
-            f"Fourier shell correlation stays above {threshold:g} up to {crossing:.3f} cycles per voxel{length}"
-        )
+        reach = reach_in_words(comparison.crossings[threshold], threshold, second.voxel_size)
+        output.line(f"Fourier shell correlation {reach}")
     page = None
     if report is not None:
         report.mkdir(parents=True, exist_ok=True)

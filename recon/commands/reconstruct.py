@@ -155,7 +155,7 @@ def reconstruct(
                 tilt_series,
                 outcome,
                 seconds=time.perf_counter() - started,
-                inputs=files_read(tilts, angles, transforms, mask, noise_model),
+                inputs=files_read(tilts, angles, transforms, mask, noise_model, reference),
                 seed=seed,
                 prepared=prepared,
                 halves=halves,
