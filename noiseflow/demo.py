@@ -56,7 +56,7 @@ def demo(
         "--reference",
         phantom / "truth.mrc",
     )
-    run("compare", out / "phantom.mrc", phantom / "truth.mrc")
+    run("compare", out / "phantom.mrc", phantom / "truth.mrc", "--report", out / "comparison")
     page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
     output.result({"report": page.resolve(), "seconds": time.perf_counter() - started})

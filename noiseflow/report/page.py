@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -42,8 +43,9 @@ class Report:
         self._parts.append(f"<p>{html.escape(text)}</p>")
 
     def command(self, text: str) -> None:
-        """Add a command as it would be typed."""
-        self._parts.append(f'<p class="command">{html.escape(text)}</p>')
+        """Add a command as it would be typed; no line ends within an option."""
+        unbroken = re.sub(r"(?<!\S)(--\S+)", r"<span>\1</span>", html.escape(text))
+        self._parts.append(f'<p class="command">{unbroken}</p>')
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
         """Add the few figures that matter most, (name, value), as cards."""
