@@ -23,8 +23,8 @@ def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerD
 def read_layers(path: str | list[str]) -> list[LayerData]:
     """Read an image, tilt series or volume as one layer, with its voxel size in Å.
 
-    A stack with tilt angles in or beside the file keeps them in the layer's metadata as ``tilt_angles``, degrees; its first
-    axis has no length.
+    A stack with tilt angles in or beside the file keeps them in the layer's metadata as ``tilt_angles``, degrees. Its first
+    axis has no length; it steps by a pixel, so that one slider moves through it and through its volume.
 
     Raises:
         FileNotFoundError, ValueError: as `noiseflow.io.read`.
@@ -39,7 +39,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
         except FileNotFoundError:
             pass
         else:
-            scale[0] = 1.0
+            scale[0] = scale[-1]
     if image.voxel_size is not None:
         metadata["voxel_size"] = image.voxel_size
     return [(image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")]

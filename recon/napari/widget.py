@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from recon.methods import Progress
 
 _STEPS = 150
+_BUTTON = "Reconstruct"
 
 
 def reconstruct_layer(
@@ -87,21 +88,31 @@ def reconstruct_widget() -> Any:
     ) -> None:
         options = {"angles": angles, "mode": mode, "method": method, "thickness": thickness, "invert_tilt": invert_tilt}
         worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
-        form.call_button.enabled = False
-        worker.returned.connect(lambda layer: viewer.add_image(layer[0], **layer[1]))
-        worker.finished.connect(lambda: setattr(form.call_button, "enabled", True))
+        button = form.call_button
+        button.enabled, button.text = False, "Reconstructing …"
+        worker.yielded.connect(lambda done: setattr(button, "text", f"Reconstructing: step {done}"))
+        worker.returned.connect(lambda layer: _show(viewer, tilts, layer))
+        worker.finished.connect(lambda: setattr(button, "text", _BUTTON))
+        worker.finished.connect(lambda: setattr(button, "enabled", True))
         worker.start()
 
     form: Any = magicgui(
         start,
-        call_button="Reconstruct",
-        angles={"mode": "r", "nullable": True, "label": "angle file"},
-        mode={"choices": ["linear", "transmission"]},
+        call_button=_BUTTON,
+        angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "where the layer has no angles"},
+        mode={"choices": ["linear", "transmission"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
         method={"choices": [name for name in METHODS if name != "joint-supervised"]},
-        thickness={"min": 0, "max": 10_000, "tooltip": "voxels along the beam; 0 for the image width"},
+        thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
         num_steps={"min": 1, "max": 10_000, "label": "steps"},
     )
     return form
+
+
+def _show(viewer: Any, tilts: Any, layer: LayerData) -> None:
+    """Add the volume in place of the tilts, and go to its middle."""
+    viewer.add_image(layer[0], **layer[1])
+    tilts.visible = False
+    viewer.dims.set_point(0, layer[1]["scale"][0] * (len(layer[0]) // 2))
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:

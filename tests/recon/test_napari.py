@@ -41,8 +41,7 @@ def test_reader_gives_pixels_angles_and_scale(needle):
     assert not rest
     assert kind == "image"
     assert len(attributes["metadata"]["tilt_angles"]) == len(pixels)
-    assert attributes["scale"][0] == 1.0
-    assert attributes["scale"][1] == pytest.approx(attributes["metadata"]["voxel_size"][1])
+    assert attributes["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][2]] * 3)
 
 
 def test_reader_declines_what_is_not_its_own():
@@ -103,5 +102,7 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
         time.sleep(0.02)
     volume = viewer.layers[1]
     assert volume.data.shape == (16, 6, 64)
+    assert not layer.visible
+    assert viewer.dims.current_step[0] == 8
     (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin="noiseflow")
     np.testing.assert_array_equal(io.read(written).data, volume.data)
