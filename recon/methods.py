@@ -123,14 +123,24 @@ def reconstruct(tilt_series: TiltSeries, grid: VolumeGrid, *, method: str = "aut
         **settings: the attributes of `Settings`.
 
     Raises:
-        ValueError: unknown method, settings that make no sense, or a grid that does not match the images.
+        ValueError: as `settings_of`, or a grid that does not match the images.
+    """
+    chosen = settings_of(method, **settings)
+    return METHODS[method](tilt_series, grid, chosen)
+
+
+def settings_of(method: str, **settings: Any) -> Settings:
+    """The settings of one of `METHODS`, checked before there are data. Arguments as of `reconstruct`.
+
+    Raises:
+        ValueError: unknown method, or settings that make no sense.
     """
     if method not in METHODS:
         raise ValueError(f"--method {method}: choose one of {', '.join(METHODS)}")
     chosen = Settings(**settings)
     if chosen.defocus and (method.startswith(("sirt", "wbp")) or method in PRESETS):
         raise ValueError(f"--defocus: method {method} models none; use --method joint, l2, l1, tv or explicit")
-    return METHODS[method](tilt_series, grid, chosen)
+    return chosen
 
 
 @method("auto")

@@ -105,12 +105,20 @@ def reconstruct(
     from noiseflow.io import require_other
     from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
+    from recon.methods import settings_of
     from recon.report import read_reference
     from recon.tilt_series import VolumeGrid
 
     output, targets = Output(json), Targets(out, report=report, noise_model=save_noise_model)
     require_other(out, tilts, angles, transforms, mask, reference)
+    method, chosen_device = method_of(method, preset), choose_device(device)
+    options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
+    options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
+    settings_of(**options)
+    if save_noise_model is not None and method.startswith(("sirt", "wbp")):
+        raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
     with warnings_as_lines(output) as warned:
+        fixed = load_noise_model(noise_model)
         tilt_series = load_tilt_series(
             tilts,
             angles=angles,
@@ -128,21 +136,16 @@ def reconstruct(
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
                 keep_tilts=keep_tilts,
-                device=choose_device(device),
+                device=chosen_device,
                 output=output,
                 report=progress,
             )
         tilt_series = prepared.tilt_series
-        grid, method = VolumeGrid.of(tilt_series, thickness), method_of(method, preset)
-        if save_noise_model is not None and method.startswith(("sirt", "wbp")):
-            raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
+        grid = VolumeGrid.of(tilt_series, thickness)
         truth = None if reference is None else read_reference(reference, grid)
-        options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
-        options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
-        fixed = load_noise_model(noise_model)
-        options |= {"noise_model": fixed, "device": choose_device(device)}
-        output.line(memory_line(tilt_series, grid, method, options["device"], slices_at_once))
+        options |= {"noise_model": fixed, "device": chosen_device}
+        output.line(memory_line(tilt_series, grid, method, chosen_device, slices_at_once))
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
         with stoppable(journal, context), scratch_beside(out) as scratch:
