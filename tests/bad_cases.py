@@ -121,7 +121,7 @@ reconstruct {bad}/inf.npy -o {out}/v.mrc | infinite
 reconstruct {bad}/flat.npy -o {out}/v.mrc | flat
 reconstruct {good}/tilts.mrc --angles {bad}/missing.tlt -o {out}/v.mrc | does not exist
 reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is no file
-reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is not an angle
+reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is no text
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:system | it failed on an image
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:name | it failed on an image
 reconstruct {good}/tilts.mrc --angles {bad}/empty.tlt -o {out}/v.mrc | no angles
@@ -170,7 +170,7 @@ simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | would be lost
 reconstruct {good}/tilts.rawtlt -o {out}/v.mrc | is no image but a file of tilt angles
-reconstruct {good}/tilts.mrc --angles {good}/tilts.mrc -o {out}/v.mrc | line 1
+reconstruct {good}/tilts.mrc --angles {good}/tilts.mrc -o {out}/v.mrc | is no text
 reconstruct {good}/model.safetensors -o {out}/v.mrc | is no image but a noise model
 reconstruct {good}/tilts.mrc --preset magic -o {out}/v.mrc | kniesel2022
 reconstruct {good}/tilts.mrc --window magic -o {out}/v.mrc | hann

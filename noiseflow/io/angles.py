@@ -30,7 +30,10 @@ def read_angles(path: str | Path) -> NDArray[np.float64]:
         raise FileNotFoundError(
             f"angle file {path} {'is no file' if path.exists() else 'does not exist'}; check the path"
         )
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if "\0" in text:
+        raise ValueError(f"{path} is no text; an angle file has one angle in degrees per line")
+    lines = text.splitlines()
     values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
     if not values:
         raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")

@@ -32,7 +32,10 @@ def read_folder(folder: Path) -> ImageFile:
     for name, image in zip(names, images, strict=True):
         section = image.data[0] if image.data.ndim == 3 and len(image.data) == 1 else image.data
         if section.ndim != 2:
-            raise ValueError(f"{folder / name} holds a stack of shape {image.data.shape}; a folder needs single images")
+            raise ValueError(
+                f"{folder / name} holds a stack of shape {image.data.shape}; a folder needs single "
+                "images: name the stack itself, or move it elsewhere"
+            )
         if sections and section.shape != sections[0].shape:
             raise ValueError(
                 f"{folder / name} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
