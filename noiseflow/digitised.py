@@ -16,7 +16,7 @@ from noiseflow.picked import Signal, given_to, values_of
 
 _MOMENT_NODES = 257
 _MOMENT_COUNT = 2**18
-_LEAST_CLEAR, _RAILED = 256, 0.02
+_LEAST_KEPT, _RAILED = 256, 0.02
 
 
 class Digitised(ArrayModel):
@@ -54,26 +54,38 @@ class Digitised(ArrayModel):
         return Digitised(self.model, step=self.step)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """Standardise the model inside, on the (N,) pixels whose signal lies clear of the rails where there are enough."""
-        values = values_of(signal)
-        clear = self._clear_of_rails(values, observation)
-        if int(clear.sum()) < max(_LEAST_CLEAR, 0.1 * clear.numel()):
-            clear = torch.ones_like(clear)
+        """Standardise the model inside, on what of the (N,) pixels the rails leave as it was, where that is enough."""
         if not hasattr(self.model, "standardise"):
             return
-        span = {"span": (float(values.min()), float(values.max()))} if hasattr(self.model, "standardisation") else {}
-        self.model.standardise(given_to(self.model, signal[clear]), observation[clear], **span)  # type: ignore[operator]
+        values, is_flow = values_of(signal), hasattr(self.model, "standardisation")
+        kept, seen = self._before_rails(values, observation, mirror=is_flow)
+        if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
+            kept, seen = torch.ones_like(kept), observation
+        span = {"span": (float(values.min()), float(values.max()))} if is_flow else {}
+        self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)  # type: ignore[operator]
         if hasattr(self.model, "settle"):  # the converter spoils what it was standardised on; now its part is known
             self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))  # type: ignore[operator]
 
-    def _clear_of_rails(self, signal: Tensor, observation: Tensor) -> Tensor:
-        """Pixels among whose 64 equally populated groups by signal hardly any reading is clipped."""
-        railed = (observation <= self.low) | (observation >= self.high)
-        clear = torch.ones_like(railed)
+    def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
+        """Which pixels the rails leave as they were, boolean, and their readings.
+
+        Of 64 equally populated groups by signal, those are kept of which hardly any reading is clipped. Where one rail clips,
+        `mirror` keeps what lies on the other side of the signal, half of it mirrored: it is as wide as the noise was.
+        """
+        kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
+        within = (signal > self.low) & (signal < self.high)
         for group in torch.tensor_split(torch.argsort(signal), 64):
-            if group.numel() and float(railed[group].float().mean()) > _RAILED:
-                clear[group] = False
-        return clear
+            on_low, on_high = (
+                float(railed.float().mean()) > _RAILED
+                for railed in (observation[group] <= self.low, observation[group] >= self.high)
+            )
+            kept[group] = not (on_low or on_high)
+            if mirror and on_low != on_high:
+                deviation = observation[group] - signal[group]
+                free = group[within[group] & (deviation > 0 if on_low else deviation < 0)]
+                kept[free] = True
+                seen[free[::2]] = 2 * signal[free[::2]] - observation[free[::2]]
+        return kept, seen
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
         """What of the likelihood of (N,) pixels does not change while the model inside learns; None where everything may."""

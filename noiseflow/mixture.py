@@ -1,4 +1,4 @@
-"""A mixture of Gaussians whose weights, means and widths are smooth functions of the signal."""
+"""A mixture of Gaussians whose weights, means and widths, or whose width alone, are smooth functions of the signal."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from noiseflow.transforms import between_rows
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _BISECTIONS = 60
+_SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
 
 
 class Mixture(ArrayModel):
@@ -26,6 +27,7 @@ class Mixture(ArrayModel):
 
     Args:
         num_components: number of Gaussians.
+        shared_shape: give all signals the same shape of the noise; only its location and scale vary with the signal.
         mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
         width: hidden units of the network that turns a signal into the parameters.
 
@@ -36,17 +38,27 @@ class Mixture(ArrayModel):
         ValueError: fewer than one component.
     """
 
-    def __init__(self, num_components: int = 3, *, mean_preserving: bool = False, width: int = 32) -> None:
+    def __init__(
+        self,
+        num_components: int = 3,
+        *,
+        shared_shape: bool = False,
+        mean_preserving: bool = False,
+        width: int = 32,
+    ) -> None:
         super().__init__()
         if num_components < 1:
             raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
-        self.num_components, self.mean_preserving, self.width = num_components, mean_preserving, width
+        self.num_components, self.shared_shape = num_components, shared_shape
+        self.mean_preserving, self.width = mean_preserving, width
         self.tabulate = True
         self.standardisation = Standardisation()
         # apart from the start, or all components would stay equal: means ±½, the outer ones wider
         place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
-        self.bias = nn.Parameter(torch.stack([-place.abs(), place, place.abs() - 0.2]))
-        self.conditioner = conditioning_network(3 * num_components, width)
+        start = torch.stack([-place.abs(), place, place.abs() - 0.2])
+        self.bias = nn.Parameter(start / _SHAPE_GAIN if shared_shape else start)
+        num_outputs = (1 if mean_preserving else 2) if shared_shape else 3 * num_components
+        self.conditioner = conditioning_network(num_outputs, width)
 
     def forward(self, signal: Tensor) -> MixtureDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
@@ -61,6 +73,12 @@ class Mixture(ArrayModel):
             at_nodes = self.conditioner(conditioning_features(nodes).to(self.bias.dtype))
             row, weight = between_nodes(coordinate, self.bias.dtype)
             conditional = between_rows(at_nodes, row, weight)
+        if self.shared_shape:
+            raw = (_SHAPE_GAIN * self.bias).expand(*coordinate.shape, 3, self.num_components)
+            log_scale = log_scale + 5 * torch.tanh(conditional[..., 0] / 5)
+            if not self.mean_preserving:
+                location = location + torch.exp(log_scale) * conditional[..., 1]
+        else:
             raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
         log_weight = torch.log_softmax(raw[..., 0, :], -1)
         centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
@@ -76,10 +94,12 @@ class Mixture(ArrayModel):
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""
-        return {"num_components": self.num_components, "mean_preserving": self.mean_preserving, "width": self.width}
+        names = ("num_components", "shared_shape", "mean_preserving", "width")
+        return {name: getattr(self, name) for name in names}
 
     def extra_repr(self) -> str:
-        return f"{self.num_components} components, width={self.width}, mean_preserving={self.mean_preserving}"
+        shape = ", shared_shape=True" if self.shared_shape else ""
+        return f"{self.num_components} components{shape}, width={self.width}, mean_preserving={self.mean_preserving}"
 
 
 class MixtureDistribution(NoiseDistribution):

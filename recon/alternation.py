@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult
-from recon.candidates import is_stiff, learns, num_steps_of, rate_of
+from recon.candidates import learns, num_steps_of, rate_of
 from recon.signal_model import TomographySignal
 
 Progress = Callable[[int, str], None]
@@ -24,7 +24,6 @@ _QUIET = 0.2  # noise relative to contrast
 _STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
-_ENOUGH_LOOKS = 8
 
 
 class Alternation:
@@ -64,7 +63,7 @@ class Alternation:
     def begin_and_alternate(
         self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, quiet: bool, progress: Progress | None
     ) -> FitResult:
-        """A third of the steps with simple noise, which pulls at a rough signal steadily, and the rest with the model of choice.
+        """A quarter of the steps with simple noise, which pulls at a rough signal steadily; the rest with the model of choice.
 
         Args:
             first: the simple noise, learnt.
@@ -73,7 +72,7 @@ class Alternation:
             quiet: whether there is little noise; the simple one then settles the signal first.
             progress: called with the steps done and a note.
         """
-        begun = min(_SETTLING[0], num_steps // 3)
+        begun = min(_SETTLING[0], num_steps // 4)
         if quiet:
             self.settle(first, thoroughly=True, progress=progress)
         elif begun:
@@ -116,18 +115,16 @@ class Alternation:
         standardise: bool = False,
         progress: Progress | None = None,
     ) -> FitResult:
-        """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: until the new signal
-        leaves the noise model as it was, or held-out pixels gain little. A turn that was at its best early took steps too large,
-        and another follows.
+        """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: twice, and on until
+        the new signal leaves the noise model as it was, or held-out pixels gain little.
 
         Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
         again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
-        wander with the few outliers of each batch, and drags the signal along. Noise of a fixed shape cannot, and learns with the
-        signal: behind a rail its width and the incident intensity go together, and by turns they would take for ever.
+        wander with the few outliers of each batch, and drags the signal along.
 
         Args:
             noise_model: fitted in place.
-            num_steps: of the signal in the first turn; the next take less than half as many.
+            num_steps: of the signal in the first two turns; the second takes less than half as many as the first.
             rate: of the first turn, relative to the usual learning rate.
             begun: steps taken before.
             standardise: fit the noise model from scratch first.
@@ -136,16 +133,18 @@ class Alternation:
         if standardise:
             self.refine(noise_model, standardise=True)
         done, reached = begun, math.inf
+        first = math.ceil(num_steps / (1 + _LATER_TURN))
         for turn in range(_MOST_TURNS):
-            steps = num_steps if turn == 0 else round(_LATER_TURN * num_steps)
+            steps = first if turn == 0 else max(1, num_steps - first)
             later = None if progress is None else partial(_continue, progress, done)
-            with nullcontext() if is_stiff(noise_model) else frozen(noise_model):
+            with frozen(noise_model):
                 result = self.fit_signal(noise_model, num_steps=steps, rate=rate * _NEXT_RATE**turn, progress=later)
             done += result.num_steps
             if turn > 0 and reached - result.held_out_nll < _SETTLED:
                 break
             reached = result.held_out_nll
-            if result.held_out_nll - self.refine(noise_model) < _STEADY and not _best_early(result.history):
+            gain = reached - self.refine(noise_model)
+            if turn > 0 and gain < _STEADY:
                 break
         return result
 
@@ -155,12 +154,6 @@ class Alternation:
             return -math.inf
         options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
         return self.fit(noise_model, known=True, **options).held_out_nll
-
-
-def _best_early(history: dict[int, float]) -> bool:
-    """Whether a fit was at its best before its middle, as far as enough looks can tell."""
-    best = min(history, key=lambda step: history[step])
-    return len(history) >= _ENOUGH_LOOKS and best < max(history) / 2
 
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:

@@ -13,13 +13,13 @@ from noiseflow import (
     Gaussian,
     Mixture,
     PoissonGaussian,
-    RadialFlow,
     SignalDependentGaussian,
     SplineFlow,
     detect_digitisation,
 )
 
 _CLIPPED = 0.02
+_SHARED = 6  # Gaussians of a shape that all signals share: enough for a long tail on one side
 _EXACT_STEPS = 15
 
 
@@ -31,10 +31,9 @@ def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
     seen at other signals stands in for what is hidden.
     """
     digitisation = detect_digitisation(images)
-    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian()]
-    if _clipped(images, digitisation):
-        models.append(RadialFlow(6, num_conditional=0, mean_preserving=True))
-    else:
+    one_shape = Mixture(_SHARED, shared_shape=True, mean_preserving=True)
+    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian(), one_shape]
+    if not _clipped(images, digitisation):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
@@ -52,12 +51,6 @@ def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
 def learns(noise_model: nn.Module) -> bool:
     """Whether a noise model has anything to learn."""
     return any(parameter.requires_grad for parameter in noise_model.parameters())
-
-
-def is_stiff(noise_model: nn.Module) -> bool:
-    """Whether the noise has one shape and only its width is learnt."""
-    base = noise_model.model if isinstance(noise_model, Digitised) else noise_model
-    return isinstance(base, Gaussian | SignalDependentGaussian)
 
 
 def num_steps_of(noise_model: nn.Module, usual: int) -> int:

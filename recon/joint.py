@@ -80,7 +80,7 @@ class JointReconstructor:
     weight: float | None = None
     noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
-    num_steps: int = 120
+    num_steps: int = 150
     estimate_response: bool = True
     skip_vacuum: bool = True
     defocus: float = 0.0
@@ -190,19 +190,22 @@ class _Chosen:
 
 
 def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
-    """The simplest that predicts held-out pixels nearly as well as the best: what a richer one gains beyond may be a bias of the
-    signal that it took for noise. Where the richest gains nothing, those between are not tried."""
-    simplest, *between, richest = (model.to(task.observation.device) for model in candidates)
+    """The simplest that predicts held-out pixels nearly as well as the richest: what a richer one gains beyond may be a bias of
+    the signal that it took for noise."""
+    *simpler, richest = (model.to(task.observation.device) for model in candidates)
 
     def nll(model: nn.Module) -> float:
         return task.fit(model, known=True, num_steps=num_steps_of(model, 100)).held_out_nll
 
-    found = {simplest: nll(simplest), richest: nll(richest)}
-    if found[simplest] <= found[richest] + _TOLERATED:
-        return simplest
-    found |= {model: nll(model) for model in between}
+    found: dict[nn.Module, float] = {}
+    lowest = nll(richest)
+    for model in simpler:
+        found[model] = nll(model)
+        if found[model] <= lowest + _TOLERATED:
+            break
+    found[richest] = lowest
     good_enough = min(found.values()) + _TOLERATED
-    return next(model for model in (simplest, *between, richest) if found[model] <= good_enough)
+    return next(model for model in found if found[model] <= good_enough)
 
 
 def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:

@@ -107,6 +107,19 @@ def test_fine_rounding_costs_no_accuracy_in_single_precision(name: str) -> None:
     assert float(difference.abs().max()) < 2e-3
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.0, math.inf), (-math.inf, 1.0), (0.0, 1.0)])
+def test_a_flow_starts_with_the_width_that_the_noise_had_before_the_rails(low: float, high: float) -> None:
+    signal = torch.linspace(0.0, 1.0, 200_000)
+    width = 0.05 + 0.2 * signal
+    observation = signal + width * torch.randn(signal.shape, generator=torch.Generator().manual_seed(0))
+    model = noiseflow.Digitised(noiseflow.SignalDependentGaussian(), 0.0, low, high)
+    model.standardise(signal, observation.clamp(low, high))
+    with torch.no_grad():
+        found = model.model(signal).stddev
+    assert float((found / width).log().abs().max()) < 0.1
+    assert float((found / width)[::20].log().abs().median()) < 0.02
+
+
 def test_pixels_that_are_not_finite_are_left_out_where_asked() -> None:
     signal, observation = image(1 / 20)
     broken = observation.clone()

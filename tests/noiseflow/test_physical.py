@@ -28,6 +28,8 @@ MODELS = {
         noiseflow.PhysicsFlow(mean_preserving=True, detector=noiseflow.PoissonGaussian(0.1, -0.05, 0.4))
     ),
     "mixture": lambda: noiseflow.Mixture(),
+    "mixture of one shape": lambda: noiseflow.Mixture(shared_shape=True),
+    "mixture of one shape, mean-preserving": lambda: noiseflow.Mixture(shared_shape=True, mean_preserving=True),
     "mixture, mean-preserving": lambda: noiseflow.Mixture(5, mean_preserving=True),
 }
 
@@ -294,14 +296,30 @@ class Caller(torch.nn.Module):
         return torch.stack([distribution.log_prob(observation), interval])
 
 
-def test_mixture_preserves_the_mean() -> None:
-    model = noiseflow.Mixture(4, mean_preserving=True).double()
+def shaken(model: noiseflow.Mixture) -> noiseflow.Mixture:
+    """The mixture with its parameters anywhere."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter.add_(torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
+            parameter.add_(torch.randn(parameter.shape, generator=generator).to(parameter))
+    return model.double()
+
+
+@pytest.mark.parametrize("shared_shape", [False, True])
+def test_mixture_preserves_the_mean(shared_shape: bool) -> None:
+    model = shaken(noiseflow.Mixture(4, shared_shape=shared_shape, mean_preserving=True))
     signal = torch.linspace(-0.2, 1.2, 50, dtype=torch.float64)
     assert torch.allclose(model(signal).mean, signal, atol=1e-12)
+
+
+@pytest.mark.parametrize("mean_preserving", [False, True])
+def test_shared_shape_varies_with_the_signal_in_width_alone(mean_preserving: bool) -> None:
+    model = shaken(noiseflow.Mixture(shared_shape=True, mean_preserving=mean_preserving))
+    with torch.no_grad():
+        noise = model(torch.linspace(0, 1, 20, dtype=torch.float64))
+        quantiles = torch.stack([(noise.icdf(q) - noise.mean) / noise.stddev for q in torch.tensor([0.01, 0.3, 0.9])])
+    assert float(noise.stddev.max() / noise.stddev.min()) > 1.5
+    assert torch.allclose(quantiles, quantiles[:, :1].expand_as(quantiles), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -12,6 +12,7 @@ MODELS = {
     "spline": lambda: noiseflow.SplineFlow(mean_preserving=True),
     "8-bit": lambda: noiseflow.Digitised(noiseflow.SplineFlow(), step=1 / 255, low=0.0, high=1.0),
     "clipped": lambda: noiseflow.Digitised(noiseflow.RadialFlow(), step=0.0, low=0.0, high=1.0),
+    "mixture of one shape": lambda: noiseflow.Mixture(shared_shape=True),
     "mixture": lambda: noiseflow.Mixture(),
 }
 

@@ -22,6 +22,7 @@ MODELS = {
 MODELS |= {
     "Poisson-Gaussian": lambda: noiseflow.PoissonGaussian(),
     "resolved electrons": lambda: noiseflow.PoissonGaussian(gain=0.2, read_noise=0.2),
+    "mixture of one shape": lambda: noiseflow.Mixture(shared_shape=True, mean_preserving=True),
     "mixture": lambda: noiseflow.Mixture(mean_preserving=True),
     "physics and flow": lambda: noiseflow.PhysicsFlow(),
     "8-bit mixture": lambda: noiseflow.Digitised(noiseflow.Mixture(), step=1 / 255, low=0.0, high=1.0),
