@@ -179,8 +179,8 @@ def test_table_agrees_with_the_exact_likelihood(clipped: bool) -> None:
 
 def test_table_widens_where_signals_leave_it() -> None:
     model = noiseflow.Digitised(noiseflow.SignalDependentGaussian(), step=0.0, high=1.0)
-    signal = torch.linspace(0.2, 1.0, 5000)
-    observation = (signal + 0.2 * torch.randn(5000, generator=torch.Generator().manual_seed(0))).clamp(max=1.0)
+    signal = torch.linspace(0.2, 1.0, 100_000)
+    observation = (signal + 0.2 * torch.randn(100_000, generator=torch.Generator().manual_seed(0))).clamp(max=1.0)
     model.standardise(signal, observation)
     table = ObservationTable(model, observation, 0.2, 1.0)
     brighter = (signal + 0.3).requires_grad_()
