@@ -1,36 +1,19 @@
 """The commands end to end, and what they answer to bad input."""
 
-import json
 import shutil
 
 import mrcfile
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from noiseflow import io
-from recon import cli
-
-
-def program():
-    app = typer.Typer(pretty_exceptions_enable=False)
-    for command in (cli.simulate, cli.reconstruct, cli.compare):
-        app.command(command.__name__)(command)
-    return app
-
-
-def run(*arguments):
-    result = CliRunner().invoke(program(), [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return json.loads(result.stdout.splitlines()[-1])
+from tests.commands import run_command
 
 
 @pytest.fixture(scope="module")
 def series(tmp_path_factory):
     folder = tmp_path_factory.mktemp("series") / "new"
-    run("simulate", folder, "--size", 16, "--tilts=-60:60:6", "--json")
+    run_command("simulate", folder, "--size", 16, "--tilts=-60:60:6")
     return folder
 
 
@@ -45,14 +28,14 @@ def scaled(series, tmp_path_factory):
 
 def require_volume_and_report(series, scaled, folder, method, *more):
     out, page = folder / "volume.mrc", folder / "report"
-    result = run("reconstruct", scaled, "-o", out, "--method", method, *more, "--report", page, "--json")
+    result = run_command("reconstruct", scaled, "-o", out, "--method", method, *more, "--report", page)
     assert result["method"] == method
     with mrcfile.open(out) as volume:
         assert volume.data.shape == (16, 16, 16)
         assert float(volume.voxel_size.z) == pytest.approx(7.5)
         assert np.isfinite(volume.data).all()
     assert 'data-widget="volume"' in (page / "index.html").read_text(encoding="utf-8")
-    assert run("compare", out, series / "truth.mrc", "--json")["errors"]["affine"]["psnr"] > 5
+    assert run_command("compare", out, series / "truth.mrc")["errors"]["affine"]["psnr"] > 5
 
 
 @pytest.mark.parametrize("method", ["l2", "tv", "sirt", "wbp"])
@@ -63,14 +46,14 @@ def test_every_method_writes_a_volume_and_a_report(series, scaled, tmp_path, met
 def test_joint_fits_of_the_same_seed_write_the_same_volume(series, scaled, tmp_path):
     options = ["--weight", 0.4, "--steps", 5, "--seed", 3]
     require_volume_and_report(series, scaled, tmp_path, "joint", *options)
-    run("reconstruct", scaled, "-o", tmp_path / "again.mrc", *options, "--json")
+    run_command("reconstruct", scaled, "-o", tmp_path / "again.mrc", *options)
     first, again = (io.read(tmp_path / name).data for name in ("volume.mrc", "again.mrc"))
     np.testing.assert_array_equal(first, again)
 
 
 def test_inverted_tilt_mirrors_the_volume(series, tmp_path):
     for name, more in (("a.npy", []), ("b.npy", ["--invert-tilt"])):
-        run("reconstruct", series / "tilts.mrc", "-o", tmp_path / name, "--method", "wbp", *more, "--json")
+        run_command("reconstruct", series / "tilts.mrc", "-o", tmp_path / name, "--method", "wbp", *more)
     np.testing.assert_allclose(np.load(tmp_path / "a.npy")[::-1], np.load(tmp_path / "b.npy"), atol=1e-5)
 
 
@@ -91,7 +74,7 @@ def test_bad_series_gives_one_clear_line_and_no_volume(series, tmp_path, damage,
     np.save(tmp_path / "bad.npy", images)
     np.savetxt(tmp_path / "bad.tlt", angles)
     with pytest.raises(ValueError, match=words):
-        run("reconstruct", tmp_path / "bad.npy", "-o", tmp_path / "out.mrc")
+        run_command("reconstruct", tmp_path / "bad.npy", "-o", tmp_path / "out.mrc")
     assert not (tmp_path / "out.mrc").exists()
 
 
@@ -107,10 +90,10 @@ def test_bad_series_gives_one_clear_line_and_no_volume(series, tmp_path, damage,
 )
 def test_bad_options_give_one_clear_line(series, tmp_path, arguments, words):
     with pytest.raises((ValueError, FileNotFoundError), match=words):
-        run("reconstruct", series / "tilts.mrc", "-o", tmp_path / "out.mrc", *arguments)
+        run_command("reconstruct", series / "tilts.mrc", "-o", tmp_path / "out.mrc", *arguments)
     assert not (tmp_path / "out.mrc").exists()
 
 
 def test_output_that_cannot_be_written_is_refused_before_the_work(series, tmp_path):
     with pytest.raises(FileNotFoundError, match="create the folder"):
-        run("reconstruct", series / "tilts.mrc", "-o", tmp_path / "none" / "out.mrc")
+        run_command("reconstruct", series / "tilts.mrc", "-o", tmp_path / "none" / "out.mrc")

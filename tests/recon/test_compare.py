@@ -1,28 +1,15 @@
 """`noiseflow compare`: errors in three dimensions and in projections, shell correlation, pictures, and what it refuses."""
 
-import json
-
 import mrcfile
 import numpy as np
 import pytest
-import typer
 from scipy.ndimage import gaussian_filter
-from typer.testing import CliRunner
 
-from recon.commands.compare import compare as command
 from recon.comparison import compare_volumes, project
 from recon.metrics import compare, compare_images, fourier_shell_correlation, resolution
 from recon.phantoms import make_phantom
 from recon.tilt_series import Volume
-
-
-def run(*arguments):
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(command)
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return json.loads(result.stdout.splitlines()[-1])
+from tests.commands import run_command
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +28,9 @@ def write(path, array, voxel_size=10.0):
 def test_command_tells_all_and_draws_it(volumes, tmp_path):
     truth, noisy = volumes
     (tmp_path / "angles.tlt").write_text("-30\n0\n45\n")
-    result = run(
+    result = run_command("compare", 
         write(tmp_path / "a.mrc", 3 * noisy - 1), write(tmp_path / "b.mrc", truth), "--angles", tmp_path / "angles.tlt",
-        "--report", tmp_path / "page", "--json",
+        "--report", tmp_path / "page",
     )  # fmt: skip
     left = (
         0.01 * truth.var() / (0.01 + truth.var()) / float(np.ptp(truth)) ** 2
@@ -99,10 +86,10 @@ def test_what_cannot_be_compared_gets_one_clear_line(volumes, tmp_path):
     truth, noisy = volumes
     a = write(tmp_path / "a.mrc", truth)
     with pytest.raises(ValueError, match=r"24 x 24 x 24 voxels and the reference 24 x 24 x 20"):
-        run(a, write(tmp_path / "small.mrc", truth[..., :20]))
+        run_command("compare", a, write(tmp_path / "small.mrc", truth[..., :20]))
     with pytest.raises(ValueError, match="10 Å in the volume and 12 Å"):
-        run(a, write(tmp_path / "coarse.mrc", noisy, voxel_size=12.0))
+        run_command("compare", a, write(tmp_path / "coarse.mrc", noisy, voxel_size=12.0))
     with pytest.raises(ValueError, match="volume \\(z, y, x\\) is needed"):
-        run(a, write(tmp_path / "image.mrc", truth[0]))
+        run_command("compare", a, write(tmp_path / "image.mrc", truth[0]))
     with pytest.raises(ValueError, match="flat"):
-        run(a, write(tmp_path / "flat.mrc", np.ones_like(truth)))
+        run_command("compare", a, write(tmp_path / "flat.mrc", np.ones_like(truth)))

@@ -1,32 +1,19 @@
 """`noiseflow simulate`: the same series streamed as in memory, and every file in its place."""
 
-import json
-
 import mrcfile
 import numpy as np
 import pytest
 import torch
-import typer
-from typer.testing import CliRunner
 
 import noiseflow
 from recon import streaming
-from recon.commands.simulate import simulate
 from recon.defocused_projector import DefocusedProjector
 from recon.phantoms import make_phantom
 from recon.projector import SliceProjector
 from recon.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range
 from recon.streaming import Simulation
 from recon.tilt_series import read_tilt_series
-
-
-def run(*arguments):
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(simulate)
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return json.loads(result.stdout.splitlines()[-1])
+from tests.commands import run_command
 
 
 def data(path):
@@ -57,7 +44,7 @@ def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise)
 
 
 def test_judging_projections_are_at_other_angles_and_of_the_same_volume(tmp_path):
-    result = run(tmp_path / "s", "--size", 16, "--tilts=-60:60:3", "--json")
+    result = run_command("simulate", tmp_path / "s", "--size", 16, "--tilts=-60:60:3")
     names = {path.name for path in (tmp_path / "s").iterdir()}
     assert names == {f"{name}.mrc" for name in ("tilts", "clean", "validation", "test", "truth")} | {
         f"{name}.rawtlt" for name in ("tilts", "clean", "validation", "test")
@@ -73,7 +60,7 @@ def test_judging_projections_are_at_other_angles_and_of_the_same_volume(tmp_path
 
 
 def test_clipping_puts_rails_on_any_noise(tmp_path):
-    run(tmp_path / "s", "--size", 16, "--tilts=-60:60:12", "--noise", "gaussian", "--clip", "--json")
+    run_command("simulate", tmp_path / "s", "--size", 16, "--tilts=-60:60:12", "--noise", "gaussian", "--clip")
     images = data(tmp_path / "s" / "tilts.mrc")
     assert images.min() >= 0
     assert images.max() == 1
@@ -86,7 +73,9 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path):
     noisy = signal + 8 * torch.randn(4096, generator=torch.Generator().manual_seed(0))
     noiseflow.fit(model, signal, noisy, num_steps=30)
     noiseflow.save(model, tmp_path / "model.safetensors")
-    run(tmp_path / "s", "--size", 16, "--tilts=-60:60:12", "--noise", tmp_path / "model.safetensors", "--json")
+    run_command(
+        "simulate", tmp_path / "s", "--size", 16, "--tilts=-60:60:12", "--noise", tmp_path / "model.safetensors"
+    )
     clean, tilts = data(tmp_path / "s" / "clean.mrc"), data(tmp_path / "s" / "tilts.mrc")
     assert clean.max() == pytest.approx(300, rel=0.01)
     assert (tilts - clean)[clean > 200].std() == pytest.approx(8, rel=0.15)
@@ -107,7 +96,7 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path):
 )
 def test_mistakes_are_answered_and_leave_nothing(tmp_path, arguments, words):
     with pytest.raises(ValueError, match=words):
-        run(tmp_path / "s", "--size", 16, *arguments)
+        run_command("simulate", tmp_path / "s", "--size", 16, *arguments)
     assert not list(tmp_path.rglob("*.mrc"))
     assert not list(tmp_path.rglob(".simulate*"))
 
@@ -124,7 +113,7 @@ def test_angles_between_tilts_are_spread_evenly():
 def test_defocus_blurs_the_tilts_by_depth_and_not_the_images_to_judge_by(tmp_path, monkeypatch):
     monkeypatch.setattr(streaming, "_BLOCK_VOXELS", 5 * 24**2)  # blocks of five slices, less than the blur reaches
     for name, options in (("sharp", []), ("blurred", ["--defocus", 0.2])):
-        run(tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options, "--json")
+        run_command("simulate", tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options)
     truth, sharp, blurred = (
         data(tmp_path / name) for name in ("sharp/truth.mrc", "sharp/clean.mrc", "blurred/clean.mrc")
     )

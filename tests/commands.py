@@ -1,0 +1,19 @@
+"""Commands run in this process."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from typer.testing import CliRunner
+
+from noiseflow.cli import build_app
+
+
+def run_command(*arguments: object) -> dict[str, Any]:
+    """Run a command with ``--json``; returns its result, or raises what it raised."""
+    result = CliRunner().invoke(build_app(), [*map(str, arguments), "--json"])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    found: dict[str, Any] = json.loads(result.stdout.splitlines()[-1])
+    return found
