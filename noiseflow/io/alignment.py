@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.checks import text_lines
+
 
 def read_transforms(path: str | Path) -> NDArray[np.float64]:
     """Read an IMOD ``.xf`` file.
@@ -23,12 +25,8 @@ def read_transforms(path: str | Path) -> NDArray[np.float64]:
         ValueError: a line is not six numbers, a matrix cannot be inverted, or there is none.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"alignment file {path} {'is no file' if path.exists() else 'does not exist'}; check the path"
-        )
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text_lines(path, "alignment file", holds="six numbers per line"), 1):
         if not line.strip():
             continue
         try:

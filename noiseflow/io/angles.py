@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.checks import text_lines
 from noiseflow.io.images import ImageFile
 
 RAW_FIRST = (".rawtlt", ".tlt")
@@ -26,14 +27,7 @@ def read_angles(path: str | Path) -> NDArray[np.float64]:
         ValueError: a line is not a number, or there is none.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"angle file {path} {'is no file' if path.exists() else 'does not exist'}; check the path"
-        )
-    text = path.read_text(encoding="utf-8", errors="replace")
-    if "\0" in text:
-        raise ValueError(f"{path} is no text; an angle file has one angle in degrees per line")
-    lines = text.splitlines()
+    lines = text_lines(path, "angle file", holds="one angle in degrees per line")
     values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
     if not values:
         raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")

@@ -1,4 +1,4 @@
-"""Refusals that name the pixel: what comes after may trust the data."""
+"""Refusals that name the pixel or the line: what comes after may trust the data."""
 
 from __future__ import annotations
 
@@ -64,3 +64,18 @@ def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_nam
     raise ValueError(
         f"{format_name} holds no {data.dtype}, and values up to {data.max()} would lose digits; write .npy instead"
     )
+
+
+def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
+    """The lines of a text file of this kind.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no text.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{kind} {path} {'is no file' if path.exists() else 'does not exist'}; check the path")
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if "\0" in text:
+        raise ValueError(f"{path} is no text; an {kind} holds {holds}")
+    return text.splitlines()
