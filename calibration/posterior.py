@@ -158,6 +158,7 @@ def _sampler(log_posterior: LogPosterior, moves: list[Any], seed: int) -> Any:
     import emcee
 
     sampler = emcee.EnsembleSampler(NUM_WALKERS, 3, log_posterior, moves=moves, vectorize=True)
+    sampler.log_prob_fn = log_posterior  # not in emcee's wrapper, which prints a traceback on Ctrl-C
     sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own generator is of this kind
     return sampler
 

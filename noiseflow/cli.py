@@ -126,16 +126,47 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop leaves nothing half done
+            _keep_ctrl_c()
         build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
     except KeyboardInterrupt:
         end_stopped(f"stopped; {START_AGAIN}")
+    except SystemExit as end:
+        if (
+            end.code == 130 and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+        ):  # stopped again, before it was told
+            end_stopped(f"stopped; {START_AGAIN}")
+        raise
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:
+        if _came_of_ctrl_c(error):
+            end_stopped(f"stopped; {START_AGAIN}")
         if debug:
             raise
         print(f"noiseflow: {_in_one_line(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+def _keep_ctrl_c() -> None:
+    """Let an interrupt that came while an object was cleared away, where Python drops it, come again a moment later."""
+    others, main_thread = sys.unraisablehook, threading.main_thread().ident
+    if others.__module__ == __name__ or not hasattr(signal, "pthread_kill") or main_thread is None:
+        return
+
+    def again(found: Any) -> None:
+        if isinstance(found.exc_value, KeyboardInterrupt):
+            threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
+        else:
+            others(found)
+
+    sys.unraisablehook = again
+
+
+def _came_of_ctrl_c(error: BaseException | None) -> bool:
+    """Whether an interrupt became another error on its way, as it does while a compiled library is being imported."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _in_one_line(error: Exception) -> str:

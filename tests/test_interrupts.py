@@ -20,7 +20,7 @@ import noiseflow
 import recon.benchmark_named
 import recon.commands.results
 import recon.streaming
-from noiseflow import io
+from noiseflow import cli, console, io
 from tests.bad_files import make_good_files
 from tests.processes import finish, start
 
@@ -126,3 +126,39 @@ def test_a_program_that_is_stopped_ends_with_130(number: signal.Signals, good: P
     assert printed.strip().splitlines()[-1].startswith("noiseflow: ")
     assert "Traceback" not in printed
     assert not (tmp_path / "v.mrc").exists()
+
+
+def test_ctrl_c_while_an_object_is_cleared_away_is_not_lost() -> None:
+    program = """
+import os, signal, time
+from noiseflow.cli import _keep_ctrl_c
+
+class Cleared:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+_keep_ctrl_c()
+try:
+    Cleared()
+    time.sleep(30)
+except KeyboardInterrupt:
+    print("stopped")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
+def test_ctrl_c_that_became_another_error_is_one_still(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr(cli, "build_app", lambda: stopped)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["doctor"])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == f"noiseflow: stopped; {console.START_AGAIN}\n"

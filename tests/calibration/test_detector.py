@@ -12,7 +12,7 @@ from calibration.exposures import Burst, ExposurePair
 from calibration.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.likelihood import DetectorLikelihood, LevelMasses
 from calibration.photon_transfer import NotMeasurable, fit_photon_transfer
-from calibration.posterior import potential_scale_reduction, sample_posterior
+from calibration.posterior import NUM_WALKERS, _local_moves, _sampler, potential_scale_reduction, sample_posterior
 
 from .conftest import expose, rigid, textured_scene
 
@@ -242,3 +242,13 @@ def test_a_gain_that_cannot_be_told_from_none_is_refused():
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
     with pytest.raises(NotMeasurable, match="gain"):
         measure_detector([align_with(pair, still)])
+
+
+def test_ctrl_c_in_the_chain_prints_no_traceback(capsys):
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    sampler = _sampler(stopped, _local_moves(1.0), 0)
+    with pytest.raises(KeyboardInterrupt):
+        sampler.run_mcmc(np.random.default_rng(0).normal(size=(NUM_WALKERS, 3)), 1)
+    assert capsys.readouterr() == ("", "")
