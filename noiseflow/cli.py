@@ -119,32 +119,43 @@ def _options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in arguments
+    debug, interrupts = "--debug" in arguments, _Interrupts()
     if not debug:
         warnings.showwarning = _show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
     try:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's stop leaves nothing half done
+            signal.signal(signal.SIGTERM, interrupts)  # a batch system's stop leaves nothing half done
+            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                signal.signal(signal.SIGINT, interrupts)
             _keep_ctrl_c()
         build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
     except KeyboardInterrupt:
         end_stopped(f"stopped; {START_AGAIN}")
     except SystemExit as end:
-        if (
-            end.code == 130 and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-        ):  # stopped again, before it was told
+        untold = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # stopped again, before a line was printed
+        if end.code == 130 and untold:
             end_stopped(f"stopped; {START_AGAIN}")
         raise
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:
-        if _came_of_ctrl_c(error):
+        if interrupts.came:
             end_stopped(f"stopped; {START_AGAIN}")
         if debug:
             raise
         print(f"noiseflow: {_in_one_line(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+class _Interrupts:
+    """Raises `KeyboardInterrupt`, and remembers it: compiled libraries make errors of other kinds of it on its way."""
+
+    came = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        self.came = True
+        raise KeyboardInterrupt
 
 
 def _keep_ctrl_c() -> None:
@@ -160,13 +171,6 @@ def _keep_ctrl_c() -> None:
             others(found)
 
     sys.unraisablehook = again
-
-
-def _came_of_ctrl_c(error: BaseException | None) -> bool:
-    """Whether an interrupt became another error on its way, as it does while a compiled library is being imported."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _in_one_line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -151,7 +152,9 @@ except KeyboardInterrupt:
 
 def test_ctrl_c_that_became_another_error_is_one_still(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def stopped(*_: object, **__: object) -> None:
-        raise ImportError("initialization failed") from KeyboardInterrupt()
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise ImportError("initialization failed")
 
     monkeypatch.setattr(cli, "build_app", lambda: stopped)
     before = signal.getsignal(signal.SIGINT)
