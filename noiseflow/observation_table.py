@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.tabulated import SIZES, Columns, Rows, interpolate, log_likelihood, mean_error
+from noiseflow.tabulated import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood, mean_error
 
 _MAX_LEVELS = 1024
-_STRAY, _MARGIN = 1e-3, 0.2
+_STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
+_WORTHWHILE = 0.7  # error of finer columns, relative to that of the size before
 
 
 class ObservationTable:
@@ -72,13 +73,17 @@ class ObservationTable:
         self.error = self.measure_error(noise_model)
 
     def _refine(self, noise_model: nn.Module) -> None:
-        """Take the first size from the present one on that is accurate enough, or else the most accurate one."""
-        errors = {}
-        for size in range(self._size, len(self._choices)):
+        """Take the first size from the present one on that is accurate enough, or else the most accurate one; sizes between
+        are left out where finer columns gain little."""
+        errors: dict[int, float] = {}
+        size = self._size
+        while size < len(self._choices):
             errors[size] = self.error = self._build(noise_model, *self._choices[size])
             self._size = size
             if self.error <= self._tolerance:
                 return
+            stalled = self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
+            size = max(size + 1, len(SIZES)) if stalled else size + 1
         self._size = min(errors, key=lambda size: errors[size])
         self.error = self._build(noise_model, *self._choices[self._size])
 
@@ -89,9 +94,10 @@ class ObservationTable:
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
         if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
             return
-        margin = _MARGIN * max(self.high - self.low, high - low)
-        self.low = low - margin if low < self.low else self.low
-        self.high = high + margin if high > self.high else self.high
+        span = max(self.high - self.low, high - low)
+        # a wide margin at the weak end would take the resolution from weak signals, whose noise is the narrowest
+        self.low = 2 * low - self.low - _LOW_MARGIN * span if low < self.low else self.low
+        self.high = high + _MARGIN * span if high > self.high else self.high
         self._refine(noise_model)
 
     def check(self, noise_model: nn.Module) -> float:
@@ -103,11 +109,12 @@ class ObservationTable:
 
     def _build(self, noise_model: nn.Module, num_rows: int, num_columns: int, levels: Tensor | None) -> float:
         self._laid_out_for = copy.deepcopy(noise_model.state_dict())
-        self._rows = Rows(self.low, self.high, num_rows)
+        self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
+        self._rows = Rows(self._scale, num_rows)
         self._signals = self._rows.signals(self._observation)
         self._columns = None
         if levels is None:
-            self._columns = Columns.of(noise_model, self._observation, self._rows, num_columns)
+            self._columns = Columns.of(noise_model, self._observation, self._scale, num_columns)
             self._offset, self._rate, self._bounds = self._columns.position(self._observation)
             self._values = self._columns.values(self._signals)
         else:
@@ -125,9 +132,10 @@ class ObservationTable:
         value = log_likelihood(noise_model, self._signals, self._values, between_rails=self._columns is not None)
         (slope,) = torch.gradient(value, spacing=(self._signals[:, 0],), dim=0)
         if self._columns is not None:
-            # along a row of equal residual the observation moves with the signal: ∂/∂s at fixed o = ∂/∂s at fixed r − ∂/∂r
+            # along a column of equal residual r = t(o) − t(s) the observation moves with the signal:
+            # ∂/∂s at fixed o = ∂/∂s at fixed r − t'(s) ∂/∂r
             (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
-            slope[:, 1:-1] -= along
+            slope[:, 1:-1] -= along * self._scale.slope(self._signals)
         self._table = torch.stack([value, slope])[None].contiguous()
 
     def log_prob(self, signal: Tensor) -> Tensor:
@@ -138,10 +146,11 @@ class ObservationTable:
     def lookup(self, signal: Tensor, part: slice = slice(None)) -> tuple[Tensor, Tensor]:
         """Log-likelihood and its signal derivative at (N,) signals; of a part of the pixels, where one is given."""
         grid, clamped = self._grid[part], signal.detach().clamp(self.low, self.high)
-        torch.addcmul(self._offset[part], clamped, self._rate[part], value=-1, out=grid[:, 0])
+        root = self._scale.signal(clamped)
+        torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=grid[:, 0])
         if self._bounds is not None:
             torch.clamp(grid[:, 0], self._bounds[0][part], self._bounds[1][part], out=grid[:, 0])
-        self._rows.position(clamped, grid[:, 1])
+        self._rows.position(root, grid[:, 1])
         value, slope = interpolate(self._table, grid)
         return torch.addcmul(value, slope, signal.detach() - clamped), slope
 

@@ -20,38 +20,89 @@ LARGE = 2**18
 """Inputs of at least so many pixels are tabulated where no gradient is asked for."""
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
-_SHIFT = 0.01
+_LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
+_COARSE = 65
 _CHUNK = 2**16
 _LATENT_LIMIT = 6.5
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Signals from `low` to `high`, spaced evenly in the square root because weak signals change the noise fastest."""
+class RootScale:
+    """A scale of readings on which noise is about equally wide everywhere: √((reading − low)/(high − low) + shift).
+
+    Below `low` it goes on along its slope, for observations fall below every signal.
+    """
 
     low: float
     high: float
+    shift: float
+
+    @staticmethod
+    def of(noise_model: nn.Module, low: float, high: float, like: Tensor) -> RootScale:
+        """The scale for signals from `low` to `high`: the variance of the noise as a straight line between its extremes."""
+        variance = _variance(noise_model, low, high, like)
+        least, most = float(variance.min()), float(variance.max())
+        found = least / (most - least) if most > least else math.inf
+        return RootScale(low, high, min(max(found, _LEAST_SHIFT), _MOST_SHIFT))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The scale at `low` and at `high`."""
+        return self.shift**0.5, (1 + self.shift) ** 0.5
+
+    def signal(self, signal: Tensor) -> Tensor:
+        """The scale at signals inside the range."""
+        scale = 1 / (self.high - self.low)
+        return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
+
+    def observation(self, observation: Tensor) -> Tensor:
+        """The scale at any readings."""
+        share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
+        return self.signal(observation) + share / (2 * self.shift**0.5)
+
+    def inverse(self, root: Tensor) -> Tensor:
+        """The readings at places of the scale."""
+        start = self.shift**0.5
+        share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
+        return self.low + (self.high - self.low) * share
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Growth of the scale per unit of signal."""
+        return 0.5 / ((self.high - self.low) * self.signal(signal))
+
+
+def _variance(noise_model: nn.Module, low: float, high: float, like: Tensor) -> Tensor:
+    coarse = torch.linspace(low, high, _COARSE, dtype=like.dtype, device=like.device)
+    variance: Tensor = getattr(noise_model, "model", noise_model)(coarse).variance.detach()
+    return variance
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Signals spaced evenly on a scale."""
+
+    scale: RootScale
     count: int
 
     def signals(self, like: Tensor) -> Tensor:
         """The rows' signals, (rows, 1)."""
-        root = torch.linspace(_SHIFT**0.5, (1 + _SHIFT) ** 0.5, self.count, dtype=torch.float64)
-        return (self.low + (self.high - self.low) * (root**2 - _SHIFT)).to(like)[:, None]
+        root = torch.linspace(*self.scale.ends, self.count, dtype=torch.float64)
+        return self.scale.inverse(root).to(like)[:, None]
 
-    def position(self, signal: Tensor, out: Tensor) -> Tensor:
-        """Row coordinate in [−1, 1] of signals inside the range, written to `out`."""
-        scale, start, stop = 1 / (self.high - self.low), _SHIFT**0.5, (1 + _SHIFT) ** 0.5
-        root = signal.mul(scale).add_(_SHIFT - self.low * scale).clamp_(min=_SHIFT).sqrt_()
-        return torch.sub(root.mul_(2 / (stop - start)), 2 * start / (stop - start) + 1, out=out)
+    def position(self, root: Tensor, out: Tensor) -> Tensor:
+        """Row coordinate in [−1, 1] of places of the scale, written to `out`."""
+        start, stop = self.scale.ends
+        return torch.add(root * (2 / (stop - start)), -2 * start / (stop - start) - 1, out=out)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Equally spaced residuals o − s, with a column at each end for observations on a rail.
+    """Equally spaced residuals on a scale, with a column at each end for observations on a rail.
 
-    In texture coordinates an observation's column is offset − rate·signal; on a rail the rate is 0.
+    In texture coordinates an observation's column is offset − rate · (the signal's place on the scale); on a rail the rate is 0.
     """
 
+    scale: RootScale
     start: float
     stop: float
     count: int
@@ -65,16 +116,18 @@ class Columns:
 
     def values(self, signals: Tensor) -> Tensor:
         """Observations tabulated for the rows' signals (rows, 1): (rows, columns)."""
-        residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64).to(signals)
+        residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64, device=signals.device)
+        inner = self.scale.inverse(self.scale.signal(signals.double()) + residuals[None, :]).to(signals)
         ends = [
             torch.full_like(signals, rail if math.isfinite(rail) else 0.0) for rail in (self.rail_low, self.rail_high)
         ]
-        return torch.cat([ends[0], signals + residuals[None, :], ends[1]], dim=1)
+        return torch.cat([ends[0], inner, ends[1]], dim=1)
 
     def position(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
         """Offset, rate and, where some residuals may lie outside the columns, the bounds that keep them off the rails."""
         unit = 2 / (self.count + 1)
-        offset = observation * (unit / self.step) + ((1 - self.start / self.step) * unit - 1)
+        root = self.scale.observation(observation)
+        offset = root * (unit / self.step) + ((1 - self.start / self.step) * unit - 1)
         rate = torch.full_like(offset, unit / self.step)
         low, high = torch.full_like(offset, unit - 1), torch.full_like(offset, 1 - unit)
         if math.isfinite(self.rail_low) or math.isfinite(self.rail_high):
@@ -86,21 +139,22 @@ class Columns:
         return offset, rate, (low, high) if self.wide else None
 
     @staticmethod
-    def of(noise_model: nn.Module, observation: Tensor, rows: Rows, count: int) -> Columns:
-        """Columns for the residuals of given observations and the rows' signals."""
+    def of(noise_model: nn.Module, observation: Tensor, scale: RootScale, count: int) -> Columns:
+        """Columns for the residuals of given observations and the scale's signals."""
         rail_low, rail_high = (
             getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf))
         )
         inside = observation[(observation > rail_low) & (observation < rail_high)]
         inside = inside if inside.numel() else observation
-        start, stop = float(inside.min()) - rows.high, float(inside.max()) - rows.low
-        coarse = torch.linspace(rows.low, rows.high, 65, dtype=observation.dtype, device=observation.device)
-        undigitised = getattr(noise_model, "model", noise_model)
-        reach = 100 * float(undigitised(coarse).variance.detach().max().sqrt())
+        root = scale.observation(torch.stack(torch.aminmax(inside)))
+        start, stop = float(root[0]) - scale.ends[1], float(root[1]) - scale.ends[0]
+        coarse = torch.linspace(scale.low, scale.high, _COARSE, dtype=observation.dtype, device=observation.device)
+        width = _variance(noise_model, scale.low, scale.high, observation).sqrt() * scale.slope(coarse)
+        reach = 100 * float(width.max())
         wide = stop - start > reach  # a few far outliers must not take the resolution from all others
         if wide:
             start, stop = max(start, -reach / 2), min(stop, reach / 2)
-        return Columns(start, max(stop, start + 1e-9 * (1 + abs(start))), count, rail_low, rail_high, wide)
+        return Columns(scale, start, max(stop, start + 1e-9), count, rail_low, rail_high, wide)
 
 
 def interpolate(table: Tensor, grid: Tensor) -> Tensor:
@@ -124,6 +178,10 @@ def mean_error(found: Tensor, exact: Tensor) -> float:
     possible = torch.isfinite(exact)
     error = float((found - exact)[possible].abs().mean()) if bool(possible.any()) else 0.0
     return error if math.isfinite(error) else math.inf
+
+
+def _apart(low: float, high: float) -> tuple[float, float]:
+    return low, max(high, low + 1e-6 * (1 + abs(low)))
 
 
 def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
@@ -178,9 +236,10 @@ def _make_likelihood(
         return None
     part = slice(None, None, max(1, observation.numel() // 2048))
     exact = noise_model(signal[part]).log_prob(observation[part])
+    scale = RootScale.of(noise_model, *_apart(*limits[:2]), observation)
     for num_rows, num_columns in SIZES:
-        rows = Rows(limits[0], max(limits[1], limits[0] + 1e-6 * (1 + abs(limits[0]))), num_rows)
-        columns = Columns.of(noise_model, torch.tensor(limits[2:]).to(observation), rows, num_columns)
+        rows = Rows(scale, num_rows)
+        columns = Columns.of(noise_model, torch.tensor(limits[2:]).to(observation), scale, num_columns)
         signals = rows.signals(observation)
         values = log_likelihood(noise_model, signals, columns.values(signals), between_rails=True)
         table = values[None, None].contiguous()
@@ -198,10 +257,11 @@ def _look_up(rows: Rows, columns: Columns, table: Tensor, signal: Tensor, observ
         s, o = signal[start : start + _CHUNK], observation[start : start + _CHUNK]
         at = grid[: o.numel()]
         offset, rate, bounds = columns.position(o)
-        torch.addcmul(offset, s, rate, value=-1, out=at[:, 0])
+        root = rows.scale.signal(s)
+        torch.addcmul(offset, root, rate, value=-1, out=at[:, 0])
         if bounds is not None:
             torch.clamp(at[:, 0], *bounds, out=at[:, 0])
-        rows.position(s, at[:, 1])
+        rows.position(root, at[:, 1])
         found[start : start + _CHUNK] = interpolate(table, at)[0]
     return found
 
@@ -244,8 +304,9 @@ def _make_quantiles(
     latent = torch.randn(picked.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(picked)
     distribution = flow(picked)
     exact, scale = distribution.from_latent(latent), distribution.stddev
+    root = RootScale.of(flow, *_apart(*limits), signal)
     for num_rows, num_columns in ((64, 512), (128, 1024), (256, 2048)):
-        rows = Rows(limits[0], max(limits[1], limits[0] + 1e-6 * (1 + abs(limits[0]))), num_rows)
+        rows = Rows(root, num_rows)
         signals = rows.signals(signal)
         nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, num_columns, dtype=torch.float64).to(signal)
         table = (flow(signals).from_latent(nodes.expand(num_rows, -1)) - signals)[None, None].contiguous()
@@ -257,5 +318,5 @@ def _make_quantiles(
 def _quantile(rows: Rows, table: Tensor, signal: Tensor, latent: Tensor) -> Tensor:
     grid = torch.empty(signal.numel(), 2, dtype=signal.dtype, device=signal.device)
     torch.mul(latent, 1 / _LATENT_LIMIT, out=grid[:, 0])
-    rows.position(signal, grid[:, 1])
+    rows.position(rows.scale.signal(signal), grid[:, 1])
     return signal + interpolate(table, grid)[0]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult
+from noiseflow.observation_table import ObservationTable
 from recon.candidates import learns, num_steps_of, rate_of
 from recon.signal_model import TomographySignal
 
@@ -24,6 +25,7 @@ _QUIET = 0.2  # noise relative to contrast
 _STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
+_TABULATED = 0.05  # nats per pixel
 
 
 class Alternation:
@@ -147,6 +149,13 @@ class Alternation:
             if turn > 0 and gain < _STEADY:
                 break
         return result
+
+    @torch.no_grad()
+    def can_tabulate(self, noise_model: nn.Module) -> bool:
+        """Whether a table holds the likelihood of the observations; see `noiseflow.observation_table`."""
+        observation = self.observation.flatten() if self.use is None else self.observation[self.use]
+        ends = [float(end) for end in torch.aminmax(self.signal_model.signal())]
+        return ObservationTable(noise_model, observation, *ends).error < _TABULATED
 
     def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> float:
         """Fit a noise model that learns to the signal as it is; the held-out NLL reached, or −inf if it does not learn."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -191,11 +192,13 @@ class _Chosen:
 
 def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
     """The simplest that predicts held-out pixels nearly as well as the richest: what a richer one gains beyond may be a bias of
-    the signal that it took for noise."""
+    the signal that it took for noise. One of which no table can be made is left out: it has a peak for every electron, far
+    narrower than their distance, to which noise without such peaks was bent."""
     *simpler, richest = (model.to(task.observation.device) for model in candidates)
 
     def nll(model: nn.Module) -> float:
-        return task.fit(model, known=True, num_steps=num_steps_of(model, 100)).held_out_nll
+        result = task.fit(model, known=True, num_steps=num_steps_of(model, 100))
+        return result.held_out_nll if model is richest or task.can_tabulate(model) else math.inf
 
     found: dict[nn.Module, float] = {}
     lowest = nll(richest)

@@ -6,6 +6,7 @@ import torch
 
 import noiseflow
 from noiseflow import metrics, tabulated
+from noiseflow.observation_table import ObservationTable
 
 MODELS = {
     "radial": lambda: noiseflow.RadialFlow(),
@@ -72,3 +73,32 @@ def test_table_follows_the_parameters() -> None:
 def test_gradients_are_exact_not_tabulated() -> None:
     model, signal, observation = fitted("radial")
     assert model(signal).log_prob(observation).requires_grad
+
+
+class ShotNoise(torch.nn.Module):
+    """Normal noise whose variance is the signal, and 4 besides."""
+
+    def forward(self, signal: torch.Tensor) -> torch.distributions.Normal:
+        return torch.distributions.Normal(signal, (signal.clamp_min(0) + 4).sqrt())
+
+
+def test_weak_signals_are_resolved_beside_strong_ones() -> None:
+    """Noise of 2 at no signal and of 190 at the brightest, 36 000: steps that serve the one would miss the other."""
+    generator = torch.Generator().manual_seed(0)
+    signal = 36_000 * torch.rand(50_000, generator=generator) ** 4
+    observation = signal + (signal + 4).sqrt() * torch.randn(signal.shape, generator=generator)
+    table = ObservationTable(ShotNoise(), observation, 0.0, 36_000.0, tolerance=2e-3)
+    assert table.error <= 2e-3
+    near = (signal + (signal + 4).sqrt()).requires_grad_()
+    exact = ShotNoise()(near).log_prob(observation)
+    found = table.log_prob(near)
+    assert float((found - exact).detach().abs().mean()) < 5e-3
+    (slope,), (found_slope,) = (torch.autograd.grad(each.sum(), near) for each in (exact, found))
+    assert float((found_slope - slope).abs().mean()) < 0.02 * float(slope.abs().mean())
+
+
+def test_scale_and_its_inverse_agree_beyond_the_range_too() -> None:
+    scale = tabulated.RootScale(-3.0, 50.0, 0.01)
+    readings = torch.linspace(-20, 90, 500, dtype=torch.float64)
+    assert torch.allclose(scale.inverse(scale.observation(readings)), readings, atol=1e-9)
+    assert bool((scale.observation(readings).diff() > 0).all())

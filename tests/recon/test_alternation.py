@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from noiseflow import FitResult, Gaussian
+from noiseflow import Digitised, FitResult, Gaussian, PoissonGaussian
 from recon.alternation import Alternation
 
 
@@ -31,3 +31,13 @@ def test_turns_go_on_while_both_gain(signal_nll: list[float], noise_nll: list[fl
     assert rates == [0.5, 0.25, 0.125][:turns]
     assert steps == [80, 32, 32][:turns]
     assert signal_model.learning_rate == 1.0
+
+
+def test_peaks_of_single_electrons_that_no_table_resolves_are_told() -> None:
+    """A gain of 100 and hardly any read noise: a peak for every electron among thousands of levels."""
+    generator = torch.Generator().manual_seed(0)
+    signal = 20_000 * torch.rand(9, 64, 64, generator=generator)
+    observation = (signal + 10 * signal.sqrt() * torch.randn(signal.shape, generator=generator)).round()
+    task = Alternation(SimpleNamespace(signal=lambda: signal), observation, None, 0, None)
+    assert not task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=0.5), step=1.0))
+    assert task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=100.0), step=1.0))
