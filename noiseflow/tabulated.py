@@ -58,13 +58,15 @@ class RootScale:
     def observation(self, observation: Tensor) -> Tensor:
         """The scale at any readings."""
         share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
-        return self.signal(observation) + share / (2 * self.shift**0.5)
+        root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
+        return root
 
     def inverse(self, root: Tensor) -> Tensor:
         """The readings at places of the scale."""
         start = self.shift**0.5
         share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
-        return self.low + (self.high - self.low) * share
+        readings: Tensor = self.low + (self.high - self.low) * share
+        return readings
 
     def slope(self, signal: Tensor) -> Tensor:
         """Growth of the scale per unit of signal."""

@@ -39,5 +39,5 @@ def test_peaks_of_single_electrons_that_no_table_resolves_are_told() -> None:
     signal = 20_000 * torch.rand(9, 64, 64, generator=generator)
     observation = (signal + 10 * signal.sqrt() * torch.randn(signal.shape, generator=generator)).round()
     task = Alternation(SimpleNamespace(signal=lambda: signal), observation, None, 0, None)
-    assert not task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=0.5), step=1.0))
-    assert task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=100.0), step=1.0))
+    assert not task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=0.1), step=1.0))
+    assert task.can_tabulate(Digitised(PoissonGaussian(gain=100.0, offset=0.0, read_noise=0.5), step=1.0))
