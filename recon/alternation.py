@@ -22,7 +22,6 @@ SECOND, WARM = 0.5, 0.25
 _SETTLING = (40, 80, 160, 320)  # steps
 _SETTLED = 0.03  # nats per pixel
 _QUIET = 0.2  # noise relative to contrast
-_STEADY = 0.001  # nats per pixel that the noise model gains on a new signal
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
 _TABULATED = 0.05  # nats per pixel
@@ -118,7 +117,7 @@ class Alternation:
         progress: Progress | None = None,
     ) -> FitResult:
         """Fit the signal to the noise model as it is, and the noise model to the signal as it is, by turns: twice, and on until
-        the new signal leaves the noise model as it was, or held-out pixels gain little.
+        held-out pixels gain little. Where there is little noise, a change of the noise model moves the signal for long.
 
         Each turn ends at a small learning rate, and the next starts at a smaller one: the incident intensity would overshoot
         again, and comes back slowly. Learning both at once from a rough start lets the mean of a heavy-tailed noise
@@ -145,9 +144,7 @@ class Alternation:
             if turn > 0 and reached - result.held_out_nll < _SETTLED:
                 break
             reached = result.held_out_nll
-            gain = reached - self.refine(noise_model)
-            if turn > 0 and gain < _STEADY:
-                break
+            self.refine(noise_model)
         return result
 
     @torch.no_grad()
@@ -157,12 +154,11 @@ class Alternation:
         ends = [float(end) for end in torch.aminmax(self.signal_model.signal())]
         return ObservationTable(noise_model, observation, *ends).error < _TABULATED
 
-    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> float:
-        """Fit a noise model that learns to the signal as it is; the held-out NLL reached, or −inf if it does not learn."""
-        if not learns(noise_model):
-            return -math.inf
-        options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
-        return self.fit(noise_model, known=True, **options).held_out_nll
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
+        """Fit a noise model, if it learns, to the signal as it is."""
+        if learns(noise_model):
+            options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
+            self.fit(noise_model, known=True, **options)
 
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:

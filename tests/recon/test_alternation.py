@@ -9,17 +9,14 @@ from noiseflow import Digitised, FitResult, Gaussian, PoissonGaussian
 from recon.alternation import Alternation
 
 
-@pytest.mark.parametrize(
-    ("signal_nll", "noise_nll", "turns"),
-    [([1.0, 1.0], [1.0], 2), ([1.0, 0.5, 0.5], [1.0, 0.4], 3), ([1.0, 0.5], [1.0, 0.5], 2)],
-)
-def test_turns_go_on_while_both_gain(signal_nll: list[float], noise_nll: list[float], turns: int) -> None:
+@pytest.mark.parametrize(("signal_nll", "turns"), [([1.0, 1.0], 2), ([1.0, 0.99], 2), ([1.0, 0.5, 0.5], 3)])
+def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> None:
     rates, steps = [], []
-    signals, noises = iter(signal_nll), iter(noise_nll)
+    signals = iter(signal_nll)
 
     def run_fit(noise_model, signal, observation, **options):
         if signal is not signal_model:
-            return FitResult(noise_model, held_out_nll=next(noises))
+            return FitResult(noise_model)
         assert not any(parameter.requires_grad for parameter in noise_model.parameters())
         rates.append(signal_model.learning_rate)
         steps.append(options["num_steps"])
