@@ -84,8 +84,10 @@ class ObservationTable:
                 return
             stalled = self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
             size = max(size + 1, len(SIZES)) if stalled else size + 1
-        self._size = min(errors, key=lambda size: errors[size])
-        self.error = self._build(noise_model, *self._choices[self._size])
+        best = min(errors, key=lambda size: errors[size])
+        if best != self._size:
+            self._size = best
+            self.error = self._build(noise_model, *self._choices[best])
 
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
         """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the

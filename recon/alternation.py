@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from noiseflow import FitResult
 from noiseflow.observation_table import ObservationTable
 from recon.candidates import learns, num_steps_of, rate_of
+from recon.image_formation import Linear
 from recon.signal_model import TomographySignal
 
 Progress = Callable[[int, str], None]
@@ -40,6 +41,7 @@ class Alternation:
     ) -> None:
         self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
         self.generator = torch.Generator().manual_seed(seed)
+        self.calm = 1.0
         self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
 
     def fit(self, noise_model: nn.Module, *, known: bool = False, **options: Any) -> FitResult:
@@ -53,9 +55,10 @@ class Alternation:
         return self.run_fit(noise_model, signal, self.observation, **options)
 
     def fit_signal(self, noise_model: nn.Module, *, rate: float, **options: Any) -> FitResult:
-        """Fit volume and noise model at so many times the usual learning rate of the volume."""
+        """Fit volume and noise model at so many times the usual learning rate of the volume, and calmer where there is little
+        noise."""
         usual = self.signal_model.learning_rate
-        self.signal_model.learning_rate = usual * rate
+        self.signal_model.learning_rate = usual * rate * self.calm
         try:
             return self.fit(noise_model, standardise=False, **options)
         finally:
@@ -75,36 +78,45 @@ class Alternation:
         """
         begun = min(_SETTLING[0], num_steps // 4)
         if quiet:
-            self.settle(first, thoroughly=True, progress=progress)
+            self.settle(first, final=first is noise_model, thoroughly=True, progress=progress)
         elif begun:
             with frozen(first):
                 self.fit_signal(first, num_steps=begun, rate=1.0, progress=progress)
         rate = WARM if quiet else SECOND
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
 
-    def settle(self, first: nn.Module, *, thoroughly: bool = False, progress: Progress | None = None) -> bool:
+    def settle(
+        self, first: nn.Module, *, final: bool, thoroughly: bool = False, progress: Progress | None = None
+    ) -> bool:
         """A fit with simple noise, longer and longer until held-out pixels gain little in its second half: what an unfinished
         signal misses would pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before
-        the end.
+        the end. Unless the simple noise is `final`, the offset of a linear response stays: to least squares a haze over a lower
+        offset looks as good as vacuum, and takes up what the volume cannot explain in bright places.
 
         Args:
             first: the simple noise; fitted in place.
+            final: whether it is the model of choice, too; else the steps that follow are calmer the less noise there is.
             thoroughly: go all the way.
             progress: called with the steps of a stage and a note.
 
         Returns:
             Whether there is little noise: what is left is small beside the contrast of the signal.
         """
+        response, self.calm = self.signal_model.image_formation, 1.0
+        held = response if isinstance(response, Linear) and not final else nn.Identity()
         self.refine(first, standardise=True)
         for stage, num_steps in enumerate(_SETTLING):
-            result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
+            with frozen(held):
+                result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
             history = list(result.history.values())
             if not thoroughly and stage > 0 and history[len(history) // 2] - min(history) < _SETTLED:
                 break
         with torch.no_grad():
             signal = self.signal_model.signal().view_as(self.observation)
             residual = signal - self.observation if self.use is None else (signal - self.observation)[self.use]
-            return bool(residual.square().mean().sqrt() < _QUIET * signal.std())
+            noise = float(residual.square().mean().sqrt() / signal.std())
+            self.calm = 1.0 if final else min(1.0, noise / _QUIET)
+            return noise < _QUIET
 
     def alternate(
         self,

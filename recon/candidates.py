@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
@@ -19,21 +20,28 @@ from noiseflow import (
 )
 
 _CLIPPED = 0.02
+_FAR = 0.01  # of the contrast
 _SHARED = 6  # Gaussians of a shape that all signals share: enough for a long tail on one side
 _EXACT_STEPS = 15
 
 
-def noise_candidates(images: NDArray[Any]) -> list[nn.Module]:
+def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Module]:
     """Noise models worth trying for these images, simplest first, behind the rounding and rails that they show.
 
     All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
     anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
-    seen at other signals stands in for what is hidden.
+    seen at other signals stands in for what is hidden. Where there is little noise, most of what is left is what the volume
+    cannot explain, and a noise model of learnt shape would learn to excuse it.
+
+    Args:
+        images: the readings.
+        quiet: whether noise is small beside the contrast.
     """
     digitisation = detect_digitisation(images)
-    one_shape = Mixture(_SHARED, shared_shape=True, mean_preserving=True)
-    models: list[nn.Module] = [SignalDependentGaussian(), PoissonGaussian(), one_shape]
-    if not _clipped(images, digitisation):
+    models: list[nn.Module] = [SignalDependentGaussian()]
+    if not quiet:
+        models += [PoissonGaussian(), Mixture(_SHARED, shared_shape=True, mean_preserving=True)]
+    if not (quiet or _clipped(images, digitisation)):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
@@ -45,7 +53,14 @@ def first_noise(images: NDArray[Any]) -> nn.Module:
 
 
 def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
-    return float(((images <= digitisation.low) | (images >= digitisation.high)).mean()) >= _CLIPPED
+    """Whether clipping hides much: many readings, and noise that takes their neighbours far from the rails. A dark background
+    at zero, whose noise is nothing beside the contrast, is as good as seen."""
+    on_rail = (images <= digitisation.low) | (images >= digitisation.high)
+    if on_rail.mean() < _CLIPPED:
+        return False
+    leaving = on_rail[..., 1:] != on_rail[..., :-1]
+    steps = np.abs(images[..., 1:][leaving].astype(np.float32) - images[..., :-1][leaving])
+    return bool(not steps.size or np.median(steps) > _FAR * images.std(dtype=np.float64))
 
 
 def learns(noise_model: nn.Module) -> bool:

@@ -31,7 +31,9 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
     block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
     means: NDArray[np.floating[Any]] = block_means(images, block, block)
     if tilt_series.mode == "linear":
-        return Linear(offset=float(np.quantile(means, 0.02)), beam=beam, estimate=estimate)
+        dark, bright = (float(level) for level in np.quantile(means, (0.02, 0.98)))
+        span = bright - dark if bright > dark else 1.0
+        return Linear(offset=dark, beam=beam, offset_unit=span / 4, estimate=estimate)
     if tilt_series.beam is not None:
         means = means / tilt_series.beam[:, None, None]
     intensity = float(np.quantile(means, 0.95))

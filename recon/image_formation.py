@@ -75,24 +75,33 @@ class Linear(Described):
         gain: detector units per unit of line integral.
         offset: detector units; a number, or one for each tilt.
         beam: (tilts,) incident intensities; only their ratios count. None where they are all the same.
+        offset_unit: line integral in units of which the offset is learnt: a fraction of those in the data.
         estimate: whether offset and beam are learnt.
 
     Raises:
-        ValueError: a gain of zero, or one that is not finite.
+        ValueError: a gain or unit of zero, or one that is not finite.
     """
 
     gain: Tensor
+    offset_unit: Tensor
     log_beam: nn.Parameter | None
 
     def __init__(
-        self, gain: float = 1.0, *, offset: float | Tensor = 0.0, beam: Tensor | None = None, estimate: bool = True
+        self,
+        gain: float = 1.0,
+        *,
+        offset: float | Tensor = 0.0,
+        beam: Tensor | None = None,
+        offset_unit: float = 1.0,
+        estimate: bool = True,
     ) -> None:
         super().__init__()
-        if not math.isfinite(gain) or gain == 0:
-            raise ValueError(f"gain {gain} must be finite and not zero")
-        self.register_buffer("gain", torch.tensor(float(gain)))
+        for name, unit in (("gain", gain), ("offset_unit", offset_unit)):
+            if not math.isfinite(unit) or unit == 0:
+                raise ValueError(f"{name.replace('_', ' ')} {unit} must be finite and not zero")
+            self.register_buffer(name, torch.tensor(float(unit)))
         start = torch.as_tensor(offset, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
-        self.scaled_offset = nn.Parameter(start / gain, requires_grad=estimate)
+        self.scaled_offset = nn.Parameter(start / (gain * offset_unit), requires_grad=estimate)
         log_beam = None if beam is None else nn.Parameter(beam.reshape(-1, 1, 1).log(), requires_grad=estimate)
         self.register_parameter("log_beam", log_beam)
 
@@ -100,18 +109,18 @@ class Linear(Described):
         """Line integrals (tilt, u, y) to signals of the same shape."""
         if self.log_beam is not None:
             line_integrals = line_integrals * _relative(self.log_beam)
-        return self.gain * (line_integrals + self.scaled_offset)
+        return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""
-        scaled = signal / self.gain - self.scaled_offset.detach()
+        scaled = signal / self.gain - self.offset_unit * self.scaled_offset.detach()
         return scaled if self.log_beam is None else scaled / _relative(self.log_beam.detach())
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
         """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
         scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
-        self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean()))
+        self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean() / self.offset_unit))
 
     def extra_repr(self) -> str:
         learnt = ", learnt" if self.scaled_offset.requires_grad else ""
@@ -121,7 +130,7 @@ class Linear(Described):
     @property
     def offset(self) -> Tensor:
         """Detector units, (1,) or (tilts,)."""
-        return (self.gain * self.scaled_offset.detach()).reshape(-1)
+        return (self.gain * self.offset_unit * self.scaled_offset.detach()).reshape(-1)
 
     def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
         """Relative intensity (geometric mean one) and offset, detector units, of every tilt."""

@@ -165,15 +165,16 @@ class JointReconstructor:
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         task = self._task(part, tilt_series, rows)
         first = given if isinstance(given, Gaussian) else first_noise(tilt_series.images).to(self.device)
-        quiet = task.settle(first)
+        quiet = task.settle(first, final=first is given)
         if given is not None and self.weight is not None and not learns(given):
             return _Chosen(given, None, first, quiet)
-        noise_model = given if given is not None else _best_noise_model(task, noise_candidates(tilt_series.images))
-        task.alternate(noise_model, num_steps=60, rate=WARM, standardise=given is not None)
+        candidates = noise_candidates(tilt_series.images, quiet=quiet) if given is None else [given]
+        noise_model = _best_noise_model(task, candidates)
+        task.alternate(noise_model, num_steps=60, rate=WARM, standardise=len(candidates) == 1)
         choice = None
         if self.weight is None:
             with frozen(noise_model):
-                choice = choose_weight(lambda weight: _held_out_nll(task, noise_model, weight), _FIRST_WEIGHT)
+                choice = choose_weight(_HeldOut(task, noise_model), _FIRST_WEIGHT)
             # only now is the signal as good as that of the whole will be: a worse one bends the noise at its bright end
             task.refine(noise_model)
         whole.image_formation.load_state_dict(part.image_formation.state_dict())
@@ -193,8 +194,10 @@ class _Chosen:
 def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.Module:
     """The simplest that predicts held-out pixels nearly as well as the richest: what a richer one gains beyond may be a bias of
     the signal that it took for noise. One of which no table can be made is left out: it has a peak for every electron, far
-    narrower than their distance, to which noise without such peaks was bent."""
+    narrower than their distance, to which noise without such peaks was bent. A single candidate is not fitted."""
     *simpler, richest = (model.to(task.observation.device) for model in candidates)
+    if not simpler:
+        return richest
 
     def nll(model: nn.Module) -> float:
         result = task.fit(model, known=True, num_steps=num_steps_of(model, 100))
@@ -211,10 +214,18 @@ def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.
     return next(model for model in found if found[model] <= good_enough)
 
 
-def _held_out_nll(task: Alternation, noise_model: nn.Module, weight: float) -> float:
-    task.signal_model.weight = weight
-    history = task.fit_signal(noise_model, num_steps=80, rate=SECOND).history
-    return list(history.values())[-1]
+class _HeldOut:
+    """Held-out NLL by weight. Every fit begins where the first did: steps that another weight has taken count for none."""
+
+    def __init__(self, task: Alternation, noise_model: nn.Module) -> None:
+        self.task, self.noise_model = task, noise_model
+        self.start = copy.deepcopy(task.signal_model.state_dict())
+
+    def __call__(self, weight: float) -> float:
+        self.task.signal_model.load_state_dict(self.start)
+        self.task.signal_model.weight = weight
+        history = self.task.fit_signal(self.noise_model, num_steps=80, rate=SECOND).history
+        return list(history.values())[-1]
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:

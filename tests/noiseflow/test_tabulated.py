@@ -102,3 +102,12 @@ def test_scale_and_its_inverse_agree_beyond_the_range_too() -> None:
     readings = torch.linspace(-20, 90, 500, dtype=torch.float64)
     assert torch.allclose(scale.inverse(scale.observation(readings)), readings, atol=1e-9)
     assert bool((scale.observation(readings).diff() > 0).all())
+
+
+def test_the_finest_size_is_not_tabulated_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+    build = ObservationTable._build
+    monkeypatch.setattr(ObservationTable, "_build", lambda self, *args: built.append(args[1:3]) or build(self, *args))
+    observation = torch.randn(5000, generator=torch.Generator().manual_seed(0))
+    ObservationTable(noiseflow.SignalDependentGaussian(), observation, -2.0, 2.0, tolerance=0.0)
+    assert len(built) == len(set(built)) > 1

@@ -7,6 +7,7 @@ import torch
 
 from noiseflow import Digitised, FitResult, Gaussian, PoissonGaussian
 from recon.alternation import Alternation
+from recon.image_formation import Linear
 
 
 @pytest.mark.parametrize(("signal_nll", "turns"), [([1.0, 1.0], 2), ([1.0, 0.99], 2), ([1.0, 0.5, 0.5], 3)])
@@ -28,6 +29,32 @@ def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> Non
     assert rates == [0.5, 0.25, 0.125][:turns]
     assert steps == [80, 32, 32][:turns]
     assert signal_model.learning_rate == 1.0
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_steps_are_calmer_the_less_noise_there_is(noise: float) -> None:
+    """Noise of a tenth of the contrast halves the steps; least squares for its own sake keeps them."""
+    signal = torch.randn(5 * 64 * 64, generator=torch.Generator().manual_seed(0))
+    observation = (signal + noise * torch.randn(signal.shape, generator=torch.Generator().manual_seed(1))).view(
+        5, 64, 64
+    )
+    rates, offset = [], Linear()
+
+    def run_fit(noise_model, signal, observation, **options):
+        if signal is signal_model:
+            rates.append((signal_model.learning_rate, offset.scaled_offset.requires_grad))
+        return FitResult(noise_model, history={0: 1.0, 1: 1.0}, held_out_nll=1.0, num_steps=options["num_steps"])
+
+    signal_model = SimpleNamespace(learning_rate=1.0, signal=lambda: signal, image_formation=offset)
+    task = Alternation(signal_model, observation, None, 0, run_fit)
+    assert task.settle(Gaussian(), final=True) == (noise < 0.2)
+    task.fit_signal(Gaussian(), rate=1.0, num_steps=1)
+    assert rates == [(1.0, True), (0.5, True), (1.0, True)]
+    rates.clear()
+    task.settle(Gaussian(), final=False)
+    task.fit_signal(Gaussian(), rate=1.0, num_steps=1)
+    assert rates[:2] == [(1.0, False), (0.5, False)]
+    assert rates[2] == (pytest.approx(min(1.0, noise / 0.2), rel=0.05), True)
 
 
 def test_peaks_of_single_electrons_that_no_table_resolves_are_told() -> None:

@@ -9,7 +9,7 @@ import torch
 import noiseflow
 from recon import benchmark_needle
 from recon.alternation import block_mask
-from recon.candidates import noise_candidates
+from recon.candidates import first_noise, noise_candidates
 from recon.fields import VoxelField
 from recon.first_guess import estimate_response
 from recon.image_formation import Linear, Transmission
@@ -82,6 +82,37 @@ def test_candidate_noise_models_fit_the_detector():
     assert all(model.step == 1.0 for model in noise_candidates((images * 100).astype(np.int16)))
 
 
+def test_a_dark_background_on_the_rail_does_not_count_as_clipped():
+    """Half the pixels are vacuum that reads zero or one; the rest has counts by the thousand."""
+    generator = np.random.default_rng(0)
+    bright = np.repeat([[0.0] * 20 + [3000.0] * 20], 40, 0)
+    dark_rail = np.round(bright + generator.normal(0, 0.7, (9, 40, 40)) * (1 + bright / 50)).clip(0)
+    assert isinstance(first_noise(dark_rail), noiseflow.Gaussian)
+    noisy_rail = np.round(bright + generator.normal(0, 300, (9, 40, 40))).clip(0)
+    assert isinstance(first_noise(noisy_rail), noiseflow.Digitised)
+
+
+def test_where_there_is_little_noise_no_shape_is_learnt():
+    images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
+    (only,) = noise_candidates(images, quiet=True)
+    assert isinstance(only, noiseflow.SignalDependentGaussian)
+
+
+def test_the_unit_of_an_offset_sets_its_step_alone():
+    rays = torch.rand(3, 4, 5)
+    plain, scaled = Linear(2.0, offset=7.0), Linear(2.0, offset=7.0, offset_unit=100.0)
+    torch.testing.assert_close(scaled(rays), plain(rays))
+    torch.testing.assert_close(scaled.offset, plain.offset)
+    torch.testing.assert_close(scaled.invert(scaled(rays)), rays)
+    with torch.no_grad():
+        scaled.scaled_offset += 0.1
+    assert float(scaled.offset) == pytest.approx(7 + 2 * 100 * 0.1)
+    scaled.match(rays, plain(rays).detach(), torch.ones(rays.shape, dtype=torch.bool))
+    assert float(scaled.offset) == pytest.approx(7.0)
+    with pytest.raises(ValueError, match="offset unit 0"):
+        Linear(offset_unit=0.0)
+
+
 def test_held_out_pixels_come_in_blocks():
     mask = block_mask((5, 42, 38), share=0.2, generator=torch.Generator().manual_seed(0))
     assert mask.shape == (5, 42, 38)
@@ -150,6 +181,5 @@ def test_a_real_series_with_little_noise_is_not_taken_for_noise():
     parts = benchmark_needle.split(benchmark_needle.load(), "as measured", "every fifth", seed=0)
     volume = JointReconstructor()(parts.given).volume.attenuation
     predicted = benchmark_needle.predict(parts.given, volume, parts.left_out.tilt_angles)
-    assert (
-        compare(predicted, parts.target).psnr > 34
-    )  # least squares reaches 38 dB, a fit that takes the misfit for noise 22
+    # least squares reaches 39.9 dB; fits that excuse misfits as noise were at 34 and 22
+    assert compare(predicted, parts.target).psnr > 39
