@@ -21,6 +21,7 @@ Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
 SECOND, WARM = 0.5, 0.25
 _SETTLING = (40, 80, 160, 320)  # steps
+_START = 10  # steps of noise that goes on to learn with the signal
 _SETTLED = 0.03  # nats per pixel
 _QUIET = 0.2  # noise relative to contrast
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
@@ -104,7 +105,7 @@ class Alternation:
         """
         response, self.calm = self.signal_model.image_formation, 1.0
         held = response if isinstance(response, Linear) and not final else nn.Identity()
-        self.refine(first, standardise=True)
+        self.refine(first, standardise=True, num_steps=_START)
         for stage, num_steps in enumerate(_SETTLING):
             with frozen(held):
                 result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
@@ -166,10 +167,10 @@ class Alternation:
         ends = [float(end) for end in torch.aminmax(self.signal_model.signal())]
         return ObservationTable(noise_model, observation, *ends).error < _TABULATED
 
-    def refine(self, noise_model: nn.Module, *, standardise: bool = False) -> None:
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False, num_steps: int = 60) -> None:
         """Fit a noise model, if it learns, to the signal as it is."""
         if learns(noise_model):
-            options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, 60), "standardise": standardise}
+            options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, num_steps), "standardise": standardise}
             self.fit(noise_model, known=True, **options)
 
 

@@ -1,6 +1,8 @@
 """The one loop: it finds known truths, alone and jointly, and survives what goes wrong."""
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -246,3 +248,14 @@ def test_the_latest_state_that_no_earlier_one_beats_is_kept(means: list[float], 
         noise = torch.randn(5000, generator=generator, dtype=torch.float64)
         best.judge({"step": step}, mean + 0.1 * (noise - noise.mean()), start=step == 0, strict=strict)
     assert best.state == {"step": kept}
+
+
+def test_a_fit_does_not_load_the_compiler() -> None:
+    """It takes seconds to load, and torch loads it with the first call of an optimiser's guarded methods."""
+    code = """
+import sys, torch
+from noiseflow import Gaussian, fit
+fit(Gaussian(), torch.zeros(200), torch.randn(200), num_steps=2)
+assert "torch._dynamo" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
