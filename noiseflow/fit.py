@@ -23,6 +23,7 @@ from noiseflow.signal_models import KnownSignal
 _log = logging.getLogger("noiseflow")
 
 
+@torch.enable_grad()
 def fit(
     noise_model: nn.Module,
     signal: Tensor | NDArray[Any] | nn.Module,

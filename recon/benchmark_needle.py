@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import noiseflow
 from noiseflow import Gaussian, SignalDependentGaussian, fit
@@ -31,6 +32,7 @@ GAPS: dict[str, Callable[[Array], Array]] = {
 """Which tilts are left out, by name."""
 
 _READ_NOISE = 0.5
+_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -109,13 +111,13 @@ def run(results: Results, line: Callable[[str], None], *, quick: bool, seed: int
 
 
 def _judged(parts: Split, found: Best) -> Cell:
-    predicted = predict(parts.given, found.volume, parts.left_out.tilt_angles)
+    angles = parts.left_out.tilt_angles
     return {
         "setting": found.setting,
         "tried": found.tried,
         "at an end": found.at_an_end,
         "psnr": _psnr(parts, found.volume),
-        "nll": held_out_nll(predicted, parts.left_out.images),
+        "nll": held_out_nll(predict(parts.given, found.volume, angles, likely=True), parts.left_out.images),
     }
 
 
@@ -125,10 +127,24 @@ def _psnr(parts: Split, volume: Array) -> float:
     return -10 * float(np.log10(np.mean((predicted - parts.target) ** 2) / span**2))
 
 
-def predict(given: TiltSeries, volume: Array, angles: Array) -> Array:
-    """Images at other angles: projections with the one gain and offset that suit the given tilts best."""
-    own = project(volume, given.tilt_angles)
-    gain, offset = np.polyfit(own.ravel().astype(np.float64), given.images.ravel().astype(np.float64), 1)
+def predict(given: TiltSeries, volume: Array, angles: Array, *, likely: bool = False) -> Array:
+    """Images at other angles: projections with the one gain and offset that suit the given tilts best.
+
+    Args:
+        given: what the volume was made from.
+        volume: (z, y, x).
+        angles: degrees.
+        likely: whether gain and offset are the most likely ones under noise that depends on the signal, found by weighing the
+            pixels over and over; else they are of least squares, which vacuum hardly counts for.
+    """
+    own, images = project(volume, given.tilt_angles).ravel(), given.images.ravel()
+    gain, offset = np.polyfit(own.astype(np.float64), images.astype(np.float64), 1)
+    for _ in range(_ROUNDS if likely else 0):
+        signal = torch.from_numpy((own * gain + offset).astype(np.float32))
+        model = _noise_of(signal, torch.from_numpy(images.astype(np.float32)))
+        with torch.no_grad():
+            width = model(signal).stddev.double().numpy()
+        gain, offset = np.polyfit(own.astype(np.float64), images.astype(np.float64), 1, w=1 / width)
     return np.asarray(project(volume, angles) * gain + offset, dtype=np.float32)
 
 
@@ -137,14 +153,18 @@ def held_out_nll(predicted: Array, observed: Array) -> float:
     signals, readings = (torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in (predicted, observed))
     found = []
     for first in (0, 1):
-        model = SignalDependentGaussian()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            generator = torch.Generator().manual_seed(0)
-            fit(model, signals[first::2], readings[first::2], digitise=False, num_steps=200, generator=generator)
+        model = _noise_of(signals[first::2], readings[first::2])
         with torch.no_grad():
             found.append(-model(signals[1 - first :: 2]).log_prob(readings[1 - first :: 2]).double().mean())
     return float(sum(found) / 2)
+
+
+def _noise_of(signals: Tensor, readings: Tensor) -> SignalDependentGaussian:
+    model = SignalDependentGaussian()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        fit(model, signals, readings, digitise=False, num_steps=200, generator=torch.Generator().manual_seed(0))
+    return model
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

@@ -177,7 +177,8 @@ def needle(folder: Path) -> str:
         "# A real tilt series with tilts left out",
         "The needle, a HAADF-STEM series of 91 tilts of 64 × 64 pixels that ships with the library "
         "(`noiseflow/data/tilt_needle`). "
-        "Methods see some tilts and predict the others, with the one gain and offset that suit the given tilts. **PSNR** is "
+        "Methods see some tilts and predict the others, with the one gain and offset that suit the given tilts: by least "
+        "squares for PSNR, most likely for NLL. **PSNR** is "
         "against the left-out tilts as measured, over their range; its ceiling is their own noise and "
         "misalignment. **NLL** is that of "
         "the left-out tilts, as noisy as the given ones, under a Gaussian whose width depends on the "

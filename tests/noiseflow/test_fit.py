@@ -259,3 +259,10 @@ fit(Gaussian(), torch.zeros(200), torch.randn(200), num_steps=2)
 assert "torch._dynamo" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_fit_learns_where_gradients_are_off() -> None:
+    signal = torch.zeros(500)
+    with torch.no_grad():
+        result = noiseflow.fit(noiseflow.Gaussian(), signal, torch.randn(500), num_steps=20)
+    assert math.isfinite(result.held_out_nll)
