@@ -28,7 +28,8 @@ from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.weight import WeightChoice, choose_weight
 
 _FIRST_WEIGHT = 0.4
-_TOLERATED = 0.003
+_TOLERATED = 0.003  # nats per pixel
+_LOOK_STEPS = 60  # of each candidate: within the tolerance of where it would end
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
 
 
@@ -200,7 +201,7 @@ def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.
         return richest
 
     def nll(model: nn.Module) -> float:
-        result = task.fit(model, known=True, num_steps=num_steps_of(model, 100))
+        result = task.fit(model, known=True, num_steps=num_steps_of(model, _LOOK_STEPS))
         return result.held_out_nll if model is richest or task.can_tabulate(model) else math.inf
 
     found: dict[nn.Module, float] = {}
