@@ -21,6 +21,7 @@ Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
 SECOND, WARM = 0.5, 0.25
 _SETTLING = (40, 80, 160, 320)  # steps
+_ENOUGH = 2  # of these stages, unless there is little noise
 _START = 10  # steps of noise that goes on to learn with the signal
 _SETTLED = 0.03  # nats per pixel
 _QUIET = 0.2  # noise relative to contrast
@@ -91,8 +92,8 @@ class Alternation:
     ) -> bool:
         """A fit with simple noise, longer and longer until held-out pixels gain little in its second half: what an unfinished
         signal misses would pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before
-        the end. Unless the simple noise is `final`, the offset of a linear response stays: to least squares a haze over a lower
-        offset looks as good as vacuum, and takes up what the volume cannot explain in bright places.
+        the end. Unless the simple noise is `final`, the offset of a linear response stays where there is little noise: to least
+        squares a haze over a lower offset looks as good as vacuum, and takes up what the volume cannot explain in bright places.
 
         Args:
             first: the simple noise; fitted in place.
@@ -107,10 +108,10 @@ class Alternation:
         held = response if isinstance(response, Linear) and not final else nn.Identity()
         self.refine(first, standardise=True, num_steps=_START)
         for stage, num_steps in enumerate(_SETTLING):
-            with frozen(held):
+            with frozen(held if thoroughly or stage >= _ENOUGH else nn.Identity()):
                 result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
             history = list(result.history.values())
-            if not thoroughly and stage > 0 and history[len(history) // 2] - min(history) < _SETTLED:
+            if not thoroughly and stage + 1 >= _ENOUGH and history[len(history) // 2] - min(history) < _SETTLED:
                 break
         with torch.no_grad():
             signal = self.signal_model.signal().view_as(self.observation)

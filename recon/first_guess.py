@@ -33,7 +33,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
     if tilt_series.mode == "linear":
         dark, bright = (float(level) for level in np.quantile(means, (0.02, 0.98)))
         span = bright - dark if bright > dark else 1.0
-        return Linear(offset=dark, beam=beam, offset_unit=span / 4, estimate=estimate)
+        return Linear(offset=dark, beam=beam, offset_unit=span, estimate=estimate)
     if tilt_series.beam is not None:
         means = means / tilt_series.beam[:, None, None]
     intensity = float(np.quantile(means, 0.95))

@@ -75,7 +75,7 @@ class Linear(Described):
         gain: detector units per unit of line integral.
         offset: detector units; a number, or one for each tilt.
         beam: (tilts,) incident intensities; only their ratios count. None where they are all the same.
-        offset_unit: line integral in units of which the offset is learnt: a fraction of those in the data.
+        offset_unit: line integral in units of which the offset is learnt: one of those in the data.
         estimate: whether offset and beam are learnt.
 
     Raises:
