@@ -213,9 +213,8 @@ def _distinct(ranked: list[Detector]) -> list[Detector]:
 
 
 def _log_prob(signal: Tensor, observation: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> Tensor:
-    above = (signal - offset).clamp(min=0)
-    residual = (observation - offset - above) / gain
-    return (log_density(residual, above / gain, read_noise) - torch.log(gain)).mean()
+    rate = (signal - offset).clamp(min=0) / gain
+    return (log_density((observation - signal) / gain, rate, read_noise) - torch.log(gain)).mean()
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _ROUNDINGS = 8
+_TOGETHER = 2**16  # readings
 
 
 class NoiseDistribution(Distribution):
@@ -121,8 +122,11 @@ class LatentDistribution(NoiseDistribution):
         """E[function(observation)] by quadrature over the latent, shape of the batch."""
         like = self._like()
         total = torch.zeros(self.batch_shape, dtype=like.dtype, device=like.device)
-        for node, weight in zip(*(tensor.tolist() for tensor in normal_quadrature(torch.float64)), strict=True):
-            total = total + weight * function(self.from_latent(torch.full_like(total, node)))
+        nodes, weights = (tensor.to(like) for tensor in normal_quadrature(torch.float64))
+        together = max(1, _TOGETHER // max(1, total.numel()))
+        for node, weight in zip(torch.split(nodes, together), torch.split(weights, together), strict=True):
+            latent = node.view(-1, *[1] * total.ndim).expand(-1, *total.shape).contiguous()
+            total = total + torch.tensordot(weight, function(self.from_latent(latent)), dims=1)
         return total
 
 

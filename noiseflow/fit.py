@@ -49,7 +49,7 @@ def fit(
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
 
     The loss is the mean negative log-likelihood of the training pixels, plus the signal model's ``penalty()`` where it has one.
-    Learning rates fall geometrically to 1 %.
+    Learning rates fall geometrically to 1 %; in a joint fit more slowly at first, and to nothing at the end.
 
     Args:
         noise_model: the model to fit; one without trainable parameters stays as it is.

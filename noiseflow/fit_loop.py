@@ -27,9 +27,11 @@ _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
 _LOOK_COUNT = 20_000
 _FIXED_COUNT = 2**20
+_ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
-_LEAST_BETWEEN_LOOKS = 4
+_DECAY = 0.3  # of a joint fit, besides a straight line to nothing
+_LEAST_BETWEEN_LOOKS = 8
 
 
 @described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
@@ -115,7 +117,9 @@ class FitLoop:
             self._judge(0)  # a good start must not be lost to worse steps
         try:
             for step in range(self.done + 1, num_steps + 1):
-                self._set_rates(_LAST_RATE ** ((step - 1) / num_steps) / 2**self.result.recoveries)
+                past = (step - 1) / num_steps
+                rate = (1 - past) * _DECAY**past if joint else _LAST_RATE**past
+                self._set_rates(rate / 2**self.result.recoveries)
                 if not self._take_step(step, schedule):
                     self._recover(good)
                 self.done = step
@@ -159,7 +163,7 @@ class FitLoop:
     def _judge(self, step: int) -> dict[str, Any] | None:
         """Look at the held-out pixels with the average of the weights, where there is one; the weights to go back to."""
         with nullcontext() if self.average is None else self.average.in_place():
-            scores, count = self.held_out_log_prob(_LOOK_COUNT)
+            scores, count = self._look()
             nll = -float(scores.sum()) / count
             if not math.isfinite(nll):
                 return None
@@ -168,6 +172,14 @@ class FitLoop:
                 self.result.held_out_nll = nll
         self.result.history[step] = nll
         return self._models()
+
+    def _look(self) -> tuple[Tensor, int]:
+        """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""
+        if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
+            return self.held_out_log_prob(_LOOK_COUNT)
+        pixels = thinned(self.pixels.judge, _LOOK_COUNT)
+        with torch.no_grad():
+            return self.table.lookup(values_of(self._signal(pixels)), pixels)[0].double(), pixels.numel()
 
     def _never_improves(self, schedule: Schedule) -> bool:
         """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""

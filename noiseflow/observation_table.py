@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -49,11 +50,6 @@ class ObservationTable:
         self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
         self._observation, self._tolerance, self._size = observation, tolerance, 0
         self._grid = torch.empty(observation.numel(), 2, dtype=observation.dtype, device=observation.device)
-        levels = torch.unique(observation[:: max(1, observation.numel() // 65536)])
-        self._choices: list[tuple[int, int, Tensor | None]] = [(rows, columns, None) for rows, columns in SIZES]
-        if levels.numel() <= _MAX_LEVELS:
-            levels = torch.unique(observation)
-            self._choices += [(rows, 0, levels) for rows, _ in SIZES]
         self.error = math.inf
         if resume is None:
             self._refine(noise_model)
@@ -64,10 +60,20 @@ class ObservationTable:
         """What makes the same rows and columns again: their number, the range of signals, the model they were laid out for."""
         return {"low": self.low, "high": self.high, "size": self._size, "laid_out_for": self._laid_out_for}
 
+    def _exists(self, size: int) -> bool:
+        """Whether there is such a size: rows and columns, or rows with all levels of the observations for columns."""
+        return size < len(SIZES) or (size < 2 * len(SIZES) and self._levels is not None)
+
+    @cached_property
+    def _levels(self) -> Tensor | None:
+        """All levels of the observations, if they are few."""
+        some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
+        return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
+
     def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
         present, self._size = copy.deepcopy(noise_model.state_dict()), state["size"]
         noise_model.load_state_dict(state["laid_out_for"])
-        self._build(noise_model, *self._choices[self._size])
+        self._build(noise_model, self._size)
         noise_model.load_state_dict(present)
         self.rebuild(noise_model)
         self.error = self.measure_error(noise_model)
@@ -77,8 +83,8 @@ class ObservationTable:
         are left out where finer columns gain little."""
         errors: dict[int, float] = {}
         size = self._size
-        while size < len(self._choices):
-            errors[size] = self.error = self._build(noise_model, *self._choices[size])
+        while self._exists(size):
+            errors[size] = self.error = self._build(noise_model, size)
             self._size = size
             if self.error <= self._tolerance:
                 return
@@ -87,7 +93,7 @@ class ObservationTable:
         best = min(errors, key=lambda size: errors[size])
         if best != self._size:
             self._size = best
-            self.error = self._build(noise_model, *self._choices[best])
+            self.error = self._build(noise_model, best)
 
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
         """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
@@ -105,11 +111,13 @@ class ObservationTable:
     def check(self, noise_model: nn.Module) -> float:
         """Measure the error again, and refine the table where the model has outgrown it."""
         self.error = self.measure_error(noise_model)
-        if self.error > self._tolerance and self._size < len(self._choices) - 1:
+        if self.error > self._tolerance and self._exists(self._size + 1):
             self._refine(noise_model)
         return self.error
 
-    def _build(self, noise_model: nn.Module, num_rows: int, num_columns: int, levels: Tensor | None) -> float:
+    def _build(self, noise_model: nn.Module, size: int) -> float:
+        num_rows, num_columns = SIZES[size % len(SIZES)]
+        levels = self._levels if size >= len(SIZES) else None
         self._laid_out_for = copy.deepcopy(noise_model.state_dict())
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
         self._rows = Rows(self._scale, num_rows)
@@ -145,8 +153,8 @@ class ObservationTable:
         found: Tensor = _Lookup.apply(signal, self)  # type: ignore[no-untyped-call]
         return found
 
-    def lookup(self, signal: Tensor, part: slice = slice(None)) -> tuple[Tensor, Tensor]:
-        """Log-likelihood and its signal derivative at (N,) signals; of a part of the pixels, where one is given."""
+    def lookup(self, signal: Tensor, part: slice | Tensor = slice(None)) -> tuple[Tensor, Tensor]:
+        """Log-likelihood and its signal derivative at (N,) signals; of a part of the pixels, or some, where they are given."""
         grid, clamped = self._grid[part], signal.detach().clamp(self.low, self.high)
         root = self._scale.signal(clamped)
         torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=grid[:, 0])

@@ -19,9 +19,10 @@ _LEAST_READ_NOISE = 1e-3
 class PoissonGaussian(ArrayModel):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
-    The rate of k is (signal − offset)/gain, and 0 where the signal lies below the offset. The likelihood is exact at any dose,
-    single electrons included. The second moments, variance = gain·(signal − offset) + (gain·read_noise)², identify only the gain
-    and gain²·read_noise² − gain·offset; the offset itself is known only as far as the shape of the noise tells it: well where
+    The rate of k is (signal − offset)/gain. Below the offset it is 0, and read noise is spread about the signal: no clean image
+    lies there, but an estimate may, and the readings pull it back. The likelihood is exact at any dose, single electrons
+    included. The second moments, variance = gain·(signal − offset) + (gain·read_noise)², identify only the gain and
+    gain²·read_noise² − gain·offset; the offset itself is known only as far as the shape of the noise tells it: well where
     single electrons are resolved or the dose is low, hardly where noise is Gaussian. It is a parameter all the same.
 
     Args:
@@ -119,13 +120,11 @@ class PoissonGaussianDistribution(NoiseDistribution):
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape)
         self.signal, self.gain, self.offset, self.read_noise = signal, gain, offset, read_noise
-        above = (signal.double() - offset).clamp(min=0)
-        self.rate = above / gain
-        self._bright = above + offset
+        self.rate = (signal.double() - offset).clamp(min=0) / gain
 
     def electrons(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals and rates of observations, electrons, float64."""
-        residual = (value.double() - self._bright) / self.gain
+        residual = (value.double() - self.signal.double()) / self.gain
         return residual, self.rate.expand_as(residual)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -166,17 +165,16 @@ class PoissonGaussianDistribution(NoiseDistribution):
         with torch.no_grad():
             rate = self._as(self.signal, self.rate).expand((*sample_shape, *self.batch_shape))
             normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
-            gain, offset, read_noise = (
-                self._as(self.signal, each) for each in (self.gain, self.offset, self.read_noise)
-            )
-            return torch.poisson(rate, generator=generator).add_(normal.mul_(read_noise)).mul_(gain).add_(offset)
+            gain, read_noise = (self._as(self.signal, each) for each in (self.gain, self.read_noise))
+            noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(read_noise)).mul_(gain)
+            return noise.add_(self.signal)
 
     def _as(self, like: Tensor, result: Tensor) -> Tensor:
         return result.to(torch.promote_types(like.dtype, self.signal.dtype))
 
     @property
     def mean(self) -> Tensor:
-        return self._as(self.signal, self._bright)
+        return self.signal
 
     @property
     def variance(self) -> Tensor:

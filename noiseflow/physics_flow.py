@@ -28,9 +28,9 @@ class PhysicsFlow(ArrayModel):
 
     Args:
         num_bins: bins of the spline.
-        mean_preserving: shift the latent so that E[observation | signal] is the detector's: the signal, or the offset where the
-            signal lies below it. Peaks stay in their places. To 1e-4 standard deviations where the read noise exceeds 0.4
-            electrons; where electrons are resolved better, a strong correction leaves up to 1e-2, and 1e-1 near the offset.
+        mean_preserving: shift the latent so that E[observation | signal] is the signal. Peaks stay in their places. To 1e-4
+            standard deviations where the read noise exceeds 0.4 electrons; where electrons are resolved better, a strong
+            correction leaves up to 1e-2, and 1e-1 near the offset.
         width: hidden units of the conditioning network.
         detector: the physical part; a default `PoissonGaussian` where none is given.
 

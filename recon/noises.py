@@ -108,7 +108,7 @@ class OutlierNoise(KnownNoise):
 
 
 class CountingNoise(KnownNoise):
-    """Poisson counts read out with Gaussian noise, one count per detector unit.
+    """Poisson counts read out with Gaussian noise, one count per detector unit; for a signal below zero, read noise about it.
 
     Args:
         read_noise: electrons rms.
@@ -122,10 +122,10 @@ class CountingNoise(KnownNoise):
     def forward(self, signal: Tensor) -> GaussianMixture:
         counts = torch.arange(self.most + 1, dtype=signal.dtype, device=signal.device)
         counts = counts.view(-1, *[1] * signal.ndim)
-        mean = signal.clamp_min(1e-4)  # a vanishing signal still gives finite likelihoods
-        log_weights = counts * torch.log(mean) - mean - torch.lgamma(counts + 1)
-        centres = counts.expand_as(log_weights)
-        return GaussianMixture(mean, log_weights, centres, torch.full_like(log_weights, self.read_noise))
+        rate = signal.clamp_min(1e-4)  # a vanishing signal still gives finite likelihoods
+        log_weights = counts * torch.log(rate) - rate - torch.lgamma(counts + 1)
+        centres = counts + (signal - rate)
+        return GaussianMixture(signal, log_weights, centres, torch.full_like(log_weights, self.read_noise))
 
 
 class GaussianMixture(NoiseDistribution):

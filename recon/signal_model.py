@@ -56,6 +56,7 @@ class TomographySignal(Described):
         self.occupancy = occupancy
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
+        self._tiles_of = (0, 0)
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
 
     def extra_repr(self) -> str:
@@ -104,8 +105,10 @@ class TomographySignal(Described):
         if self.occupancy is None or not isinstance(self.projector, SliceProjector):
             raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
         mask = self.occupancy.mask
-        if self._tiles is None or not torch.equal(self._tiles.mask, mask):
-            self._tiles = Tiles(mask, self.projector)
+        if self._tiles is None or self._tiles_of != (mask.data_ptr(), mask._version):
+            if self._tiles is None or not torch.equal(self._tiles.mask, mask):
+                self._tiles = Tiles(mask, self.projector)
+            self._tiles_of = mask.data_ptr(), mask._version
         return self._tiles
 
     def volume(self) -> Tensor:
@@ -163,4 +166,4 @@ class TomographySignal(Described):
                 "eps": 1e-15,
             }
         ]
-        return groups + ([{"params": response, "lr": self.learning_rate / 20}] if response else [])
+        return groups + ([{"params": response, "lr": self.learning_rate / 25}] if response else [])

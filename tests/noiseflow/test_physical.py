@@ -12,6 +12,7 @@ import noiseflow
 from noiseflow.distributions import log_normal_cdf
 from noiseflow.electrons import log_both_tails, log_density, log_interval
 from noiseflow.physics_distribution import ndtri_exp
+from recon.noises import CountingNoise
 from tests.contracts import check_noise_model, integrate_density
 
 SIGNALS = torch.tensor([0.0, 0.03, 0.5, 1.0], dtype=torch.float64)
@@ -380,6 +381,20 @@ def test_detector_behind_rails_is_found(step: float) -> None:
     model = noiseflow.Digitised(noiseflow.PhysicsFlow(), step=step, low=0.0, high=1.0)
     model.standardise(signal, observation)
     assert divergence(truth, model, signal, observation) < 0.001
+
+
+@pytest.mark.parametrize(
+    "noise", [noiseflow.PoissonGaussian(1.0, 0.0, 0.5), CountingNoise(0.5)], ids=lambda noise: type(noise).__name__
+)
+def test_readings_pull_an_estimate_below_the_offset_back(noise: torch.nn.Module) -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.full((4000,), -0.4, dtype=torch.float64, requires_grad=True)
+    readings = noise(torch.zeros(4000, dtype=torch.float64)).sample(generator=generator)
+    distribution = noise(signal)
+    distribution.log_prob(readings).sum().backward()
+    assert float(distribution.mean.detach().mean()) == pytest.approx(-0.4)
+    assert float(distribution.sample(generator=generator).mean()) == pytest.approx(-0.4, abs=0.05)
+    assert float(signal.grad.mean()) == pytest.approx(0.4 / 0.25, rel=0.1)
 
 
 @pytest.mark.parametrize(("gain", "read_noise"), [(-1.0, 1.0), (1.0, 0.0)])
