@@ -31,9 +31,7 @@ _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, besides a straight line to nothing
-_LEAST_BETWEEN_LOOKS = (
-    8  # steps; half as many of a joint fit, whose signals must not stray far from the table between two
-)
+_LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
 
 
 @described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
@@ -113,7 +111,7 @@ class FitLoop:
             self.table = self._make_table()
         if not joint and self.pixels.train.ndim == 1:
             self.fixed_part = self._compute_fixed_part()
-        check_every = max(_LEAST_BETWEEN_LOOKS // (2 if joint else 1), num_steps // 20)
+        check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
         if self.done == 0:
             self._judge(0)  # a good start must not be lost to worse steps

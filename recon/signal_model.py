@@ -30,7 +30,7 @@ class TomographySignal(Described):
         weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
             voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
-        learning_rate: of a field of voxels; the detector's response learns at a twentieth of it.
+        learning_rate: of a field of voxels; the detector's response learns at a twenty-fifth of it.
         occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a `SliceProjector`.
 
     Raises:
@@ -56,7 +56,7 @@ class TomographySignal(Described):
         self.occupancy = occupancy
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
-        self._tiles_of = (0, 0)
+        self._tiles_of: tuple[Tensor | None, int] = None, 0
         self._seen: tuple[tuple[int, ...], Tensor] | None = None
 
     def extra_repr(self) -> str:
@@ -105,10 +105,11 @@ class TomographySignal(Described):
         if self.occupancy is None or not isinstance(self.projector, SliceProjector):
             raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
         mask = self.occupancy.mask
-        if self._tiles is None or self._tiles_of != (mask.data_ptr(), mask._version):
+        known, version = self._tiles_of
+        if self._tiles is None or known is not mask or version != mask._version:
             if self._tiles is None or not torch.equal(self._tiles.mask, mask):
                 self._tiles = Tiles(mask, self.projector)
-            self._tiles_of = mask.data_ptr(), mask._version
+            self._tiles_of = mask, mask._version
         return self._tiles
 
     def volume(self) -> Tensor:
