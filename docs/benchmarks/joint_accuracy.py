@@ -24,7 +24,7 @@ from recon.tilt_series import TiltSeries
 
 PHANTOMS = ("shells", "virions", "filaments", "particles", "slab")
 NOISES = ("clipped", "skewed", "outliers", "low-dose", "8-bit")
-_LOWEST, _HIGHEST, _SEARCHES, _SLAB = 0.05, 2.0, 6, 24
+_LOWEST, _HIGHEST, _RUNGS, _SEARCHES, _SLAB = 0.05, 2.0, 5, 4, 24
 Row = dict[str, Any]
 
 
@@ -58,13 +58,16 @@ def _name(noise_model: nn.Module) -> str:
 
 
 def best_weight(reconstructor: JointReconstructor, scene: Scene) -> float:
-    """The weight of the highest volume PSNR, by golden section on the slices that vary most: only a rival may look there."""
+    """The weight of the highest volume PSNR on the slices that vary most: only a rival may look there. Golden section about
+    the best of a few, for chance dents the curve far from its peak."""
     slab = _slab(scene)
 
     def loss(log_weight: float) -> float:
         return -float(score(replace(reconstructor, weight=math.exp(log_weight)), slab)["volume"])
 
-    return math.exp(golden_section(loss, math.log(_LOWEST), math.log(_HIGHEST), _SEARCHES))
+    ladder = np.linspace(math.log(_LOWEST), math.log(_HIGHEST), _RUNGS)
+    best = int(np.argmin([loss(rung) for rung in ladder]))
+    return math.exp(golden_section(loss, ladder[max(0, best - 1)], ladder[min(best + 1, _RUNGS - 1)], _SEARCHES))
 
 
 def golden_section(loss: Callable[[float], float], low: float, high: float, count: int) -> float:
