@@ -73,7 +73,8 @@ def _accuracy(rows: list[Row]) -> str:
         "`noiseflow reconstruct` without options. **Oracle**: the same field and regulariser, told the true noise, at its best "
         "weight. **Least squares**: the same field with least squares + total variation at its best weight, incident intensity "
         "or offset learnt or not, whichever is better. Best weights are found by looking at the truth, by golden section on the "
-        "24 slices of most contrast. One row:\n\n"
+        "24 slices of most contrast; about the best of five that lie apart in the row of particles in 8 bits, where it went "
+        "astray. One row:\n\n"
         "```sh\npython docs/benchmarks/joint.py accuracy --phantom shells --noise clipped\n```"
     )
     body = [

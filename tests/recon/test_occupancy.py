@@ -1,5 +1,6 @@
 """Skipping of vacuum: nothing changes where the field is evaluated, and what the data wants is found."""
 
+import copy
 from functools import partial
 
 import numpy as np
@@ -80,6 +81,20 @@ def test_vacuum_is_not_evaluated(field):
     assert float(volume[2:5, 4:7, 1:4].min()) > 0
     volume[2:5, 4:7, 1:4] = 0
     assert not volume.any()
+
+
+def test_signal_sees_every_change_of_the_occupied():
+    field = VoxelField((8, 10, 12), scale=0.1)
+    field.start_from(torch.full((8, 10, 12), 0.1))
+    occupancy = Occupancy(torch.zeros(1, 1, 1), (8, 10, 12))
+    model, empty = signal_model(field, occupancy), copy.deepcopy(occupancy.state_dict())
+    assert not model.volume().any()
+    occupancy.mask = torch.ones_like(occupancy.mask)
+    torch.testing.assert_close(model.volume(), field.volume())
+    occupancy.load_state_dict(empty)
+    assert not model.volume().any()
+    occupancy.mask |= torch.ones_like(occupancy.mask)
+    torch.testing.assert_close(model.volume(), field.volume())
 
 
 def test_rows_of_an_occupancy():
