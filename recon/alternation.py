@@ -31,7 +31,7 @@ _TABULATED = 0.05  # nats per pixel
 
 
 class Alternation:
-    """A signal model with its observations, those of them to use, and the pixels that judge it."""
+    """A signal model with its observations, those of them to use, and a share `held_out` that judges it."""
 
     def __init__(
         self,
@@ -40,11 +40,13 @@ class Alternation:
         use: Tensor | None,
         seed: int,
         run_fit: Callable[..., FitResult],
+        *,
+        held_out: float = 0.1,
     ) -> None:
         self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
         self.generator = torch.Generator().manual_seed(seed)
         self.calm = 1.0
-        self.held_out = block_mask(observation.shape, generator=self.generator).to(observation.device)
+        self.held_out = block_mask(observation.shape, share=held_out, generator=self.generator).to(observation.device)
 
     def fit(self, noise_model: nn.Module, *, known: bool = False, **options: Any) -> FitResult:
         """Fit volume and noise model; with `known`, the noise model alone on the signal as it is."""
@@ -78,14 +80,19 @@ class Alternation:
             quiet: whether there is little noise; the simple one then settles the signal first.
             progress: called with the steps done and a note.
         """
-        begun = min(_SETTLING[0], num_steps // 4)
+        begun = _begun(num_steps)
         if quiet:
             self.settle(first, final=first is noise_model, thoroughly=True, progress=progress)
-        elif begun:
-            with frozen(first):
-                self.fit_signal(first, num_steps=begun, rate=1.0, progress=progress)
+        else:
+            self.begin(first, num_steps=num_steps, progress=progress)
         rate = WARM if quiet else SECOND
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
+
+    def begin(self, first: nn.Module, *, num_steps: int, progress: Progress | None = None) -> None:
+        """The first quarter of so many steps, with simple noise as it is."""
+        if _begun(num_steps):
+            with frozen(first):
+                self.fit_signal(first, num_steps=_begun(num_steps), rate=1.0, progress=progress)
 
     def settle(
         self, first: nn.Module, *, final: bool, thoroughly: bool = False, progress: Progress | None = None
@@ -173,6 +180,10 @@ class Alternation:
         if learns(noise_model):
             options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, num_steps), "standardise": standardise}
             self.fit(noise_model, known=True, **options)
+
+
+def _begun(num_steps: int) -> int:
+    return min(_SETTLING[0], num_steps // 4)
 
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:

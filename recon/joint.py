@@ -28,6 +28,7 @@ from recon.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.weight import WeightChoice, choose_weight
 
 _FIRST_WEIGHT = 0.4
+_HELD_OUT_TO_CHOOSE = 0.2  # of the pixels: those of a slab are few to tell weights apart
 _TOLERATED = 0.003  # nats per pixel
 _LOOK_STEPS = 60  # of each candidate: within the tolerance of where it would end
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
@@ -150,10 +151,12 @@ class JointReconstructor:
             field, projector, image_formation, weight=weight, learning_rate=rate, occupancy=occupancy
         )
 
-    def _task(self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None)) -> Alternation:
+    def _task(
+        self, signal_model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None), **options: float
+    ) -> Alternation:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
-        return Alternation(signal_model, observation, use, self.seed, self.run_fit)
+        return Alternation(signal_model, observation, use, self.seed, self.run_fit, **options)
 
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> _Chosen:
         """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
@@ -164,7 +167,8 @@ class JointReconstructor:
         field.start_from(whole.field.volume()[:, rows])
         part = whole.with_field(field)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
-        task = self._task(part, tilt_series, rows)
+        rough = copy.deepcopy(part.state_dict())
+        task = self._task(part, tilt_series, rows, held_out=_HELD_OUT_TO_CHOOSE)
         first = given if isinstance(given, Gaussian) else first_noise(tilt_series.images).to(self.device)
         quiet = task.settle(first, final=first is given)
         if given is not None and self.weight is not None and not learns(given):
@@ -172,13 +176,19 @@ class JointReconstructor:
         candidates = noise_candidates(tilt_series.images, quiet=quiet) if given is None else [given]
         noise_model = _best_noise_model(task, candidates)
         task.alternate(noise_model, num_steps=60, rate=WARM, standardise=len(candidates) == 1)
-        choice = None
+        response, choice = copy.deepcopy(part.image_formation.state_dict()), None
         if self.weight is None:
+            if not quiet:  # as the whole will begin: from a signal that has settled, fits want more weight
+                part.load_state_dict(rough)
+                part.image_formation.load_state_dict(response)
+                task.begin(first, num_steps=self.num_steps)
+            held_out = _HeldOut(task, noise_model, WARM if quiet else SECOND)
             with frozen(noise_model):
-                choice = choose_weight(_HeldOut(task, noise_model), _FIRST_WEIGHT)
+                choice = choose_weight(held_out, _FIRST_WEIGHT)
             # only now is the signal as good as that of the whole will be: a worse one bends the noise at its bright end
+            part.load_state_dict(held_out.likeliest)
             task.refine(noise_model)
-        whole.image_formation.load_state_dict(part.image_formation.state_dict())
+        whole.image_formation.load_state_dict(response)
         return _Chosen(noise_model, choice, first, quiet)
 
 
@@ -218,15 +228,20 @@ def _best_noise_model(task: Alternation, candidates: Sequence[nn.Module]) -> nn.
 class _HeldOut:
     """Held-out NLL by weight. Every fit begins where the first did: steps that another weight has taken count for none."""
 
-    def __init__(self, task: Alternation, noise_model: nn.Module) -> None:
-        self.task, self.noise_model = task, noise_model
-        self.start = copy.deepcopy(task.signal_model.state_dict())
+    def __init__(self, task: Alternation, noise_model: nn.Module, rate: float) -> None:
+        self.task, self.noise_model, self.rate = task, noise_model, rate
+        self.start = self.likeliest = copy.deepcopy(task.signal_model.state_dict())
+        self.lowest = math.inf
 
     def __call__(self, weight: float) -> float:
-        self.task.signal_model.load_state_dict(self.start)
-        self.task.signal_model.weight = weight
-        history = self.task.fit_signal(self.noise_model, num_steps=80, rate=SECOND).history
-        return list(history.values())[-1]
+        signal_model = self.task.signal_model
+        signal_model.load_state_dict(self.start)
+        signal_model.weight = weight
+        history = self.task.fit_signal(self.noise_model, num_steps=80, rate=self.rate).history
+        nll = list(history.values())[-1]
+        if nll < self.lowest:
+            self.lowest, self.likeliest = nll, copy.deepcopy(signal_model.state_dict())
+        return nll
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:
