@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from noiseflow import Gaussian
+from noiseflow.kept_memory import kept_memory
 from recon.classical import LineIntegralProblem, best_num_iterations, best_window, part_of
 from recon.fields import MultiresolutionField, VoxelField
 from recon.first_guess import contrast_slab, estimate_response
@@ -35,6 +36,7 @@ _FITTED: dict[str, dict[str, Any]] = {
 }
 
 
+@kept_memory()
 def reconstruct_in_blocks(
     tilt_series: TiltSeries,
     grid: VolumeGrid,

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, Gaussian, fit
 from noiseflow.described import described
+from noiseflow.kept_memory import kept_memory
 from recon.alternation import SECOND, WARM, Alternation, Progress, frozen
 from recon.candidates import first_noise, learns, noise_candidates, num_steps_of
 from recon.coarse_start import coarse_start, learning_rate
@@ -93,6 +94,7 @@ class JointReconstructor:
     device: torch.device | str = "cpu"
     run_fit: Callable[..., FitResult] = fit
 
+    @kept_memory()
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
     ) -> Reconstruction:

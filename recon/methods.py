@@ -12,6 +12,7 @@ from torch import nn
 
 from noiseflow import Digitisation, Digitised, FitResult, Gaussian, fit
 from noiseflow.described import described
+from noiseflow.kept_memory import kept_memory
 from recon.classical import LineIntegralProblem, best_num_iterations, best_window
 from recon.defocused_projector import DefocusedProjector
 from recon.denoise import find_denoiser
@@ -113,6 +114,7 @@ def method(name: str) -> Callable[[Method], Method]:
     return register
 
 
+@kept_memory()
 def reconstruct(tilt_series: TiltSeries, grid: VolumeGrid, *, method: str = "auto", **settings: Any) -> Outcome:
     """Reconstruct a volume from a tilt series.
 
