@@ -115,6 +115,10 @@ def reconstruct(
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
     settings_of(**options)
+    if fsc and slices_at_once is not None:
+        raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
+    if fsc and report is None:
+        raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and method.startswith(("sirt", "wbp")):
         raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
     with warnings_as_lines(output) as warned:
@@ -152,7 +156,7 @@ def reconstruct(
             if slices_at_once is not None:
                 options |= {"rows_at_once": slices_at_once, "scratch": scratch}
             with step_report(json_mode=json) as journal.report:
-                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc and report is not None)
+                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
             targets.write(
                 output,
                 tilt_series,
@@ -178,8 +182,6 @@ def _solve(
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
     if "scratch" in options:
-        if fsc:
-            raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
         return reconstruct_in_blocks(tilt_series, grid, **options, progress=lambda done, note: None), None
     outcome = reconstruct(tilt_series, grid, **options, progress=lambda done, note: None)
     if not fsc:
