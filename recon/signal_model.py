@@ -81,7 +81,7 @@ class TomographySignal(Described):
             everywhere: Tensor = self.field()
             return everywhere
         tiles = self.tiles
-        units = self.field.at(tiles.places[tiles.occupied])
+        units = self.field.on(tiles)
         return units.new_zeros(tiles.places.numel()).index_copy(0, tiles.occupied, units * self.field.scale)
 
     def _project(self, values: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ class PanelledMatrix:
         for start in range(0, shape[1], panel):
             here = number == start // panel
             size = (shape[0], min(panel, shape[1] - start))
-            panels.append(_as_tensor(csr_array((values[here], (rows[here], columns[here] - start)), shape=size)))
+            panels.append(csr_tensor(csr_array((values[here], (rows[here], columns[here] - start)), shape=size)))
         return PanelledMatrix(panels)
 
     @property
@@ -94,10 +94,11 @@ class PanelledMatrix:
             chosen.append(csr_array(parts, shape=tuple(panel.shape))[rows.cpu().numpy()])
         whole = hstack(chosen, format="csr")
         like = self.panels[0]
-        return _as_tensor(whole).to(like), _as_tensor(whole.T.tocsr()).to(like)
+        return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
 
 
-def _as_tensor(matrix: Any) -> Tensor:
+def csr_tensor(matrix: Any) -> Tensor:
+    """A SciPy CSR matrix as a tensor."""
     matrix.sort_indices()
     with warnings.catch_warnings():  # torch announces that CSR is in beta
         warnings.simplefilter("ignore")

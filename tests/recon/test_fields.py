@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch.nn import functional
 
-from recon.fields import MultiresolutionField, VoxelField, upsample
+from recon.fields import MultiresolutionField, VoxelField
 from recon.image_formation import Linear, Transmission
 from recon.regularisers import total_variation
+from recon.upsampling import upsample
 
 
 @pytest.mark.parametrize("make", [VoxelField, MultiresolutionField])
@@ -44,6 +45,9 @@ def test_upsampling_equals_the_general_interpolation(shape):
     expected = functional.interpolate(grid[None, None], size=even, mode="trilinear")[0, 0]
     torch.testing.assert_close(upsample(grid, shape), expected[: shape[0], : shape[1], : shape[2]])
     assert torch.autograd.gradcheck(lambda values: upsample(values, shape), grid)
+    fine = torch.rand(shape, dtype=torch.float64, requires_grad=True)
+    torch.testing.assert_close(upsample(grid, shape, plus=fine), upsample(grid, shape) + fine)
+    assert torch.autograd.gradcheck(lambda values, more: upsample(values, shape, plus=more), (grid, fine))
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 4), (4, 4)])

@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from recon.fields import MultiresolutionField
 from recon.projector import SliceProjector
 from recon.regularisers import total_variation
 from recon.tiles import Tiles
+from recon.upsampling import upsample
 
 SHAPE = (9, 11, 37)  # z, x, y
 
@@ -57,6 +59,28 @@ def test_total_variation_and_its_gradient_are_those_of_the_whole(mask):
     expected.backward()
     found.backward()
     torch.testing.assert_close(values.grad, lattice.grad.view(-1)[tiles.places])
+
+
+def test_a_coarse_grid_is_interpolated_to_the_list(mask):
+    _, tiles, _, _ = operators(mask)
+    generator = torch.Generator().manual_seed(3)
+    grid = torch.rand(5, 6, 19, dtype=torch.float64, generator=generator, requires_grad=True)
+    torch.testing.assert_close(tiles.upsampled(grid), upsample(grid, SHAPE).reshape(-1)[tiles.places])
+    assert torch.autograd.gradcheck(tiles.upsampled, grid)
+
+
+def test_field_and_its_gradient_on_tiles_are_those_of_the_whole(mask):
+    _, tiles, _, _ = operators(mask)
+    field, generator = MultiresolutionField((9, 37, 11)).double(), torch.Generator().manual_seed(4)
+    for grid in field.grids:
+        torch.nn.init.normal_(grid, generator=generator)
+    weights = torch.rand(tiles.voxels.numel(), dtype=torch.float64, generator=generator)
+    found, gradients = [], []
+    for values in (field.on(tiles), field.units().reshape(-1)[tiles.voxels]):
+        found.append(values)
+        gradients.append(torch.autograd.grad((values * weights).sum(), list(field.grids)))
+    torch.testing.assert_close(*found)
+    torch.testing.assert_close(*gradients)
 
 
 def test_nothing_occupied_projects_to_nothing():
