@@ -25,7 +25,7 @@ Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
-_LOOK_COUNT = 20_000
+_LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
 _FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
@@ -175,9 +175,10 @@ class FitLoop:
 
     def _look(self) -> tuple[Tensor, int]:
         """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""
+        most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
         if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
-            return self.held_out_log_prob(_LOOK_COUNT)
-        pixels = thinned(self.pixels.judge, _LOOK_COUNT)
+            return self.held_out_log_prob(most)
+        pixels = thinned(self.pixels.judge, most)
         with torch.no_grad():
             return self.table.lookup(values_of(self._signal(pixels)), pixels)[0].double(), pixels.numel()
 

@@ -91,5 +91,5 @@ def _drawn(use: Tensor, held_out: float | Tensor, generator: torch.Generator) ->
 
 
 def thinned(pixels: Tensor, most: int) -> Tensor:
-    """At most about `most` pixels, evenly picked from pixels (P,) or lines (P, L)."""
-    return pixels[:: max(1, pixels.numel() // most)]
+    """At most `most` pixels, evenly picked from pixels (P,) or lines (P, L)."""
+    return pixels[:: max(1, -(-pixels.numel() // most))]

@@ -72,9 +72,8 @@ def _accuracy(rows: list[Row]) -> str:
         "PSNR of the volume / of the clean projections, dB, over the range of the truth, without rescaling. **Joint**: "
         "`noiseflow reconstruct` without options. **Oracle**: the same field and regulariser, told the true noise, at its best "
         "weight. **Least squares**: the same field with least squares + total variation at its best weight, incident intensity "
-        "or offset learnt or not, whichever is better. Best weights are found by looking at the truth, by golden section on the "
-        "24 slices of most contrast; about the best of five that lie apart in the row of particles in 8 bits, where it went "
-        "astray. One row:\n\n"
+        "or offset learnt or not, whichever is better. Best weights are found by looking at the truth, on the 24 slices of "
+        "most contrast: by golden section about the best of five that lie apart. One row:\n\n"
         "```sh\npython docs/benchmarks/joint.py accuracy --phantom shells --noise clipped\n```"
     )
     body = [
