@@ -65,11 +65,11 @@ def run_time(folder: Path) -> str:
             f"## {size}³",
             f"![PSNR over wall time for every method at {size}³]({_figure(size)})",
             _table(header, rows),
-            f"{len(repeats)} repeats in turn. Load of the machine before each cell: {min(loads):.1f} to {max(loads):.1f}.",
+            f"{_runs(len(repeats))} Load of the machine before each cell: {min(loads):.1f} to {max(loads):.1f}.",
             _machines(files),
         ]
     missing = [f"{size}³" for size in (64, 96, 128) if size not in sizes]
-    gaps = [f"- {', '.join(missing)} on a CPU are not measured yet."] if missing else []
+    gaps = [f"- {', '.join(missing)} on a CPU: not measured yet."] if missing else []
     gaps += [
         "- 256³ and 512³ are not measured: they want a GPU.",
         "- The paper's preset asks for 400 000 iterations; its curve ends where its budget of seconds did, "
@@ -262,6 +262,10 @@ def _machines(contents: Iterable[Content]) -> str:
 
 def _absent(names: Sequence[str]) -> str:
     return f"Not measured yet: {', '.join(names)}." if names else ""
+
+
+def _runs(count: int) -> str:
+    return "One run of each." if count == 1 else f"{count} repeats in turn."
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
