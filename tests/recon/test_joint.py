@@ -166,6 +166,22 @@ def test_grid_of_another_height_is_refused(scene):
         JointReconstructor()(scene[2], VolumeGrid(32, 31, 32))
 
 
+def test_fits_that_tell_weights_apart_begin_as_that_of_the_whole(scene):
+    """On a slab that is the whole: both begin at the rough volume, not at the one that settled the noise."""
+    starts = []
+
+    def run_fit(noise_model, signal, observation, **options):
+        if isinstance(signal, TomographySignal):
+            starts.append((options["num_steps"], signal.volume(), float(signal.learning_rate)))
+        return noiseflow.fit(noise_model, signal, observation, **options)
+
+    JointReconstructor(noise_model=noiseflow.Gaussian, num_steps=40, slab=32, run_fit=run_fit)(scene[2])
+    (of_weights, rate), (of_whole, same_rate) = [start[1:] for start in starts if start[0] == 10]
+    settled = next(volume for num_steps, volume, _ in starts if num_steps == 17)
+    assert rate == same_rate
+    assert (of_weights - of_whole).norm() < 0.3 * (settled - of_whole).norm()
+
+
 @pytest.mark.slow
 def test_chosen_weight_is_nearly_the_best(scene):
     truth, _, noisy = scene
