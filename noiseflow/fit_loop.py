@@ -168,10 +168,11 @@ class FitLoop:
             if not math.isfinite(nll):
                 return None
             # a joint fit moves on slowly, and each of its looks is as good as its weights: there the best look counts
-            if self.best.judge(self._models(), scores, start=step == 0, strict=self.average is None):
+            models = self._models()
+            if self.best.judge(models, scores, start=step == 0, strict=self.average is None):
                 self.result.held_out_nll = nll
         self.result.history[step] = nll
-        return self._models()
+        return models if self.average is None else self._models()
 
     def _look(self) -> tuple[Tensor, int]:
         """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""

@@ -56,7 +56,10 @@ class Alternation:
                 signal = self.signal_model.signal().view_as(self.observation)
         options = {"batch_size": 4096, "learning_rate": rate_of(noise_model)} | options
         options |= {"mask": self.use, "held_out": self.held_out, "generator": self.generator, "digitise": False}
-        return self.run_fit(noise_model, signal, self.observation, **options)
+        try:
+            return self.run_fit(noise_model, signal, self.observation, **options)
+        finally:
+            self.signal_model.release()
 
     def fit_signal(self, noise_model: nn.Module, *, rate: float, **options: Any) -> FitResult:
         """Fit volume and noise model at so many times the usual learning rate of the volume, and calmer where there is little

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -51,8 +50,9 @@ class Field(Described):
         return self.units().reshape(-1).index_select(0, places)
 
     def on(self, tiles: Tiles) -> Tensor:
-        """The same at the voxels of tiles; a field that has a faster way than by their places takes it."""
-        return self.at(tiles.voxels)
+        """The same as the list of `tiles`, (N,), zero where nothing is occupied."""
+        values = self.at(tiles.voxels)
+        return values.new_zeros(tiles.filled.numel()).index_copy(0, tiles.occupied, values)
 
     def start_from(self, volume: Tensor) -> None:
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
@@ -94,8 +94,8 @@ class VoxelField(Field):
     def units(self) -> Tensor:
         return functional.softplus(self.values)
 
-    def at(self, places: Tensor) -> Tensor:
-        return functional.softplus(_picked(self.values, places))
+    def on(self, tiles: Tiles) -> Tensor:
+        return functional.softplus(tiles.gathered(self.values)) * tiles.filled
 
 
 class MultiresolutionField(Field):
@@ -130,10 +130,10 @@ class MultiresolutionField(Field):
 
     def on(self, tiles: Tiles) -> Tensor:
         *coarse, finest = self.grids
-        values = _picked(finest, tiles.voxels)
+        values = tiles.gathered(finest)
         if coarse:
-            values = values + tiles.upsampled(_sum(coarse)).index_select(0, tiles.occupied)
-        return functional.softplus(values)
+            values = values + tiles.upsampled(_sum(coarse))
+        return functional.softplus(values) * tiles.filled
 
 
 def _sum(grids: Sequence[Tensor]) -> Tensor:
@@ -141,22 +141,3 @@ def _sum(grids: Sequence[Tensor]) -> Tensor:
     for grid in finer:
         total = upsample(total, grid.shape, plus=grid)
     return total
-
-
-def _picked(lattice: Tensor, places: Tensor) -> Tensor:
-    """Values at different places, so that the gradient may be copied where it belongs."""
-    picked: Tensor = _Picked.apply(lattice, places)  # type: ignore[no-untyped-call]
-    return picked
-
-
-class _Picked(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, lattice: Tensor, places: Tensor) -> Tensor:
-        ctx.shape = lattice.shape
-        ctx.save_for_backward(places)
-        return lattice.reshape(-1).index_select(0, places)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (places,) = ctx.saved_tensors
-        return gradient.new_zeros(ctx.shape.numel()).index_copy_(0, places, gradient).view(ctx.shape), None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -38,8 +39,7 @@ class Occupancy(nn.Module):
         super().__init__()
         self.block = block
         lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
-        grown = functional.max_pool3d(lattice, 2 * margin + 1, stride=1, padding=margin)[0, 0]
-        self.register_buffer("mask", (grown > least).transpose(1, 2).contiguous())
+        self.register_buffer("mask", _grown(lattice[0, 0].transpose(1, 2).contiguous() > least, margin))
         self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
 
@@ -69,12 +69,24 @@ class Occupancy(nn.Module):
         self.num_steps += 1
         if int(self.num_steps) % _RETEST_EVERY:
             return
-        lattice = projector.backproject(gradient).view(self.mask.shape)[None, None]
-        options = {"ceil_mode": True, "divisor_override": 1}
-        gain = -functional.avg_pool3d(lattice, self.block, **options)[0, 0]  # type: ignore[arg-type]
+        options: dict[str, Any] = {"ceil_mode": True, "divisor_override": 1}
+        # slices are projected one by one: those of a block may be added up before
+        slabs = functional.avg_pool2d(gradient[None, None], (1, self.block), **options)[0, 0]
+        lattice = projector.backproject(slabs).view(*self.mask.shape[:2], -1)
+        gain = -functional.avg_pool3d(lattice[None, None], (self.block, self.block, 1), **options)[0, 0]
         wanted = gain > 6 * self.block**2 * cost
         lasting, self.wanted = wanted & self.wanted, wanted
         for axis, size in enumerate(self.mask.shape):
             lasting = lasting.repeat_interleave(self.block, axis).narrow(axis, 0, size)
         if bool((lasting & ~self.mask).any()):
             self.mask |= lasting
+
+
+def _grown(mask: Tensor, margin: int) -> Tensor:
+    """Whatever is within a cube of so many voxels to each side of what is set."""
+    for axis, size in enumerate(mask.shape):
+        start, mask = mask, mask.clone()
+        for step in range(1, min(margin, size - 1) + 1):
+            mask.narrow(axis, step, size - step).logical_or_(start.narrow(axis, 0, size - step))
+            mask.narrow(axis, 0, size - step).logical_or_(start.narrow(axis, step, size - step))
+    return mask

@@ -57,7 +57,7 @@ class TomographySignal(Described):
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
         self._tiles_of: tuple[Tensor | None, int] = None, 0
-        self._seen: tuple[tuple[int, ...], Tensor] | None = None
+        self._seen: tuple[tuple[object, ...], Tensor] | None = None
 
     def extra_repr(self) -> str:
         return f"{self.projector!r}, weight={self.weight:.4g}, smoothing={self.smoothing:.4g}"
@@ -68,7 +68,11 @@ class TomographySignal(Described):
         return self.projector.num_tilts * self.projector.detector_width * self.field.height
 
     def signal(self) -> Tensor:
-        """The signal of all pixels, flat."""
+        """The signal of all pixels, flat; what `forward` has just seen is taken over, with its gradient."""
+        seen = self._seen
+        if seen is not None and seen[1].requires_grad and torch.is_grad_enabled() and seen[0] == self._changes:
+            self._seen = None
+            return seen[1]
         self._values, self._seen = self._evaluate(), None
         rays = self._project(self._values)
         shape = (self.projector.num_tilts, self.projector.detector_width, self.field.height)
@@ -76,13 +80,11 @@ class TomographySignal(Described):
         return signal.reshape(-1)
 
     def _evaluate(self) -> Tensor:
-        """The field on the whole lattice, (depth * width, height), or at the places where it is occupied."""
+        """The field on the whole lattice, (depth * width, height), or as the list of `tiles`."""
         if self.occupancy is None:
             everywhere: Tensor = self.field()
             return everywhere
-        tiles = self.tiles
-        units = self.field.on(tiles)
-        return units.new_zeros(tiles.places.numel()).index_copy(0, tiles.occupied, units * self.field.scale)
+        return self.field.on(self.tiles) * self.field.scale
 
     def _project(self, values: Tensor) -> Tensor:
         """Line integrals; what the data wants where the lattice counts as empty is tested as gradients pass."""
@@ -108,7 +110,7 @@ class TomographySignal(Described):
         known, version = self._tiles_of
         if self._tiles is None or known is not mask or version != mask._version:
             if self._tiles is None or not torch.equal(self._tiles.mask, mask):
-                self._tiles = Tiles(mask, self.projector)
+                self._tiles = Tiles(mask, self.projector, known=self._tiles)
             self._tiles_of = mask, mask._version
         return self._tiles
 
@@ -120,18 +122,27 @@ class TomographySignal(Described):
             return from_columns(columns, self.field.depth).contiguous()
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """The signal of some pixels; without gradients, all are projected once for each state of the parameters."""
+        """The signal of some pixels; without gradients, all are projected once for each state of the parameters, and once more
+        is not needed for the step that follows."""
         if torch.is_grad_enabled():
             return self.signal()[pixels]
         # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
         if self._seen is None or self._seen[0] != self._changes:
-            signal = self.signal()  # which may set a response that is matched to it
+            with torch.enable_grad():
+                signal = self.signal()  # which may set a response that is matched to it
             self._seen = self._changes, signal
-        return self._seen[1][pixels]
+        return self._seen[1].detach()[pixels]
+
+    def release(self) -> None:
+        """Let go of what was kept for a next step."""
+        self._values = None
+        if self._seen is not None:
+            self._seen = self._seen[0], self._seen[1].detach()
 
     @property
-    def _changes(self) -> tuple[int, ...]:
-        return tuple(parameter._version for parameter in self.parameters())
+    def _changes(self) -> tuple[object, ...]:
+        tensors = [*self.parameters(), *self.buffers()]
+        return tuple((tensor._version, tensor.requires_grad) for tensor in tensors)
 
     def penalty(self) -> Tensor:
         """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -14,47 +16,66 @@ from recon.projector import SliceProjector
 from recon.sparse import csr_tensor
 from recon.upsampling import upsampling_matrix
 
-_TOGETHER, _MOST_GROUPS = 16, 8
+_TOGETHER, _MOST_TILES = 16, 8
 
 
 class Tiles:
-    """The columns (z, x) of a lattice in which neighbouring slices hold anything, group by group of slices.
+    """The columns (z, x) of a lattice in which neighbouring slices hold anything, tile by tile of such slices.
 
-    Every group has its own small part of the projector's matrix: the columns that are occupied in any of its slices. A list of
-    values counts as a volume that is empty wherever the list has no voxel.
+    Every tile has its own small part of the projector's matrix: the columns that are occupied in any of its slices. They are
+    listed whole, so that memory is read in runs. A list of values counts as a volume that is empty wherever the list has no
+    voxel.
 
     Args:
         mask: (depth, width, height) of the lattice, True where occupied.
         projector: of the whole lattice.
+        known: tiles of another mask of the lattice, for the same projector; what is the same is taken over.
 
     Attributes:
         mask: as given.
-        places: (N,) voxels of the list, flat lattice indices (z, x, y).
-        occupied: (M,) where in the list the occupied ones stand.
-        voxels: (M,) their flat lattice indices.
+        filled: (N,) 1 where the listed voxel is occupied, else 0.
     """
 
-    def __init__(self, mask: Tensor, projector: SliceProjector) -> None:
+    def __init__(self, mask: Tensor, projector: SliceProjector, *, known: Tiles | None = None) -> None:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
-        together = max(_TOGETHER, -(-height // _MOST_GROUPS))
+        together = max(_TOGETHER, -(-height // _MOST_TILES))
         flat = mask.reshape(depth * width, height)
-        self.rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
-        self._columns = columns = [flat[:, rows].any(1).nonzero()[:, 0] for rows in self.rows]
-        spans = [torch.arange(rows.start, rows.stop, device=mask.device) for rows in self.rows]
-        listed = [(part[:, None] * height + span).reshape(-1) for part, span in zip(columns, spans, strict=True)]
-        self.places = torch.cat(listed)
-        self.occupied = mask.reshape(-1)[self.places].nonzero()[:, 0]
-        self.voxels = self.places[self.occupied]
-        self.parts = [slice(*ends) for ends in pairwise(accumulate(map(len, listed), initial=0))]
-        self.matrices = [projector.part(part) for part in columns]
-        self._neighbours = _neighbours(self.places, self.shape)
-        self._upsampling: tuple[tuple[int, ...], list[_GroupUpsampling]] | None = None
+        rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
+        columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
+        sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
+        parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
+        neighbours = _neighbours(columns, (depth, width))
+        before: Sequence[_Tile | None] = [None] * len(rows) if known is None else [*known]
+        self._tiles: list[_Tile] = [
+            _Tile(*lists, *_matrices(projector, lists[1], tile))
+            for lists, tile in zip(zip(rows, columns, parts, neighbours, strict=True), before, strict=True)
+        ]
+        self._like = self._tiles[0].matrix.values()
+        self.filled = self._like.new_empty(parts[-1].stop)
+        for tile in self._tiles:
+            tile.of(self.filled).copy_(flat[:, tile.rows].index_select(0, tile.columns))
+        self._upsampling: tuple[tuple[int, ...], list[_TileUpsampling]] | None = None
 
     @property
     def share(self) -> float:
         """The share of the lattice that is listed."""
-        return self.places.numel() / math.prod(self.shape)
+        return self.filled.numel() / math.prod(self.shape)
+
+    @cached_property
+    def occupied(self) -> Tensor:
+        """(M,) where in the list the occupied voxels stand."""
+        return self.filled.nonzero()[:, 0]
+
+    @cached_property
+    def voxels(self) -> Tensor:
+        """(M,) flat lattice indices (z, x, y) of the occupied voxels."""
+        height, device = self.shape[2], self.filled.device
+        spans = [torch.arange(tile.rows.start, tile.rows.stop, device=device) for tile in self._tiles]
+        listed = [
+            (tile.columns[:, None] * height + span).reshape(-1) for tile, span in zip(self._tiles, spans, strict=True)
+        ]
+        return torch.cat(listed)[self.occupied]
 
     def project(self, values: Tensor) -> Tensor:
         """Values (N,) to line integrals (tilts * detector_width, height), in the projector's native order."""
@@ -63,38 +84,134 @@ class Tiles:
 
     def total_variation(self, values: Tensor, *, smoothing: float) -> Tensor:
         """Of the whole lattice, see `recon.regularisers.total_variation`."""
-        variation: Tensor = _Variation.apply(values, smoothing, *self._neighbours)  # type: ignore[no-untyped-call]
+        variation: Tensor = _Variation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
         return variation
 
+    def gathered(self, lattice: Tensor) -> Tensor:
+        """The list, (N,), of a whole lattice, (z, x, y)."""
+        values: Tensor = _Gathering.apply(lattice, self)  # type: ignore[no-untyped-call]
+        return values
+
     def upsampled(self, grid: Tensor) -> Tensor:
-        """A grid half as fine as the lattice, (z, x, y), interpolated to the list, (N,): see `recon.upsampling`."""
+        """The list, (N,), of a grid half as fine as the lattice, (z, x, y), interpolated: see `recon.upsampling`."""
         values: Tensor = _Upsampling.apply(grid, self)  # type: ignore[no-untyped-call]
         return values
 
-    def upsampling(self, size: tuple[int, ...]) -> list[_GroupUpsampling]:
-        """Of a grid of that size, for every group."""
+    def upsampling(self, size: tuple[int, ...]) -> list[_TileUpsampling]:
+        """Of a grid of that size, for every tile."""
         if self._upsampling is None or self._upsampling[0] != size:
             depth, width, height = self.shape
-            like = self.matrices[0][0].values()
             across = _between_columns((depth, width), size[:2])
-            along = upsampling_matrix(size[2], height, like=like)
-            groups = [
-                _GroupUpsampling.of(across[columns.cpu().numpy()], along[rows], like)
-                for columns, rows in zip(self._columns, self.rows, strict=True)
+            along = upsampling_matrix(size[2], height, like=self._like)
+            upsampling = [
+                _TileUpsampling.of(across[tile.columns.cpu().numpy()], along[tile.rows]) for tile in self._tiles
             ]
-            self._upsampling = size, groups
+            self._upsampling = size, upsampling
         return self._upsampling[1]
 
     def lattice(self, values: Tensor) -> Tensor:
         """The whole lattice, (depth * width, height), without gradient."""
-        depth, width, height = self.shape
-        empty = values.new_zeros(depth * width * height)
-        return empty.index_copy(0, self.places, values.detach()).view(depth * width, height)
+        return self.scattered(values.detach()).view(-1, self.shape[2])
+
+    def scattered(self, values: Tensor) -> Tensor:
+        """The lattice, (z, x, y), of a list: the adjoint of `gathered`."""
+        lattice = values.new_zeros(self.shape)
+        for tile in self._tiles:
+            lattice.view(-1, self.shape[2])[:, tile.rows].index_copy_(0, tile.columns, tile.of(values))
+        return lattice
+
+    def __iter__(self) -> Iterator[_Tile]:
+        return iter(self._tiles)
 
 
 @dataclass(frozen=True)
-class _GroupUpsampling:
-    """From a coarse grid to the columns of one group: between columns by a sparse matrix, along them by a small dense one."""
+class _Tile:
+    """Neighbouring slices `rows` of the lattice, and those of its `columns` that hold anything there.
+
+    Attributes:
+        part: where in the list their values stand, column by column.
+        neighbours: of its columns.
+        matrix, transposed: the projector's part.
+    """
+
+    rows: slice
+    columns: Tensor
+    part: slice
+    neighbours: _Neighbours
+    matrix: Tensor
+    transposed: Tensor
+
+    def of(self, values: Tensor) -> Tensor:
+        """The tile's part of a list as (columns, slices)."""
+        return values[self.part].view(self.columns.numel(), self.rows.stop - self.rows.start)
+
+
+def _matrices(projector: SliceProjector, columns: Tensor, known: _Tile | None) -> tuple[Tensor, Tensor]:
+    if known is not None and torch.equal(columns, known.columns):
+        return known.matrix, known.transposed
+    return projector.part(columns)
+
+
+@dataclass(frozen=True)
+class _Neighbours:
+    """Where the neighbours of a tile's columns stand, its own first and then the rim: empty ones from which a difference leads to
+    a listed one. The number of all these, C, stands for an empty one that is not among them.
+
+    Attributes:
+        following: (2, C) the next one along z and x, or the column itself at an edge.
+        preceding: (2, n) the one before each of its own.
+        above: (C,) among the next tile's own, whose number stands for an empty one; None at the edge.
+        below: (n,) among the tile's before, own and rim; None at the edge.
+    """
+
+    following: Tensor
+    preceding: Tensor
+    above: Tensor | None
+    below: Tensor | None
+
+
+def _neighbours(columns: Sequence[Tensor], shape: tuple[int, int]) -> list[_Neighbours]:
+    """Of every tile, given its columns, indices of the flat (depth, width)."""
+    total, steps, found, below = math.prod(shape), (shape[1], 1), [], None
+    for tile, own in enumerate(columns):
+        following_tile = columns[tile + 1] if tile + 1 < len(columns) else None
+        first = [own < shape[1], own % shape[1] == 0]
+        is_rim = torch.zeros(total, dtype=torch.bool, device=own.device)
+        for step, edge in zip(steps, first, strict=True):
+            is_rim[(own - step)[~edge]] = True
+        if following_tile is not None:
+            is_rim[following_tile] = True
+        is_rim[own] = False
+        everything = torch.cat([own, is_rim.nonzero()[:, 0]])
+        here = torch.arange(everything.numel(), device=own.device)
+        at = _positions(everything, total)
+        last = [everything >= total - shape[1], everything % shape[1] == shape[1] - 1]
+        following = [
+            torch.where(edge, here, at[(everything + step).clamp(max=total - 1)])
+            for step, edge in zip(steps, last, strict=True)
+        ]
+        preceding = [
+            at[(own - step).clamp(min=0)].masked_fill(edge, len(everything))
+            for step, edge in zip(steps, first, strict=True)
+        ]
+        above = None if following_tile is None else _positions(following_tile, total)[everything]
+        found.append(
+            _Neighbours(torch.stack(following), torch.stack(preceding), above, None if below is None else below[own])
+        )
+        below = at
+    return found
+
+
+def _positions(columns: Tensor, total: int) -> Tensor:
+    """(total,) where each column stands among `columns`, or their number."""
+    at = torch.full((total,), columns.numel(), device=columns.device)
+    at[columns] = torch.arange(columns.numel(), device=columns.device)
+    return at
+
+
+@dataclass(frozen=True)
+class _TileUpsampling:
+    """From a coarse grid to the columns of one tile: between columns by a sparse matrix, along them by a small dense one."""
 
     across: Tensor
     across_transposed: Tensor
@@ -102,11 +219,11 @@ class _GroupUpsampling:
     rows: slice
 
     @staticmethod
-    def of(across: Any, along: Tensor, like: Tensor) -> _GroupUpsampling:
+    def of(across: Any, along: Tensor) -> _TileUpsampling:
         needed = along.any(0).nonzero()[:, 0]
         rows = slice(int(needed[0]), int(needed[-1]) + 1)
-        forward, back = (csr_tensor(matrix).to(like) for matrix in (across, across.T.tocsr()))
-        return _GroupUpsampling(forward, back, along[:, rows].contiguous(), rows)
+        forward, back = (csr_tensor(matrix).to(along) for matrix in (across, across.T.tocsr()))
+        return _TileUpsampling(forward, back, along[:, rows].contiguous(), rows)
 
 
 def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
@@ -119,22 +236,35 @@ def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
     return csr_array(kron(z, x, format="csr"))
 
 
+class _Gathering(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, lattice: Tensor, tiles: Tiles) -> Tensor:
+        ctx.tiles = tiles
+        columns, values = lattice.reshape(-1, lattice.shape[2]), lattice.new_empty(tiles.filled.numel())
+        for tile in tiles:
+            torch.index_select(columns[:, tile.rows], 0, tile.columns, out=tile.of(values))
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.tiles.scattered(gradient), None
+
+
 class _Upsampling(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Tensor, tiles: Tiles) -> Tensor:
         ctx.tiles, ctx.size = tiles, tuple(grid.shape)
-        coarse, values = grid.reshape(-1, grid.shape[2]), grid.new_empty(tiles.places.numel())
-        for part, group in zip(tiles.parts, tiles.upsampling(ctx.size), strict=True):
-            values[part] = ((group.across @ coarse[:, group.rows]) @ group.along.T).view(-1)
+        coarse, values = grid.reshape(-1, grid.shape[2]), grid.new_empty(tiles.filled.numel())
+        for tile, up in zip(tiles, tiles.upsampling(ctx.size), strict=True):
+            torch.mm(up.across @ coarse[:, up.rows], up.along.T, out=tile.of(values))
         return values
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         found = gradient.new_zeros(ctx.size)
         coarse = found.view(-1, ctx.size[2])
-        for part, group in zip(ctx.tiles.parts, ctx.tiles.upsampling(ctx.size), strict=True):
-            columns = gradient[part].view(-1, group.along.shape[0]) @ group.along
-            coarse[:, group.rows] += group.across_transposed @ columns
+        for tile, up in zip(ctx.tiles, ctx.tiles.upsampling(ctx.size), strict=True):
+            coarse[:, up.rows] += up.across_transposed @ (tile.of(gradient) @ up.along)
         return found, None
 
 
@@ -142,74 +272,59 @@ class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, tiles: Tiles) -> Tensor:
         ctx.tiles = tiles
-        rays = values.new_empty(tiles.matrices[0][0].shape[0], tiles.shape[2])
-        for rows, part, (matrix, _) in zip(tiles.rows, tiles.parts, tiles.matrices, strict=True):
-            rays[:, rows] = matrix @ values[part].view(matrix.shape[1], rows.stop - rows.start)
+        like = next(iter(tiles)).matrix
+        rays = values.new_empty(like.shape[0], tiles.shape[2])
+        for tile in tiles:
+            rays[:, tile.rows] = tile.matrix @ tile.of(values)
         return rays
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        tiles, found = ctx.tiles, gradient.new_empty(ctx.tiles.places.numel())
-        for rows, part, (_, transposed) in zip(tiles.rows, tiles.parts, tiles.matrices, strict=True):
-            found[part] = (transposed @ gradient[:, rows].contiguous()).view(-1)
+        found = gradient.new_empty(ctx.tiles.filled.numel())
+        for tile in ctx.tiles:
+            tile.of(found).copy_(tile.transposed @ gradient[:, tile.rows].contiguous())
         return found, None
-
-
-def _neighbours(places: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Where in a list of voxels, their empty neighbours before them, and one empty voxel, each one's neighbours stand.
-
-    Returns:
-        (3, N + rim) the next voxel along each axis, or the voxel itself at an edge; (3, N) the one before, or the empty voxel.
-    """
-    total, steps = math.prod(shape), (shape[1] * shape[2], shape[2], 1)
-    first = [axis == 0 for axis in _coordinates(places, shape)]
-    is_rim = torch.zeros(total, dtype=torch.bool, device=places.device)
-    for step, edge in zip(steps, first, strict=True):
-        is_rim[(places - step)[~edge]] = True
-    is_rim[places] = False
-    everything = torch.cat([places, is_rim.nonzero()[:, 0]])
-    empty = everything.numel()
-    here = torch.arange(empty, dtype=torch.int32, device=places.device)
-    at = torch.full((total,), empty, dtype=torch.int32, device=places.device)
-    at[everything] = here
-    following = torch.empty(3, empty, dtype=torch.int32, device=places.device)
-    preceding = torch.empty(3, places.numel(), dtype=torch.int32, device=places.device)
-    coordinates = _coordinates(everything, shape)
-    for axis, (step, size) in enumerate(zip(steps, shape, strict=True)):
-        torch.index_select(at, 0, (everything + step).clamp_(max=total - 1), out=following[axis])
-        torch.where(coordinates[axis] == size - 1, here, following[axis], out=following[axis])
-        torch.index_select(at, 0, (places - step).clamp_(min=0), out=preceding[axis])
-        preceding[axis].masked_fill_(first[axis], empty)
-    return following, preceding
-
-
-def _coordinates(places: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    _, width, height = shape
-    columns = torch.div(places, height, rounding_mode="trunc")
-    depths = torch.div(columns, width, rounding_mode="trunc")
-    return depths, columns - depths * width, places - columns * height
 
 
 class _Variation(torch.autograd.Function):
     """The sum over all voxels, of which only listed ones and the empty ones just before them add anything."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, smoothing: float, following: Tensor, preceding: Tensor) -> Tensor:
-        count = following.shape[1]
-        padded = torch.cat([values, values.new_zeros(count + 1 - values.numel())])
-        differences = [padded.index_select(0, following[axis]).sub_(padded[:count]) for axis in range(3)]
-        magnitude = torch.full_like(differences[0], smoothing**2)
-        for difference in differences:
-            magnitude.addcmul_(difference, difference)
-        magnitude.sqrt_()
-        gradient = torch.zeros_like(values)
-        for axis, difference in enumerate(differences):  # minus the divergence of ∇v / |∇v|
-            flow = torch.cat([difference.div_(magnitude), values.new_zeros(1)])
-            gradient.sub_(flow[: values.numel()]).add_(flow.index_select(0, preceding[axis]))
+    def forward(ctx: Any, values: Tensor, smoothing: float, tiles: Tiles) -> Tensor:
+        gradient, total, below, following = torch.empty_like(values), values.new_zeros(()), None, [*tiles][1:]
+        for number, tile in enumerate(tiles):
+            near, own = tile.neighbours, tile.of(values)
+            count, height = near.following.shape[1], own.shape[1]
+            padded = values.new_zeros(count + 1, height + 1)
+            padded[: len(own), :height] = own
+            if near.above is None:
+                padded[:, height] = padded[:, height - 1]
+            else:
+                above = following[number].of(values)[:, 0]
+                padded[:-1, height] = torch.cat([above, above.new_zeros(1)]).index_select(0, near.above)
+            lattice = padded[:, :height]
+            flows = [values.new_zeros(count + 1, height) for _ in range(3)]
+            for flow, after in zip(flows, near.following, strict=False):
+                torch.index_select(lattice, 0, after, out=flow[:-1]).sub_(lattice[:-1])
+            torch.sub(padded[:-1, 1:], lattice[:-1], out=flows[2][:-1])
+            magnitude = torch.full_like(flows[0], smoothing**2)
+            for flow in flows:
+                magnitude.addcmul_(flow, flow)
+            magnitude.sqrt_()
+            total += (magnitude - smoothing).sum()
+            found = tile.of(gradient).zero_()  # minus the divergence of ∇v / |∇v|
+            for flow in flows:
+                found.sub_(flow.div_(magnitude)[: len(own)])
+            for flow, before in zip(flows, near.preceding, strict=False):
+                found.add_(flow.index_select(0, before))
+            found[:, 1:] += flows[2][: len(own), :-1]
+            if near.below is not None and below is not None:
+                found[:, 0] += below.index_select(0, near.below)
+            below = flows[2][:, -1]
         ctx.save_for_backward(gradient)
-        return (magnitude - smoothing).sum()
+        return total
 
     @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * outer, None, None, None
+        return gradient * outer, None, None

@@ -23,7 +23,7 @@ def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> Non
         steps.append(options["num_steps"])
         return FitResult(noise_model, held_out_nll=next(signals), num_steps=options["num_steps"])
 
-    signal_model = SimpleNamespace(learning_rate=1.0, signal=lambda: torch.zeros(5 * 8 * 8))
+    signal_model = SimpleNamespace(learning_rate=1.0, signal=lambda: torch.zeros(5 * 8 * 8), release=lambda: None)
     task = Alternation(signal_model, torch.zeros(5, 8, 8), None, 0, run_fit)
     task.alternate(Gaussian(), num_steps=112, rate=0.5)
     assert rates == [0.5, 0.25, 0.125][:turns]
@@ -45,7 +45,9 @@ def test_steps_are_calmer_the_less_noise_there_is(noise: float) -> None:
             rates.append((signal_model.learning_rate, offset.scaled_offset.requires_grad))
         return FitResult(noise_model, history={0: 1.0, 1: 1.0}, held_out_nll=1.0, num_steps=options["num_steps"])
 
-    signal_model = SimpleNamespace(learning_rate=1.0, signal=lambda: signal, image_formation=offset)
+    signal_model = SimpleNamespace(
+        learning_rate=1.0, signal=lambda: signal, image_formation=offset, release=lambda: None
+    )
     task = Alternation(signal_model, observation, None, 0, run_fit)
     assert task.settle(Gaussian(), final=True) == (noise < 0.2)
     task.fit_signal(Gaussian(), rate=1.0, num_steps=1)

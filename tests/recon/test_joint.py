@@ -65,6 +65,42 @@ def test_signal_without_gradients_follows_every_step():
             torch.testing.assert_close(model(everything), model.signal())
 
 
+def test_a_step_takes_over_what_a_look_has_seen():
+    def gradients(*, look):
+        model = TomographySignal(
+            VoxelField((6, 5, 6)), SliceProjector(tilt_angles=[0, 40], depth=6, width=6), Transmission()
+        )
+        calls, project = [], model._project
+        model._project = lambda values: calls.append(0) or project(values)
+        if look:
+            with torch.no_grad():
+                model(torch.tensor([3, 4]))
+        loss = model.signal().sum() + model.penalty()
+        loss.backward()
+        assert len(calls) == 1
+        model.signal()
+        assert len(calls) == 2
+        return [parameter.grad for parameter in model.parameters()]
+
+    torch.testing.assert_close(gradients(look=True), gradients(look=False), rtol=0, atol=0)
+
+
+def test_a_step_after_any_change_sees_it():
+    model = TomographySignal(
+        VoxelField((6, 5, 6)), SliceProjector(tilt_angles=[0, 40], depth=6, width=6), Transmission()
+    )
+    model.image_formation.requires_grad_(False)
+    with torch.no_grad():
+        before = model(torch.arange(model.num_pixels))
+        model.field.values += 1
+    assert (model.signal() < before).any()
+    with torch.no_grad():
+        model(torch.tensor([0]))
+    model.image_formation.requires_grad_(True)
+    model.signal().sum().backward()
+    assert all(parameter.grad is not None for parameter in model.image_formation.parameters())
+
+
 def test_penalty_does_not_depend_on_the_unit_of_attenuation():
     small, large = small_signal_model(), small_signal_model()
     with torch.no_grad():

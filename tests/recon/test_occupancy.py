@@ -50,6 +50,16 @@ def test_fields_skip_alike(kind):
     torch.testing.assert_close(found, [parameter.grad for parameter in field.parameters()])
 
 
+@pytest.mark.parametrize("margin", [0, 1, 3])
+def test_a_margin_reaches_so_many_voxels_in_every_direction(margin):
+    rough = torch.zeros(9, 4, 11)
+    rough[4, 2, 6] = rough[0, 0, 10] = 1.0
+    mask = Occupancy(rough, (9, 4, 11), margin=margin).mask.transpose(1, 2)
+    somewhere = torch.stack(torch.meshgrid(*map(torch.arange, (9, 4, 11)), indexing="ij"), -1)
+    near = [(somewhere - place).abs().amax(-1) <= margin for place in rough.nonzero()]
+    assert torch.equal(mask, torch.stack(near).any(0))
+
+
 def everything():
     return Occupancy(torch.ones(2, 2, 2), (8, 10, 12))
 
