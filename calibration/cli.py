@@ -21,7 +21,7 @@ def calibrate(
     short: Annotated[
         list[Path], typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Noise-model file to write, .safetensors.")],
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
     long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short one, or one for all.")] = None,
     dark: Annotated[
         list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")

@@ -30,7 +30,7 @@ _BASELINE_STEPS = 500
 def sample(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     clean: Annotated[Path, typer.Argument(help="Clean image or stack, in the model's units.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Noisy image to write (.tif, .mrc, .npy).")],
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noisy image to write (.tif, .mrc, .npy).")],
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,

@@ -291,22 +291,9 @@ class _Variation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, smoothing: float, tiles: Tiles) -> Tensor:
-        gradient, total, below, following = torch.empty_like(values), values.new_zeros(()), None, [*tiles][1:]
-        for number, tile in enumerate(tiles):
-            near, own = tile.neighbours, tile.of(values)
-            count, height = near.following.shape[1], own.shape[1]
-            padded = values.new_zeros(count + 1, height + 1)
-            padded[: len(own), :height] = own
-            if near.above is None:
-                padded[:, height] = padded[:, height - 1]
-            else:
-                above = following[number].of(values)[:, 0]
-                padded[:-1, height] = torch.cat([above, above.new_zeros(1)]).index_select(0, near.above)
-            lattice = padded[:, :height]
-            flows = [values.new_zeros(count + 1, height) for _ in range(3)]
-            for flow, after in zip(flows, near.following, strict=False):
-                torch.index_select(lattice, 0, after, out=flow[:-1]).sub_(lattice[:-1])
-            torch.sub(padded[:-1, 1:], lattice[:-1], out=flows[2][:-1])
+        gradient, total, below, in_order = torch.empty_like(values), values.new_zeros(()), None, [*tiles]
+        for tile, above in zip(in_order, [*in_order[1:], None], strict=True):
+            flows, near = _differences(values, tile, above), tile.neighbours
             magnitude = torch.full_like(flows[0], smoothing**2)
             for flow in flows:
                 magnitude.addcmul_(flow, flow)
@@ -314,10 +301,10 @@ class _Variation(torch.autograd.Function):
             total += (magnitude - smoothing).sum()
             found = tile.of(gradient).zero_()  # minus the divergence of ∇v / |∇v|
             for flow in flows:
-                found.sub_(flow.div_(magnitude)[: len(own)])
-            for flow, before in zip(flows, near.preceding, strict=False):
+                found.sub_(flow.div_(magnitude)[: len(found)])
+            for flow, before in zip(flows[:2], near.preceding, strict=True):
                 found.add_(flow.index_select(0, before))
-            found[:, 1:] += flows[2][: len(own), :-1]
+            found[:, 1:] += flows[2][: len(found), :-1]
             if near.below is not None and below is not None:
                 found[:, 0] += below.index_select(0, near.below)
             below = flows[2][:, -1]
@@ -328,3 +315,22 @@ class _Variation(torch.autograd.Function):
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * outer, None, None
+
+
+def _differences(values: Tensor, tile: _Tile, above: _Tile | None) -> list[Tensor]:
+    """Forward differences along z, x and y of a tile's columns, its rim and, last, the empty one, (C + 1, slices) each."""
+    near, own = tile.neighbours, tile.of(values)
+    count, height = near.following.shape[1], own.shape[1]
+    padded = values.new_zeros(count + 1, height + 1)
+    padded[: len(own), :height] = own
+    if above is None or near.above is None:
+        padded[:, height] = padded[:, height - 1]
+    else:
+        first = above.of(values)[:, 0]
+        padded[:-1, height] = torch.cat([first, first.new_zeros(1)]).index_select(0, near.above)
+    here = padded[:, :height]
+    found = [values.new_zeros(count + 1, height) for _ in range(3)]
+    for difference, following in zip(found[:2], near.following, strict=True):
+        torch.index_select(here, 0, following, out=difference[:-1]).sub_(here[:-1])
+    torch.sub(padded[:, 1:], here, out=found[2])
+    return found

@@ -25,7 +25,9 @@ def reconstruct(
         Path,
         typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")],
+    out: Annotated[
+        Path, typer.Option("--out", "--output", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")
+    ],
     angles: Annotated[
         Path | None,
         typer.Option(help="Angle file; by default the .rawtlt, .tlt or .mdoc beside the stack, or its own."),
