@@ -36,6 +36,8 @@ SPEED: dict[str, Callable[[], dict[str, Any]]] = {
     "skipping-shells": lambda: joint_speed.skipping("shells", 96),
     "skipping-shells-192": lambda: joint_speed.skipping("shells", 192, repeats=1),
     "skipping-slab": lambda: joint_speed.skipping("slab", 96),
+    "steps-shells": lambda: joint_speed.steps("shells", 96),
+    "steps-shells-192": lambda: joint_speed.steps("shells", 192),
     "skipping-voxels-shells": lambda: joint_speed.skipping_voxels("shells"),
     "skipping-network-shells": lambda: joint_speed.skipping_network("shells"),
     "skipping-network-slab": lambda: joint_speed.skipping_network("slab"),
