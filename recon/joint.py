@@ -32,6 +32,7 @@ _FIRST_WEIGHT = 0.4
 _HELD_OUT_TO_CHOOSE = 0.2  # of the pixels: those of a slab are few to tell weights apart
 _TOLERATED = 0.003  # nats per pixel
 _LOOK_STEPS = 60  # of each candidate: within the tolerance of where it would end
+_SLAB, _SLAB_VOXELS = 24, 24 * 96**2  # slices; where they are small, as many as have so many voxels tell weights apart
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
 
 
@@ -74,7 +75,7 @@ class JointReconstructor:
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
         defocus: blur to model, pixels per voxel out of the plane of focus, see `recon.defocused_projector.DefocusedProjector`.
-        slab: slices used to choose.
+        slab: slices used to choose; by default 24, or more where a weight is chosen and they are small.
         settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
         seed: of every random choice.
         device: where to compute.
@@ -88,7 +89,7 @@ class JointReconstructor:
     estimate_response: bool = True
     skip_vacuum: bool = True
     defocus: float = 0.0
-    slab: int = 24
+    slab: int | None = None
     settled: TomographySignal | None = None
     seed: int = 0
     device: torch.device | str = "cpu"
@@ -160,10 +161,16 @@ class JointReconstructor:
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
         return Alternation(signal_model, observation, use, self.seed, self.run_fit, **options)
 
+    def _num_slices(self, field: Field) -> int:
+        """Of the slab: a few cannot tell weights apart where each of them has few pixels."""
+        if self.slab is not None:
+            return self.slab
+        return _SLAB if self.weight is not None else max(_SLAB, -(-_SLAB_VOXELS // (field.depth * field.width)))
+
     def _choose(self, tilt_series: TiltSeries, whole: TomographySignal) -> _Chosen:
         """Noise model and weight, found on a slab; the response learnt there is where the whole starts."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        rows = contrast_slab(tilt_series, self.slab)
+        rows = contrast_slab(tilt_series, self._num_slices(whole.field))
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
         field = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
         field.start_from(whole.field.volume()[:, rows])
