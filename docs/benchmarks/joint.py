@@ -1,6 +1,7 @@
 """The joint reconstruction: its accuracy against the oracle and least squares, the choice of its field, and its speed.
 
     python docs/benchmarks/joint.py accuracy [--phantom shells] [--noise clipped]     # 25 rows; those already there are kept
+    python docs/benchmarks/joint.py accuracy --again --same-weights   # rivals keep the weights that were best before
     python docs/benchmarks/joint.py fields [--phantom shells]         # which field is best when the true noise is known
     python docs/benchmarks/joint.py offset [--phantom shells]         # a known offset of a linear series, recovered
     python docs/benchmarks/joint.py speed [--row joint]               # ratios in one run; wants a quiet machine
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--noise", action="append", choices=NOISES)
     parser.add_argument("--row", action="append", choices=SPEED, help="of the speed rows; all by default")
     parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
+    parser.add_argument("--same-weights", action="store_true", help="take the rivals' best weights from the kept rows")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--tilts", default=joint_speed.TILTS, help="START:STOP:STEP in degrees; 79 tilts by default")
     parser.add_argument("--seed", type=int, default=0)
@@ -74,7 +76,9 @@ def main() -> None:
     if options.part == "accuracy":
         for phantom in options.phantom or PHANTOMS:
             for noise in options.noise or NOISES:
-                row = cell(f"accuracy/{phantom}/{noise}/{name}", lambda p=phantom, n=noise: accuracy(p, n, **scene))
+                key = f"accuracy/{phantom}/{noise}/{name}"
+                known = results.cells.get(key) if options.same_weights else None
+                row = cell(key, lambda p=phantom, n=noise, k=known: accuracy(p, n, kept=k, **scene))
                 output.line(joint_page.accuracy_line(row))
     for part, measure in (("fields", fields), ("offset", offset)):
         if options.part == part:

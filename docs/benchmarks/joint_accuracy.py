@@ -97,16 +97,20 @@ def _slab(scene: Scene) -> Scene:
     return replace(scene, truth=scene.truth[:, rows], clean=cut(scene.clean), noisy=cut(scene.noisy))
 
 
-def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int) -> Row:
-    """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares + TV at its best weight."""
+def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int, kept: Row | None = None) -> Row:
+    """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares + TV at its best weight; the
+    best weights are those of a kept row, where one is given."""
     scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
     row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
     row["images"] = compare(scene.noisy.images, scene.clean.images).psnr
     row["joint"] = score(JointReconstructor(), scene)
-    oracle = JointReconstructor(noise_model=lambda: true_noise(noise))
-    row["oracle"] = score(replace(oracle, weight=best_weight(oracle, scene)), scene)
-    least_squares = JointReconstructor(noise_model=Gaussian)
-    least_squares = replace(least_squares, weight=best_weight(least_squares, scene))
+    rivals = {
+        "oracle": JointReconstructor(noise_model=lambda: true_noise(noise)),
+        "least squares": JointReconstructor(noise_model=Gaussian),
+    }
+    for name, rival in rivals.items():
+        rivals[name] = replace(rival, weight=kept[name]["weight"] if kept else best_weight(rival, scene))
+    row["oracle"], least_squares = score(rivals["oracle"], scene), rivals["least squares"]
     variants = [score(replace(least_squares, estimate_response=estimate), scene) for estimate in (True, False)]
     row["least squares"] = max(variants, key=lambda found: found["volume"])
     return row
