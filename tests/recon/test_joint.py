@@ -218,6 +218,24 @@ def test_fits_that_tell_weights_apart_begin_as_that_of_the_whole(scene):
     assert (of_weights - of_whole).norm() < 0.3 * (settled - of_whole).norm()
 
 
+@pytest.mark.parametrize(
+    ("options", "width", "slices"),
+    [({}, 96, 24), ({}, 192, 24), ({}, 64, 54), ({"weight": 0.4}, 64, 24), ({"slab": 8}, 64, 8)],
+)
+def test_weights_of_small_volumes_are_told_apart_on_more_slices(options, width, slices):
+    class Enough(Exception):
+        pass
+
+    def run_fit(noise_model, signal, observation, **_):
+        raise Enough(observation.shape)
+
+    images = np.random.default_rng(0).random((3, 70, width), np.float32)
+    series = TiltSeries(images, np.array([-40.0, 0.0, 40.0]), None, "linear")
+    with pytest.raises(Enough) as reached:
+        JointReconstructor(run_fit=run_fit, **options)(series)
+    assert reached.value.args[0] == (3, width, slices)
+
+
 @pytest.mark.slow
 def test_chosen_weight_is_nearly_the_best(scene):
     truth, _, noisy = scene
