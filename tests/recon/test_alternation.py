@@ -12,7 +12,7 @@ from recon.image_formation import Linear
 
 @pytest.mark.parametrize(("signal_nll", "turns"), [([1.0, 1.0], 2), ([1.0, 0.99], 2), ([1.0, 0.5, 0.5], 3)])
 def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> None:
-    rates, steps = [], []
+    rates, steps, released = [], [], []
     signals = iter(signal_nll)
 
     def run_fit(noise_model, signal, observation, **options):
@@ -23,11 +23,14 @@ def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> Non
         steps.append(options["num_steps"])
         return FitResult(noise_model, held_out_nll=next(signals), num_steps=options["num_steps"])
 
-    signal_model = SimpleNamespace(learning_rate=1.0, signal=lambda: torch.zeros(5 * 8 * 8), release=lambda: None)
+    signal_model = SimpleNamespace(
+        learning_rate=1.0, signal=lambda: torch.zeros(5 * 8 * 8), release=lambda: released.append(0)
+    )
     task = Alternation(signal_model, torch.zeros(5, 8, 8), None, 0, run_fit)
     task.alternate(Gaussian(), num_steps=112, rate=0.5)
     assert rates == [0.5, 0.25, 0.125][:turns]
     assert steps == [80, 32, 32][:turns]
+    assert len(released) == 2 * turns - 1  # after every fit, of the noise model too
     assert signal_model.learning_rate == 1.0
 
 

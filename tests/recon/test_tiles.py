@@ -19,6 +19,7 @@ def mask(request):
     if request.param == "edges":
         chosen = torch.zeros(SHAPE, dtype=torch.bool)
         chosen[0, :, 3] = chosen[-1, 4] = chosen[2, -1, -1] = chosen[5, 0, 0] = True
+        chosen[6, 8, 16] = chosen[3, 3, 32] = True  # alone in the first slice of a tile
     return torch.ones(SHAPE, dtype=torch.bool) if request.param == "whole" else chosen
 
 
