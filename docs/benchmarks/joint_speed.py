@@ -64,12 +64,12 @@ def network(size: int = 96) -> Row:
     projector = SliceProjector(tilt_angles=scene.noisy.tilt_angles, depth=size, width=size)
     observed = torch.rand(scene.noisy.num_tilts * size, 1, generator=torch.Generator().manual_seed(0))
     preset = replace(PRESETS["kniesel2022"], accumulate=1)
-    state = next(preset.train(scene.noisy, max_steps=1))
+    state = preset.start(scene.noisy)
 
     def by_slice() -> None:
         ((torch.exp(-projector.project(field())) - observed) ** 2).mean().backward()  # type: ignore[no-untyped-call]
 
-    (slice_wise, _), (ray_wise, _) = in_turn([by_slice, lambda: state.step(1)], repeats=3)
+    (slice_wise, _), (ray_wise, _) = in_turn([by_slice, state.step], repeats=3)
     rays = scene.noisy.num_tilts * size
     row = {"rays of a slice": rays, "by slice": slice_wise, "ray by ray": ray_wise * rays / preset.rays}
     return row | {"ratio": row["ray by ray"] / slice_wise}
