@@ -58,6 +58,7 @@ class TomographySignal(Described):
         self._tiles: Tiles | None = None
         self._tiles_of: tuple[Tensor | None, int] = None, 0
         self._seen: tuple[tuple[object, ...], Tensor] | None = None
+        self._steps_follow = False
 
     def extra_repr(self) -> str:
         return f"{self.projector!r}, weight={self.weight:.4g}, smoothing={self.smoothing:.4g}"
@@ -73,7 +74,7 @@ class TomographySignal(Described):
         if seen is not None and seen[1].requires_grad and torch.is_grad_enabled() and seen[0] == self._changes:
             self._seen = None
             return seen[1]
-        self._values, self._seen = self._evaluate(), None
+        self._values, self._seen, self._steps_follow = self._evaluate(), None, torch.is_grad_enabled()
         rays = self._project(self._values)
         shape = (self.projector.num_tilts, self.projector.detector_width, self.field.height)
         signal: Tensor = self.image_formation(rays.view(shape))
@@ -122,20 +123,20 @@ class TomographySignal(Described):
             return from_columns(columns, self.field.depth).contiguous()
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """The signal of some pixels; without gradients, all are projected once for each state of the parameters, and once more
-        is not needed for the step that follows."""
+        """The signal of some pixels; without gradients, all are projected once for each state of the parameters. Between steps
+        their gradient is kept, for the next one begins where this look was."""
         if torch.is_grad_enabled():
             return self.signal()[pixels]
         # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
         if self._seen is None or self._seen[0] != self._changes:
-            with torch.enable_grad():
+            with torch.set_grad_enabled(self._steps_follow):
                 signal = self.signal()  # which may set a response that is matched to it
             self._seen = self._changes, signal
         return self._seen[1].detach()[pixels]
 
     def release(self) -> None:
-        """Let go of what was kept for a next step."""
-        self._values = None
+        """Let go of what was kept for a next step: none follows for now."""
+        self._values, self._steps_follow = None, False
         if self._seen is not None:
             self._seen = self._seen[0], self._seen[1].detach()
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from recon.projector import SliceProjector
 from recon.sparse import csr_tensor
+from recon.tile_variation import Neighbours, TileVariation, neighbours_of
 from recon.upsampling import upsampling_matrix
 
 _TOGETHER, _MOST_TILES = 16, 8
@@ -45,11 +46,11 @@ class Tiles:
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
         sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
         parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
-        neighbours = _neighbours(columns, (depth, width))
-        before: Sequence[_Tile | None] = [None] * len(rows) if known is None else [*known]
-        self._tiles: list[_Tile] = [
-            _Tile(*lists, *_matrices(projector, lists[1], tile))
-            for lists, tile in zip(zip(rows, columns, parts, neighbours, strict=True), before, strict=True)
+        neighbours = neighbours_of(columns, (depth, width))
+        before: Sequence[Tile | None] = [None] * len(rows) if known is None else [*known]
+        self._tiles: list[Tile] = [
+            Tile(span, here, part, near, *_matrices(projector, here, tile))
+            for span, here, part, near, tile in zip(rows, columns, parts, neighbours, before, strict=True)
         ]
         self._like = self._tiles[0].matrix.values()
         self.filled = self._like.new_empty(parts[-1].stop)
@@ -84,7 +85,7 @@ class Tiles:
 
     def total_variation(self, values: Tensor, *, smoothing: float) -> Tensor:
         """Of the whole lattice, see `recon.regularisers.total_variation`."""
-        variation: Tensor = _Variation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
+        variation: Tensor = TileVariation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
         return variation
 
     def gathered(self, lattice: Tensor) -> Tensor:
@@ -120,12 +121,12 @@ class Tiles:
             lattice.view(-1, self.shape[2])[:, tile.rows].index_copy_(0, tile.columns, tile.of(values))
         return lattice
 
-    def __iter__(self) -> Iterator[_Tile]:
+    def __iter__(self) -> Iterator[Tile]:
         return iter(self._tiles)
 
 
 @dataclass(frozen=True)
-class _Tile:
+class Tile:
     """Neighbouring slices `rows` of the lattice, and those of its `columns` that hold anything there.
 
     Attributes:
@@ -137,7 +138,7 @@ class _Tile:
     rows: slice
     columns: Tensor
     part: slice
-    neighbours: _Neighbours
+    neighbours: Neighbours
     matrix: Tensor
     transposed: Tensor
 
@@ -146,67 +147,10 @@ class _Tile:
         return values[self.part].view(self.columns.numel(), self.rows.stop - self.rows.start)
 
 
-def _matrices(projector: SliceProjector, columns: Tensor, known: _Tile | None) -> tuple[Tensor, Tensor]:
+def _matrices(projector: SliceProjector, columns: Tensor, known: Tile | None) -> tuple[Tensor, Tensor]:
     if known is not None and torch.equal(columns, known.columns):
         return known.matrix, known.transposed
     return projector.part(columns)
-
-
-@dataclass(frozen=True)
-class _Neighbours:
-    """Where the neighbours of a tile's columns stand, its own first and then the rim: empty ones from which a difference leads to
-    a listed one. The number of all these, C, stands for an empty one that is not among them.
-
-    Attributes:
-        following: (2, C) the next one along z and x, or the column itself at an edge.
-        preceding: (2, n) the one before each of its own.
-        above: (C,) among the next tile's own, whose number stands for an empty one; None at the edge.
-        below: (n,) among the tile's before, own and rim; None at the edge.
-    """
-
-    following: Tensor
-    preceding: Tensor
-    above: Tensor | None
-    below: Tensor | None
-
-
-def _neighbours(columns: Sequence[Tensor], shape: tuple[int, int]) -> list[_Neighbours]:
-    """Of every tile, given its columns, indices of the flat (depth, width)."""
-    total, steps, found, below = math.prod(shape), (shape[1], 1), [], None
-    for tile, own in enumerate(columns):
-        following_tile = columns[tile + 1] if tile + 1 < len(columns) else None
-        first = [own < shape[1], own % shape[1] == 0]
-        is_rim = torch.zeros(total, dtype=torch.bool, device=own.device)
-        for step, edge in zip(steps, first, strict=True):
-            is_rim[(own - step)[~edge]] = True
-        if following_tile is not None:
-            is_rim[following_tile] = True
-        is_rim[own] = False
-        everything = torch.cat([own, is_rim.nonzero()[:, 0]])
-        here = torch.arange(everything.numel(), device=own.device)
-        at = _positions(everything, total)
-        last = [everything >= total - shape[1], everything % shape[1] == shape[1] - 1]
-        following = [
-            torch.where(edge, here, at[(everything + step).clamp(max=total - 1)])
-            for step, edge in zip(steps, last, strict=True)
-        ]
-        preceding = [
-            at[(own - step).clamp(min=0)].masked_fill(edge, len(everything))
-            for step, edge in zip(steps, first, strict=True)
-        ]
-        above = None if following_tile is None else _positions(following_tile, total)[everything]
-        found.append(
-            _Neighbours(torch.stack(following), torch.stack(preceding), above, None if below is None else below[own])
-        )
-        below = at
-    return found
-
-
-def _positions(columns: Tensor, total: int) -> Tensor:
-    """(total,) where each column stands among `columns`, or their number."""
-    at = torch.full((total,), columns.numel(), device=columns.device)
-    at[columns] = torch.arange(columns.numel(), device=columns.device)
-    return at
 
 
 @dataclass(frozen=True)
@@ -284,53 +228,3 @@ class _Projection(torch.autograd.Function):
         for tile in ctx.tiles:
             tile.of(found).copy_(tile.transposed @ gradient[:, tile.rows].contiguous())
         return found, None
-
-
-class _Variation(torch.autograd.Function):
-    """The sum over all voxels, of which only listed ones and the empty ones just before them add anything."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, smoothing: float, tiles: Tiles) -> Tensor:
-        gradient, total, below, in_order = torch.empty_like(values), values.new_zeros(()), None, [*tiles]
-        for tile, above in zip(in_order, [*in_order[1:], None], strict=True):
-            flows, near = _differences(values, tile, above), tile.neighbours
-            magnitude = torch.full_like(flows[0], smoothing**2)
-            for flow in flows:
-                magnitude.addcmul_(flow, flow)
-            magnitude.sqrt_()
-            total += (magnitude - smoothing).sum()
-            found = tile.of(gradient).zero_()  # minus the divergence of ∇v / |∇v|
-            for flow in flows:
-                found.sub_(flow.div_(magnitude)[: len(found)])
-            for flow, before in zip(flows[:2], near.preceding, strict=True):
-                found.add_(flow.index_select(0, before))
-            found[:, 1:] += flows[2][: len(found), :-1]
-            if near.below is not None and below is not None:
-                found[:, 0] += below.index_select(0, near.below)
-            below = flows[2][:, -1]
-        ctx.save_for_backward(gradient)
-        return total
-
-    @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * outer, None, None
-
-
-def _differences(values: Tensor, tile: _Tile, above: _Tile | None) -> list[Tensor]:
-    """Forward differences along z, x and y of a tile's columns, its rim and, last, the empty one, (C + 1, slices) each."""
-    near, own = tile.neighbours, tile.of(values)
-    count, height = near.following.shape[1], own.shape[1]
-    padded = values.new_zeros(count + 1, height + 1)
-    padded[: len(own), :height] = own
-    if above is None or near.above is None:
-        padded[:, height] = padded[:, height - 1]
-    else:
-        first = above.of(values)[:, 0]
-        padded[:-1, height] = torch.cat([first, first.new_zeros(1)]).index_select(0, near.above)
-    here = padded[:, :height]
-    found = [values.new_zeros(count + 1, height) for _ in range(3)]
-    for difference, following in zip(found[:2], near.following, strict=True):
-        torch.index_select(here, 0, following, out=difference[:-1]).sub_(here[:-1])
-    torch.sub(padded[:, 1:], here, out=found[2])
-    return found

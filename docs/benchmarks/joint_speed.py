@@ -38,7 +38,7 @@ def joint(size: int, repeats: int = 3) -> Row:
         JointReconstructor(),
     ]
     given, least_squares, chosen = (
-        seconds for seconds, _ in in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=repeats)
+        seconds for seconds, _ in in_turn([partial(each, scene.noisy) for each in fits], repeats=repeats)
     )
     row = {"scene": scene.name, "joint, weight given": given, "least squares, weight given": least_squares}
     return row | {"ratio": given / least_squares, "joint, everything chosen": chosen}
@@ -85,7 +85,7 @@ def skipping(
     scene = make_scene(size, phantom=phantom, tilts=tilts)
     skips = JointReconstructor(weight=_WEIGHT, make_field=make_field, noise_model=lambda: scene.noise_model)
     fits = [replace(skips, skip_vacuum=skip) for skip in (True, False)]
-    (skipped, result), (full, reference) = in_turn([lambda fit=fit: fit(scene.noisy) for fit in fits], repeats=repeats)
+    (skipped, result), (full, reference) = in_turn([partial(each, scene.noisy) for each in fits], repeats=repeats)
     psnr = [compare(each.volume.attenuation, scene.truth).psnr for each in (result, reference)]
     occupancy = result.signal_model.occupancy
     row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean())}

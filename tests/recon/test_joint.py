@@ -70,11 +70,12 @@ def test_a_step_takes_over_what_a_look_has_seen():
         model = TomographySignal(
             VoxelField((6, 5, 6)), SliceProjector(tilt_angles=[0, 40], depth=6, width=6), Transmission()
         )
+        model.signal()
         calls, project = [], model._project
         model._project = lambda values: calls.append(0) or project(values)
         if look:
             with torch.no_grad():
-                model(torch.tensor([3, 4]))
+                assert not model(torch.tensor([3, 4])).requires_grad
         loss = model.signal().sum() + model.penalty()
         loss.backward()
         assert len(calls) == 1
@@ -83,6 +84,16 @@ def test_a_step_takes_over_what_a_look_has_seen():
         return [parameter.grad for parameter in model.parameters()]
 
     torch.testing.assert_close(gradients(look=True), gradients(look=False), rtol=0, atol=0)
+
+
+def test_looks_keep_no_gradient_where_no_step_follows():
+    model = small_signal_model()
+    model.signal()
+    model.release()
+    with torch.no_grad():
+        model(torch.tensor([0]))
+    assert not model._seen[1].requires_grad
+    assert not model._values.requires_grad
 
 
 def test_a_step_after_any_change_sees_it():
@@ -95,7 +106,7 @@ def test_a_step_after_any_change_sees_it():
         model.field.values += 1
     assert (model.signal() < before).any()
     with torch.no_grad():
-        model(torch.tensor([0]))
+        model(torch.tensor([0]))  # after a step: its gradient is kept
     model.image_formation.requires_grad_(True)
     model.signal().sum().backward()
     assert all(parameter.grad is not None for parameter in model.image_formation.parameters())
