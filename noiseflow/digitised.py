@@ -141,19 +141,24 @@ class DigitisedDistribution(NoiseDistribution):
         if found is not None:
             return found
         inside = value.clamp(self.low, self.high)  # what lies beyond a rail is not used, and must not spoil a gradient
-        result = self._log_cell(inside) if self.step > 0 else self.base.log_prob(inside)
+        on_low, on_high = value <= self.low, value >= self.high
+        if self.step > 0:
+            below = (inside - self.step / 2).masked_fill(on_low, -math.inf)
+            return self.base.log_interval_prob(below, (inside + self.step / 2).masked_fill(on_high, math.inf))
+        result = self.base.log_prob(inside)
+        if value.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
+            low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
+            high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)
+            return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
         # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
         infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)
         if math.isfinite(self.low):
-            edge = torch.full_like(infinity, self.low + self.step / 2)
-            result = torch.where(value <= self.low, self.base.log_interval_prob(-infinity, edge), result)
+            mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low))
+            result = torch.where(on_low, mass, result)
         if math.isfinite(self.high):
-            edge = torch.full_like(infinity, self.high - self.step / 2)
-            result = torch.where(value >= self.high, self.base.log_interval_prob(edge, infinity), result)
+            mass = self.base.log_interval_prob(torch.full_like(infinity, self.high), infinity)
+            result = torch.where(on_high, mass, result)
         return result
-
-    def _log_cell(self, value: Tensor) -> Tensor:
-        return self.base.log_interval_prob(value - self.step / 2, value + self.step / 2)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return self.base.log_interval_prob(self._edge(low), self._edge(high))
