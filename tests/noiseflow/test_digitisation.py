@@ -129,3 +129,23 @@ def test_pixels_that_are_not_finite_are_left_out_where_asked() -> None:
     result = noiseflow.fit(noiseflow.Gaussian(), signal, broken, skip_non_finite=True, num_steps=20)
     assert result.digitisation.step == pytest.approx(1 / 20)
     assert math.isfinite(result.held_out_nll)
+
+
+@pytest.mark.parametrize("rails", [{"low": 0.0, "high": 1.0}, {"low": 0.0}, {"high": 1.0}, {}])
+@pytest.mark.parametrize("step", [0.0, 0.125])
+def test_likelihood_is_the_same_pixel_by_pixel_as_by_reading(step: float, rails: dict[str, float]) -> None:
+    """Between the rails it is that of one level, on a rail that of all beyond; however signals and readings are laid out."""
+    inner, signals = noiseflow.Gaussian(0.3), torch.linspace(-0.2, 1.2, 29)
+    model = noiseflow.Digitised(inner, step=step, **rails)
+    readings = torch.arange(9) / 8
+    base, low, high = inner(signals[:, None]), rails.get("low", -math.inf), rails.get("high", math.inf)
+    below = torch.where(readings <= low, -math.inf, readings - step / 2)
+    above = torch.where(readings >= high, math.inf, readings + step / 2)
+    masses = base.cdf(above.expand(29, -1)) - base.cdf(below.expand(29, -1))
+    density = base.log_prob(readings.expand(29, -1))
+    on_rail = (readings <= low) | (readings >= high)
+    expected = torch.where(on_rail | torch.tensor(step > 0), masses.log(), density)
+    by_reading = model(signals[:, None]).log_prob(readings.expand(29, -1))
+    by_pixel = model(signals.repeat_interleave(9)).log_prob(readings.repeat(29)).view(29, 9)
+    torch.testing.assert_close(by_reading, expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(by_pixel, by_reading)
