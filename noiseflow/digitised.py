@@ -142,21 +142,19 @@ class DigitisedDistribution(NoiseDistribution):
             return found
         inside = value.clamp(self.low, self.high)  # what lies beyond a rail is not used, and must not spoil a gradient
         on_low, on_high = value <= self.low, value >= self.high
-        if self.step > 0:
-            below = (inside - self.step / 2).masked_fill(on_low, -math.inf)
-            return self.base.log_interval_prob(below, (inside + self.step / 2).masked_fill(on_high, math.inf))
-        result = self.base.log_prob(inside)
-        if value.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
+        between, half = self.step == 0, self.step / 2
+        result = self.base.log_prob(inside) if between else self.base.log_interval_prob(inside - half, inside + half)
+        if between and value.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
             low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
             high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)
             return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
         # the mass of a rail depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
         infinity = torch.full(self.batch_shape, math.inf, dtype=value.dtype, device=value.device)
         if math.isfinite(self.low):
-            mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low))
+            mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low + half))
             result = torch.where(on_low, mass, result)
         if math.isfinite(self.high):
-            mass = self.base.log_interval_prob(torch.full_like(infinity, self.high), infinity)
+            mass = self.base.log_interval_prob(torch.full_like(infinity, self.high - half), infinity)
             result = torch.where(on_high, mass, result)
         return result
 

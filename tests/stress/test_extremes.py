@@ -27,6 +27,7 @@ MODELS |= {
     "physics and flow": lambda: noiseflow.PhysicsFlow(),
     "8-bit mixture": lambda: noiseflow.Digitised(noiseflow.Mixture(), step=1 / 255, low=0.0, high=1.0),
     "8-bit physics": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(), step=1 / 255, low=0.0, high=1.0),
+    "clipped physics": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(), low=0.0, high=1.0),
 }
 SEEN = [-1e6, -1.0, -1e-12, 0.0, 1e-12, 0.5, 1.0, 2.0, 1e6]
 IMAGE_MODELS = {
