@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import signal
 import sys
@@ -50,7 +51,10 @@ class StopSignal:
             journal.abandoned = True
             raise KeyboardInterrupt("stopped at once")
         journal.stop_requested = True
-        print("noiseflow: finishing this step; Ctrl-C again stops at once", file=sys.stderr, flush=True)
+        with contextlib.suppress(
+            OSError, ValueError, AttributeError
+        ):  # no buffer: the line that was stopped may be writing to it
+            os.write(sys.stderr.fileno(), b"noiseflow: finishing this step; Ctrl-C again stops at once\n")
 
 
 @contextlib.contextmanager
