@@ -22,6 +22,8 @@ import recon.benchmark_named
 import recon.commands.results
 import recon.streaming
 from noiseflow import cli, console, io
+from recon.checkpoint import Journal
+from recon.commands.running import StopSignal
 from tests.bad_files import make_good_files
 from tests.processes import finish, start
 
@@ -165,3 +167,23 @@ def test_ctrl_c_that_became_another_error_is_one_still(monkeypatch: pytest.Monke
         signal.signal(signal.SIGINT, before)
     assert stop.value.code == 130
     assert capsys.readouterr().err == f"noiseflow: stopped; {console.START_AGAIN}\n"
+
+
+def test_ctrl_c_while_a_line_is_written_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Writing:
+        def write(self, text: str) -> int:
+            raise RuntimeError("reentrant call")
+
+        def flush(self) -> None:
+            self.write("")
+
+        def fileno(self) -> int:
+            return file.fileno()
+
+    journal = Journal(tmp_path / "journal", {})
+    journal.in_fit = True
+    with (tmp_path / "told").open("wb") as file, monkeypatch.context() as patch, StopSignal(journal):
+        patch.setattr(sys, "stderr", Writing())
+        signal.raise_signal(signal.SIGINT)
+    assert journal.stop_requested
+    assert "finishing this step" in (tmp_path / "told").read_text()

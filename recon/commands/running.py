@@ -51,9 +51,8 @@ class StopSignal:
             journal.abandoned = True
             raise KeyboardInterrupt("stopped at once")
         journal.stop_requested = True
-        with contextlib.suppress(
-            OSError, ValueError, AttributeError
-        ):  # no buffer: the line that was stopped may be writing to it
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            # past the buffer, which a line that was stopped may be writing to
             os.write(sys.stderr.fileno(), b"noiseflow: finishing this step; Ctrl-C again stops at once\n")
 
 
