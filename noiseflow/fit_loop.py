@@ -30,7 +30,8 @@ _FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
-_DECAY = 0.3  # of a joint fit, besides a straight line to nothing
+# of a joint fit: rates fall to nothing along more than a straight line; Adam's first steps would move everything as far
+_WARM_UP, _DECAY = 0.1, 0.3
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
 
 
@@ -118,7 +119,9 @@ class FitLoop:
         try:
             for step in range(self.done + 1, num_steps + 1):
                 past = (step - 1) / num_steps
-                rate = (1 - past) * _DECAY**past if joint else _LAST_RATE**past
+                rate = (
+                    min(1.0, step / (_WARM_UP * num_steps)) * (1 - past) * _DECAY**past if joint else _LAST_RATE**past
+                )
                 self._set_rates(rate / 2**self.result.recoveries)
                 if not self._take_step(step, schedule):
                     self._recover(good)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +14,9 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult
 from noiseflow.observation_table import ObservationTable
+from noiseflow.picked import needs_image
 from recon.candidates import learns, num_steps_of, rate_of
+from recon.half_resolution import HalfResolution
 from recon.image_formation import Linear
 from recon.signal_model import TomographySignal
 
@@ -42,7 +45,9 @@ class Alternation:
         run_fit: Callable[..., FitResult],
         *,
         held_out: float = 0.1,
+        coarse_to_fine: bool = True,
     ) -> None:
+        self.coarse_to_fine = coarse_to_fine
         self.signal_model, self.observation, self.use, self.run_fit = signal_model, observation, use, run_fit
         self.generator = torch.Generator().manual_seed(seed)
         self.calm = 1.0
@@ -83,19 +88,44 @@ class Alternation:
             quiet: whether there is little noise; the simple one then settles the signal first.
             progress: called with the steps done and a note.
         """
-        begun = _begun(num_steps)
         if quiet:
+            begun = _begun(num_steps)
             self.settle(first, final=first is noise_model, thoroughly=True, progress=progress)
         else:
-            self.begin(first, num_steps=num_steps, progress=progress)
+            begun = self.begin(first, noise_model, num_steps=num_steps, progress=progress)
         rate = WARM if quiet else SECOND
         return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
 
-    def begin(self, first: nn.Module, *, num_steps: int, progress: Progress | None = None) -> None:
-        """The first quarter of so many steps, with simple noise as it is."""
-        if _begun(num_steps):
-            with frozen(first):
-                self.fit_signal(first, num_steps=_begun(num_steps), rate=1.0, progress=progress)
+    def begin(
+        self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, progress: Progress | None = None
+    ) -> int:
+        """The first quarter of so many steps, with simple noise as it is; and where half the resolution will do for that, another
+        quarter there, with the model of choice as it is. Returns the steps taken.
+        """
+        begun = _begun(num_steps)
+        if not begun:
+            return 0
+        with self._half_resolution(noise_model) as task, frozen(first), frozen(noise_model):
+            task.fit_signal(first, num_steps=begun, rate=1.0, progress=progress)
+            if task is self:
+                return begun
+            later = None if progress is None else partial(_continue, progress, begun)
+            task.fit_signal(noise_model, num_steps=begun, rate=SECOND, progress=later)
+        return 2 * begun
+
+    @contextmanager
+    def _half_resolution(self, noise_model: nn.Module, *, wanted: bool = True) -> Iterator[Alternation]:
+        """The same task at half the resolution, if that is wanted and can be; else the task as it is."""
+        wanted = wanted and self.coarse_to_fine and not needs_image(noise_model)
+        if not (wanted and HalfResolution.exists_for(self.signal_model)):
+            yield self
+            return
+        half, task = HalfResolution(self.signal_model), copy.copy(self)
+        task.signal_model, task.observation = half.signal_model, half.pixels(self.observation)
+        task.held_out = half.pixels(self.held_out)
+        task.use = None if self.use is None else half.pixels(self.use)
+        yield task
+        half.hand_over()
 
     def settle(
         self, first: nn.Module, *, final: bool, thoroughly: bool = False, progress: Progress | None = None
@@ -118,8 +148,9 @@ class Alternation:
         held = response if isinstance(response, Linear) and not final else nn.Identity()
         self.refine(first, standardise=True, num_steps=_START)
         for stage, num_steps in enumerate(_SETTLING):
-            with frozen(held if thoroughly or stage >= _ENOUGH else nn.Identity()):
-                result = self.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
+            holding = frozen(held if thoroughly or stage >= _ENOUGH else nn.Identity())
+            with self._half_resolution(first, wanted=stage == 0) as task, holding:
+                result = task.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
             history = list(result.history.values())
             if not thoroughly and stage + 1 >= _ENOUGH and history[len(history) // 2] - min(history) < _SETTLED:
                 break

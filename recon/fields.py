@@ -58,6 +58,11 @@ class Field(Described):
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
         raise NotImplementedError
 
+    def coarser(self) -> Field | None:
+        """This field on a lattice half as fine, by the same parameters: what it learns, this one has learnt. None where it has no
+        such lattice."""
+        return None
+
     def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
         """Unconstrained values of a volume (z, y, x) averaged or stretched to `shape`, (depth, width, height)."""
         lattice = volume.transpose(1, 2)[None, None] / self.scale
@@ -124,6 +129,15 @@ class MultiresolutionField(Field):
                 grid.zero_()
             grid = self.grids[max(0, len(self.grids) - 3)]
             grid.copy_(self._raw_of(volume, grid.shape))
+
+    def coarser(self) -> Field | None:
+        """The sum of all grids but the finest; a derived class may make its volume otherwise."""
+        if len(self.grids) < 2 or type(self) is not MultiresolutionField:
+            return None
+        depth, width, height = self.grids[-2].shape
+        field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)
+        field.grids = self.grids[:-1]
+        return field
 
     def units(self) -> Tensor:
         return functional.softplus(_sum(list(self.grids)))

@@ -33,6 +33,7 @@ _HELD_OUT_TO_CHOOSE = 0.2  # of the pixels: those of a slab are few to tell weig
 _TOLERATED = 0.003  # nats per pixel
 _LOOK_STEPS = 60  # of each candidate: within the tolerance of where it would end
 _SLAB, _SLAB_VOXELS = 24, 24 * 96**2  # slices; where they are small, as many as have so many voxels tell weights apart
+_RUNG_STEPS = 60  # of the fits that tell weights apart
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
 
 
@@ -74,6 +75,8 @@ class JointReconstructor:
         num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
+        coarse_to_fine: whether the first half of the steps is taken at half the resolution, where the field knows it; without
+            defocus.
         defocus: blur to model, pixels per voxel out of the plane of focus, see `recon.defocused_projector.DefocusedProjector`.
         slab: slices used to choose; by default 24, or more where a weight is chosen and they are small.
         settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
@@ -88,6 +91,7 @@ class JointReconstructor:
     num_steps: int = 150
     estimate_response: bool = True
     skip_vacuum: bool = True
+    coarse_to_fine: bool = True
     defocus: float = 0.0
     slab: int | None = None
     settled: TomographySignal | None = None
@@ -159,7 +163,15 @@ class JointReconstructor:
     ) -> Alternation:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
-        return Alternation(signal_model, observation, use, self.seed, self.run_fit, **options)
+        return Alternation(
+            signal_model,
+            observation,
+            use,
+            self.seed,
+            self.run_fit,
+            coarse_to_fine=self.coarse_to_fine,
+            **options,
+        )
 
     def _num_slices(self, field: Field) -> int:
         """Of the slab: a few cannot tell weights apart where each of them has few pixels."""
@@ -190,7 +202,7 @@ class JointReconstructor:
             if not quiet:  # as the whole will begin: from a signal that has settled, fits want more weight
                 part.load_state_dict(rough)
                 part.image_formation.load_state_dict(response)
-                task.begin(first, num_steps=self.num_steps)
+                task.begin(first, noise_model, num_steps=self.num_steps)
             held_out = _HeldOut(task, noise_model, WARM if quiet else SECOND)
             with frozen(noise_model):
                 choice = choose_weight(held_out, _FIRST_WEIGHT)
@@ -246,7 +258,7 @@ class _HeldOut:
         signal_model = self.task.signal_model
         signal_model.load_state_dict(self.start)
         signal_model.weight = weight
-        history = self.task.fit_signal(self.noise_model, num_steps=80, rate=self.rate).history
+        history = self.task.fit_signal(self.noise_model, num_steps=_RUNG_STEPS, rate=self.rate).history
         nll = list(history.values())[-1]
         if nll < self.lowest:
             self.lowest, self.likeliest = nll, copy.deepcopy(signal_model.state_dict())

@@ -57,6 +57,12 @@ class Occupancy(nn.Module):
         part.mask = self.mask[..., rows].clone()
         return part
 
+    def coarser(self, shape: Sequence[int]) -> Occupancy:
+        """The same on a lattice (depth, height, width) half as fine."""
+        part = Occupancy(torch.zeros(1, 1, 1), shape, block=self.block).to(self.mask.device)
+        part.mask = functional.adaptive_max_pool3d(self.mask.float()[None], part.mask.shape)[0] > 0
+        return part
+
     @torch.no_grad()
     def retest(self, gradient: Tensor, projector: SliceProjector, cost: float) -> None:
         """Occupy the blocks that the data wants, in every tenth call.

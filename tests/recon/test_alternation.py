@@ -51,7 +51,7 @@ def test_steps_are_calmer_the_less_noise_there_is(noise: float) -> None:
     signal_model = SimpleNamespace(
         learning_rate=1.0, signal=lambda: signal, image_formation=offset, release=lambda: None
     )
-    task = Alternation(signal_model, observation, None, 0, run_fit)
+    task = Alternation(signal_model, observation, None, 0, run_fit, coarse_to_fine=False)
     assert task.settle(Gaussian(), final=True) == (noise < 0.2)
     task.fit_signal(Gaussian(), rate=1.0, num_steps=1)
     assert rates == [(1.0, True), (0.5, True), (1.0, True)]

@@ -1,0 +1,153 @@
+"""The first steps of a fit at half the resolution: the same scene, seen by fewer pixels."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from noiseflow import Gaussian, SplineFlow
+from noiseflow.fit_loop import FitResult
+from recon import half_resolution
+from recon.alternation import Alternation
+from recon.benchmark import make_scene
+from recon.defocused_projector import with_defocus
+from recon.fields import MultiresolutionField, VoxelField
+from recon.half_resolution import HalfResolution
+from recon.image_formation import Transmission
+from recon.joint import JointReconstructor
+from recon.metrics import compare
+from recon.occupancy import Occupancy
+from recon.projector import SliceProjector
+from recon.signal_model import TomographySignal
+
+_ANGLES = np.arange(-60, 61, 8.0)
+_SHAPES = [(48, 40, 64), (50, 39, 63), (49, 42, 61)]  # (depth, height, width)
+
+
+def smooth_model(shape, *, detector_width=None, occupancy=False, offset=0.0):
+    """A soft ball well inside the lattice, which half the resolution holds nearly as well."""
+    depth, _, width = shape
+    projector = SliceProjector(
+        tilt_angles=_ANGLES, depth=depth, width=width, detector_width=detector_width, detector_offset=offset
+    )
+    field = MultiresolutionField(shape, scale=0.05)
+    places = [torch.linspace(-1, 1, 12) - shift for shift in (0.1, -0.2, 0.15)]
+    distance = sum(place.view([-1 if axis == k else 1 for k in range(3)]) ** 2 for axis, place in enumerate(places))
+    rough = functional.interpolate(torch.exp(-6 * distance)[None, None], size=field.grids[-2].shape, mode="trilinear")
+    with torch.no_grad():
+        for grid in field.grids:
+            grid.zero_()
+        field.grids[-2].copy_(7 * rough[0, 0] - 4)
+    skip = Occupancy(torch.ones(1, 1, 1), shape) if occupancy else None
+    return TomographySignal(field, projector, Transmission(1.0), weight=0.5, occupancy=skip)
+
+
+def images_of(model):
+    with torch.no_grad():
+        return model.signal().view(len(_ANGLES), model.projector.detector_width, model.field.height)
+
+
+@pytest.mark.parametrize("occupancy", [False, True])
+@pytest.mark.parametrize("offset", [0.0, 1.3])
+@pytest.mark.parametrize("shape", _SHAPES)
+def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
+    model = smooth_model(shape, occupancy=occupancy, offset=offset, detector_width=shape[2] + 5)
+    half = HalfResolution(model)
+    seen, expected = images_of(half.signal_model), half.pixels(images_of(model))
+    assert seen.shape == expected.shape
+    assert 4 * seen.numel() <= 1.1 * model.num_pixels
+    contrast, error = float(expected.max() - expected.min()), seen - expected
+    assert contrast > 0.1
+    assert float(error.square().mean().sqrt()) < 0.02 * contrast
+    slopes = expected.diff(dim=1)[..., 1:], expected.diff(dim=2)[:, 1:]
+    allowed = 0.3 if any(size % 2 for size in shape) else 0.05  # half of an odd number of voxels is a little too wide
+    for slope in slopes:  # error along a slope is a shift, in pixels at half the resolution
+        assert abs(float((error[:, 1:, 1:] * slope).sum() / slope.square().sum())) < allowed
+
+
+def test_total_variation_weighs_as_much():
+    model = smooth_model((64, 64, 64))
+    model.smoothing = 1e-3
+    half = HalfResolution(model).signal_model
+    assert float(half.penalty()) == pytest.approx(float(model.penalty()), rel=0.08)
+
+
+def test_pixels_come_from_everywhere_and_are_as_they_were():
+    half = HalfResolution(smooth_model(_SHAPES[0]))
+    images = torch.arange(len(_ANGLES) * 64 * 40).view(len(_ANGLES), 64, 40)
+    picked = half.pixels(images)
+    columns, rows = picked // 40 % 64, picked % 40
+    assert picked.shape == (len(_ANGLES), 32, 20)
+    assert (columns.diff(dim=1) == 2).all()
+    assert (rows.diff(dim=2) == 2).all()
+    assert {(int(c), int(r)) for c, r in zip(columns[:, 0, 0], rows[:, 0, 0], strict=True)} == {
+        (c, r) for c in (0, 1) for r in (0, 1)
+    }
+
+
+def test_what_is_learnt_is_learnt_for_both():
+    model = smooth_model(_SHAPES[1])
+    half = HalfResolution(model).signal_model
+    before = model.volume()
+    (half.signal().mean() + half.penalty()).backward()
+    assert model.field.grids[-1].grad is None
+    with torch.no_grad():
+        for grid in model.field.grids[:-1]:
+            grid -= 100 * grid.grad
+    assert not torch.equal(model.volume(), before)
+    assert model.image_formation is half.image_formation
+
+
+def test_the_full_resolution_begins_around_what_was_found():
+    model = smooth_model(_SHAPES[0], occupancy=True)
+    HalfResolution(model).hand_over()
+    something = (model.field.volume() > 0.3 * model.field.scale).transpose(1, 2)
+    assert something.any()
+    assert model.occupancy.mask[something].all()
+    assert model.occupancy.share < 0.5
+
+
+def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
+    model = smooth_model(_SHAPES[0])
+    assert HalfResolution.exists_for(model)
+    small = smooth_model((24, 24, half_resolution._LEAST - 1))
+    voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
+    blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
+    for other in (small, voxels, blurred):
+        assert not HalfResolution.exists_for(other)
+    for other in (voxels, blurred):
+        with pytest.raises(ValueError, match="half as fine"):
+            HalfResolution(other)
+
+
+@pytest.mark.parametrize(
+    ("noise_model", "coarse_to_fine", "sizes"),
+    [
+        (Gaussian(), True, [(32, 20), (32, 20)]),
+        (Gaussian(), False, [(64, 40)]),
+        (SplineFlow(neighbourhood=3), True, [(64, 40)]),
+    ],
+)
+def test_a_fit_begins_at_half_the_resolution_where_it_can(noise_model, coarse_to_fine, sizes):
+    seen = []
+
+    def run_fit(noise_model, signal, observation, **options):
+        assert options["mask"].shape == options["held_out"].shape == observation.shape
+        seen.append(tuple(observation.shape[1:]))
+        return FitResult(noise_model)
+
+    model = smooth_model(_SHAPES[0])
+    images, use = images_of(model), torch.ones(len(_ANGLES), 64, 40, dtype=torch.bool)
+    task = Alternation(model, images, use, 0, run_fit, coarse_to_fine=coarse_to_fine)
+    assert task.begin(Gaussian(), noise_model, num_steps=40) == 10 * len(sizes)
+    assert seen == sizes
+
+
+def test_half_the_steps_at_half_the_resolution_lose_nothing():
+    scene = make_scene(64, tilts="-60:60:4")
+    fits = [
+        JointReconstructor(weight=0.4, noise_model=lambda: scene.noise_model, coarse_to_fine=wanted)
+        for wanted in (True, False)
+    ]
+    coarsely, finely = (compare(fit(scene.noisy).volume.attenuation, scene.truth).psnr for fit in fits)
+    assert coarsely > finely - 0.1
