@@ -209,7 +209,7 @@ class Alternation:
         ends = [float(end) for end in torch.aminmax(self.signal_model.signal())]
         return ObservationTable(noise_model, observation, *ends).error < _TABULATED
 
-    def refine(self, noise_model: nn.Module, *, standardise: bool = False, num_steps: int = 60) -> None:
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False, num_steps: int = 40) -> None:
         """Fit a noise model, if it learns, to the signal as it is."""
         if learns(noise_model):
             options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, num_steps), "standardise": standardise}
