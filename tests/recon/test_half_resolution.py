@@ -1,5 +1,7 @@
 """The first steps of a fit at half the resolution: the same scene, seen by fewer pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from noiseflow.fit_loop import FitResult
 from recon import half_resolution
 from recon.alternation import Alternation
 from recon.benchmark import make_scene
+from recon.checkpoint import Journal
 from recon.defocused_projector import with_defocus
 from recon.fields import MultiresolutionField, VoxelField
 from recon.half_resolution import HalfResolution
@@ -143,11 +146,41 @@ def test_a_fit_begins_at_half_the_resolution_where_it_can(noise_model, coarse_to
     assert seen == sizes
 
 
-def test_half_the_steps_at_half_the_resolution_lose_nothing():
-    scene = make_scene(64, tilts="-60:60:4")
-    fits = [
-        JointReconstructor(weight=0.4, noise_model=lambda: scene.noise_model, coarse_to_fine=wanted)
-        for wanted in (True, False)
-    ]
-    coarsely, finely = (compare(fit(scene.noisy).volume.attenuation, scene.truth).psnr for fit in fits)
+@pytest.fixture(autouse=True)
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Some slices of shells: truth and noisy series."""
+    whole, rows = make_scene(64, tilts="-60:60:4"), slice(24, 40)
+    return whole.truth[:, rows], replace(whole.noisy, images=whole.noisy.images[:, rows]), whole.noise_model
+
+
+def test_half_the_steps_at_half_the_resolution_lose_nothing(scene):
+    truth, noisy, noise_model = scene
+    fit = JointReconstructor(weight=0.4, noise_model=lambda: noise_model)
+    fits = [replace(fit, coarse_to_fine=wanted) for wanted in (True, False)]
+    coarsely, finely = (compare(each(noisy).volume.attenuation, truth).psnr for each in fits)
     assert coarsely > finely - 0.1
+
+
+def test_a_fit_stopped_at_half_the_resolution_goes_on(scene, tmp_path):
+    _, noisy, _ = scene
+    fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16)
+    stopped = []
+
+    def stop(title, done, total, note):
+        if title == "fitting the volume" and done == 2 and total == 4:
+            stopped.append(done)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        replace(fit, run_fit=Journal(tmp_path, {}, report=stop).fit)(noisy, progress=lambda done, note: None)
+    assert stopped
+    resumed = replace(fit, run_fit=Journal(tmp_path, {}, resume=True).fit)(noisy).volume.attenuation
+    np.testing.assert_allclose(resumed, fit(noisy).volume.attenuation, rtol=1e-5, atol=1e-5 * resumed.max())
