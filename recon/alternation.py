@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from noiseflow import FitResult
 from noiseflow.observation_table import ObservationTable
 from noiseflow.picked import needs_image
-from recon.candidates import learns, num_steps_of, rate_of
+from recon.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.half_resolution import HalfResolution
 from recon.image_formation import Linear
 from recon.signal_model import TomographySignal
@@ -209,9 +209,10 @@ class Alternation:
         ends = [float(end) for end in torch.aminmax(self.signal_model.signal())]
         return ObservationTable(noise_model, observation, *ends).error < _TABULATED
 
-    def refine(self, noise_model: nn.Module, *, standardise: bool = False, num_steps: int = 40) -> None:
+    def refine(self, noise_model: nn.Module, *, standardise: bool = False, num_steps: int = 60) -> None:
         """Fit a noise model, if it learns, to the signal as it is."""
         if learns(noise_model):
+            standardise = standardise or starts_anew(noise_model)
             options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, num_steps), "standardise": standardise}
             self.fit(noise_model, known=True, **options)
 

@@ -74,6 +74,12 @@ def num_steps_of(noise_model: nn.Module, usual: int) -> int:
     return min(usual, _EXACT_STEPS) if exact else usual
 
 
+def starts_anew(noise_model: nn.Module) -> bool:
+    """Whether it had better start from scratch on a better signal: a Gaussian's width at every signal is read off the residuals,
+    and a fit that went on from the width about a worse signal would hardly move."""
+    return any(isinstance(module, SignalDependentGaussian) for module in noise_model.modules())
+
+
 def rate_of(noise_model: nn.Module) -> float:
     """Models of many parameters overshoot at rates that the others need to keep up with the volume."""
     rich = any(isinstance(module, SplineFlow | Mixture) for module in noise_model.modules())

@@ -31,7 +31,7 @@ from recon.weight import WeightChoice, choose_weight
 _FIRST_WEIGHT = 0.4
 _HELD_OUT_TO_CHOOSE = 0.2  # of the pixels: those of a slab are few to tell weights apart
 _TOLERATED = 0.003  # nats per pixel
-_LOOK_STEPS = 40  # of each candidate: within the tolerance of where it would end
+_LOOK_STEPS = 60  # of each candidate: within the tolerance of where it would end
 _SLAB, _SLAB_VOXELS = 24, 24 * 96**2  # slices; where they are small, as many as have so many voxels tell weights apart
 _RUNG_STEPS = 60  # of the fits that tell weights apart
 _WORTHWHILE = 0.4  # share of the lattice that may be occupied; skipping little costs more than it saves
