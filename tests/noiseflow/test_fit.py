@@ -266,3 +266,16 @@ def test_a_fit_learns_where_gradients_are_off() -> None:
     with torch.no_grad():
         result = noiseflow.fit(noiseflow.Gaussian(), signal, torch.randn(500), num_steps=20)
     assert math.isfinite(result.held_out_nll)
+
+
+def test_a_joint_fit_begins_with_small_steps():
+    """Adam's first steps move everything as far, however little there is to gain: a good start would be lost to them."""
+    observation = torch.randn(64, 64, generator=torch.Generator().manual_seed(0))
+    signal_model = noiseflow.StaticScene(observation)
+    before, moved = signal_model.scene.detach().clone(), []
+
+    def progress(step, note):
+        moved.append(float((signal_model.scene - before).abs().max()))
+
+    noiseflow.fit(noiseflow.Gaussian(), signal_model, observation, num_steps=100, learning_rate=0.05, progress=progress)
+    assert 0 < moved[0] < 0.1 * 0.05 * 1.01
