@@ -36,6 +36,7 @@ def fit(
     num_steps: int = 500,
     batch_size: int = 8192,
     learning_rate: float = 1e-2,
+    warm_up: float = 0.0,
     noise_interval: int = 10,
     noise_steps: int = 10,
     standardise: bool = True,
@@ -65,6 +66,8 @@ def fit(
         num_steps: optimisation steps.
         batch_size: pixels per noise-model step.
         learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``.
+        warm_up: share of the steps of a joint fit in which its rates grow to their full size. Adam's first steps move everything
+            as far, which a rough start gains from and a good one is lost to.
         noise_interval, noise_steps: in a joint fit, this many noise-model steps after every so many signal steps.
         standardise: measure the data's scaling first and store it in the noise model.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
@@ -78,8 +81,10 @@ def fit(
         The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, too few pixels, or no finite step could be made.
+        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, or no finite step could be made.
     """
+    if not 0 <= warm_up < 1:
+        raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
     if isinstance(signal, np.ndarray):
         signal = as_tensor(signal)
     observation = as_tensor(observation)
@@ -106,7 +111,7 @@ def fit(
     loop.prepare(num_steps, learning_rate, standardise and resume is None)
     if resume is not None:
         loop.load_state(resume)
-    schedule = Schedule(num_steps, batch_size, noise_interval, noise_steps, tabulate, checkpoint_interval)
+    schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     return loop.run(schedule, progress, checkpoint)
 
 

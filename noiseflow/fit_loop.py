@@ -30,8 +30,7 @@ _FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
-# of a joint fit: rates fall to nothing along more than a straight line; Adam's first steps would move everything as far
-_WARM_UP, _DECAY = 0.1, 0.3
+_DECAY = 0.3  # of a joint fit, besides a straight line to nothing
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
 
 
@@ -67,6 +66,7 @@ class Schedule:
 
     num_steps: int
     batch_size: int
+    warm_up: float
     noise_interval: int
     noise_steps: int
     tabulate: bool
@@ -119,9 +119,9 @@ class FitLoop:
         try:
             for step in range(self.done + 1, num_steps + 1):
                 past = (step - 1) / num_steps
-                rate = (
-                    min(1.0, step / (_WARM_UP * num_steps)) * (1 - past) * _DECAY**past if joint else _LAST_RATE**past
-                )
+                rate = (1 - past) * _DECAY**past if joint else _LAST_RATE**past
+                if joint and step < schedule.warm_up * num_steps:
+                    rate *= step / (schedule.warm_up * num_steps)
                 self._set_rates(rate / 2**self.result.recoveries)
                 if not self._take_step(step, schedule):
                     self._recover(good)

@@ -23,6 +23,7 @@ from recon.signal_model import TomographySignal
 Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
 SECOND, WARM = 0.5, 0.25
+_WARM_UP = 0.1  # of the steps, but from a rough start
 _SETTLING = (40, 80, 160, 320)  # steps
 _ENOUGH = 2  # of these stages, unless there is little noise
 _START = 10  # steps of noise that goes on to learn with the signal
@@ -72,7 +73,7 @@ class Alternation:
         usual = self.signal_model.learning_rate
         self.signal_model.learning_rate = usual * rate * self.calm
         try:
-            return self.fit(noise_model, standardise=False, **options)
+            return self.fit(noise_model, standardise=False, warm_up=_WARM_UP if rate < 1 else 0.0, **options)
         finally:
             self.signal_model.learning_rate = usual
 

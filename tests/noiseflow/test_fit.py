@@ -268,8 +268,8 @@ def test_a_fit_learns_where_gradients_are_off() -> None:
     assert math.isfinite(result.held_out_nll)
 
 
-def test_a_joint_fit_begins_with_small_steps():
-    """Adam's first steps move everything as far, however little there is to gain: a good start would be lost to them."""
+@pytest.mark.parametrize(("warm_up", "first"), [(0.0, 1.0), (0.1, 0.1)])
+def test_a_joint_fit_begins_with_small_steps_where_it_is_told_to(warm_up, first):
     observation = torch.randn(64, 64, generator=torch.Generator().manual_seed(0))
     signal_model = noiseflow.StaticScene(observation)
     before, moved = signal_model.scene.detach().clone(), []
@@ -277,5 +277,12 @@ def test_a_joint_fit_begins_with_small_steps():
     def progress(step, note):
         moved.append(float((signal_model.scene - before).abs().max()))
 
-    noiseflow.fit(noiseflow.Gaussian(), signal_model, observation, num_steps=100, learning_rate=0.05, progress=progress)
-    assert 0 < moved[0] < 0.1 * 0.05 * 1.01
+    options = {"num_steps": 100, "learning_rate": 0.05, "warm_up": warm_up, "progress": progress}
+    noiseflow.fit(noiseflow.Gaussian(), signal_model, observation, **options)
+    assert moved[0] == pytest.approx(0.05 * first, rel=0.02)
+
+
+@pytest.mark.parametrize("warm_up", [-0.1, 1.0, math.nan])
+def test_a_share_of_steps_is_one(warm_up):
+    with pytest.raises(ValueError, match="warm_up"):
+        noiseflow.fit(noiseflow.Gaussian(), torch.zeros(100), torch.zeros(100), warm_up=warm_up)
