@@ -90,7 +90,7 @@ class Alternation:
             progress: called with the steps done and a note.
         """
         if quiet:
-            begun = _begun(num_steps)
+            begun = num_steps // 4
             self.settle(first, final=first is noise_model, thoroughly=True, progress=progress)
         else:
             begun = self.begin(first, noise_model, num_steps=num_steps, progress=progress)
@@ -103,7 +103,7 @@ class Alternation:
         """The first quarter of so many steps, with simple noise as it is; and where half the resolution will do for that, another
         quarter there, with the model of choice as it is. Returns the steps taken.
         """
-        begun = _begun(num_steps)
+        begun = num_steps // 4
         if not begun:
             return 0
         with self._half_resolution(noise_model) as task, frozen(first), frozen(noise_model):
@@ -216,10 +216,6 @@ class Alternation:
             standardise = standardise or starts_anew(noise_model)
             options: dict[str, Any] = {"num_steps": num_steps_of(noise_model, num_steps), "standardise": standardise}
             self.fit(noise_model, known=True, **options)
-
-
-def _begun(num_steps: int) -> int:
-    return min(_SETTLING[0], num_steps // 4)
 
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:

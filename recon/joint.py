@@ -88,7 +88,7 @@ class JointReconstructor:
     weight: float | None = None
     noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
-    num_steps: int = 150
+    num_steps: int = 200
     estimate_response: bool = True
     skip_vacuum: bool = True
     coarse_to_fine: bool = True

@@ -13,7 +13,7 @@ from recon.napari.files import LayerData
 if TYPE_CHECKING:
     from recon.methods import Progress
 
-_STEPS = 150
+_STEPS = 200
 _BUTTON = "Reconstruct"
 
 
