@@ -81,17 +81,24 @@ _NETWORK = partial(CoordinateNetwork, width=32, layers=3, frequencies=6, skip=1)
 def skipping(
     phantom: str, size: int, make_field: Callable[..., Any] = MultiresolutionField, tilts: str = TILTS, repeats: int = 3
 ) -> Row:
-    """A field with and without skipping of vacuum, equal steps, noise known and weight given; whole runs."""
+    """A field with vacuum and, at first, half of the resolution left out, with each of them, and with nothing; only vacuum, where
+    the field has one resolution. Equal steps, noise known and weight given; whole runs."""
     scene = make_scene(size, phantom=phantom, tilts=tilts)
-    skips = JointReconstructor(weight=_WEIGHT, make_field=make_field, noise_model=lambda: scene.noise_model)
-    fits = [replace(skips, skip_vacuum=skip) for skip in (True, False)]
-    (skipped, result), (full, reference) = in_turn([partial(each, scene.noisy) for each in fits], repeats=repeats)
-    psnr = [compare(each.volume.attenuation, scene.truth).psnr for each in (result, reference)]
-    occupancy = result.signal_model.occupancy
-    row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean())}
-    row |= {"occupied": 1.0 if occupancy is None else occupancy.share}
-    row |= {"skipping": skipped, "everywhere": full, "ratio": full / skipped}
-    return row | {"volume PSNR, skipping": psnr[0], "volume PSNR, everywhere": psnr[1]}
+    everything = JointReconstructor(weight=_WEIGHT, make_field=make_field, noise_model=lambda: scene.noise_model)
+    fits = {"everything": everything, "nothing": replace(everything, skip_vacuum=False, coarse_to_fine=False)}
+    if make_field is MultiresolutionField:
+        fits["vacuum alone"] = replace(everything, coarse_to_fine=False)
+        fits["resolution alone"] = replace(everything, skip_vacuum=False)
+    found = dict(
+        zip(fits, in_turn([partial(each, scene.noisy) for each in fits.values()], repeats=repeats), strict=True)
+    )
+    occupancy = found["everything"][1].signal_model.occupancy
+    row: Row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean())}
+    row["occupied"] = 1.0 if occupancy is None else occupancy.share
+    for name, (seconds, result) in found.items():
+        row[f"skipping {name}"] = seconds
+        row[f"skipping {name}, volume PSNR"] = compare(result.volume.attenuation, scene.truth).psnr
+    return row | {"ratio": found["nothing"][0] / found["everything"][0]}
 
 
 def steps(phantom: str, size: int, repeats: int = 3) -> Row:

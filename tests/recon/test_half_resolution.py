@@ -154,23 +154,25 @@ def _one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.fixture(scope="module")
-def scene():
-    """Some slices of shells: truth and noisy series."""
-    whole, rows = make_scene(64, tilts="-60:60:4"), slice(24, 40)
+def slices(phantom):
+    """Some slices: truth, noisy series and true noise."""
+    whole, rows = make_scene(64, phantom=phantom, tilts="-60:60:4"), slice(24, 40)
     return whole.truth[:, rows], replace(whole.noisy, images=whole.noisy.images[:, rows]), whole.noise_model
 
 
-def test_half_the_steps_at_half_the_resolution_lose_nothing(scene):
-    truth, noisy, noise_model = scene
-    fit = JointReconstructor(weight=0.4, noise_model=lambda: noise_model)
-    fits = [replace(fit, coarse_to_fine=wanted) for wanted in (True, False)]
-    coarsely, finely = (compare(each(noisy).volume.attenuation, truth).psnr for each in fits)
-    assert coarsely > finely - 0.1
+def test_half_the_steps_at_half_the_resolution_lose_nothing():
+    gains = []
+    for phantom in ("shells", "virions"):
+        truth, noisy, noise_model = slices(phantom)
+        fit = JointReconstructor(weight=0.4, noise_model=lambda noise_model=noise_model: noise_model)
+        fits = [replace(fit, coarse_to_fine=wanted) for wanted in (True, False)]
+        coarsely, finely = (compare(each(noisy).volume.attenuation, truth).psnr for each in fits)
+        gains.append(coarsely - finely)
+    assert np.mean(gains) > -0.1
 
 
-def test_a_fit_stopped_at_half_the_resolution_goes_on(scene, tmp_path):
-    _, noisy, _ = scene
+def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
+    _, noisy, _ = slices("shells")
     fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16)
     stopped = []
 
