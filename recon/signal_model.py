@@ -30,8 +30,11 @@ class TomographySignal(Described):
         weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
             voxel face.
         smoothing: jumps below this, in units of the field's scale, count quadratically.
-        learning_rate: of a field of voxels; the detector's response learns at a twenty-fifth of it.
+        learning_rate: of a field of voxels.
         occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a `SliceProjector`.
+
+    Attributes:
+        response_rate: learning rate of the detector's response, relative to the volume's.
 
     Raises:
         ValueError: an occupancy for another projector.
@@ -54,6 +57,7 @@ class TomographySignal(Described):
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
         self.occupancy = occupancy
+        self.response_rate = 0.04
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
         self._tiles_of: tuple[Tensor | None, int] = None, 0
@@ -179,4 +183,4 @@ class TomographySignal(Described):
                 "eps": 1e-15,
             }
         ]
-        return groups + ([{"params": response, "lr": self.learning_rate / 25}] if response else [])
+        return groups + ([{"params": response, "lr": self.learning_rate * self.response_rate}] if response else [])
