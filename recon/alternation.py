@@ -72,14 +72,14 @@ class Alternation:
     def fit_signal(self, noise_model: nn.Module, *, rate: float, **options: Any) -> FitResult:
         """Fit volume and noise model at so many times the usual learning rate of the volume, and calmer where there is little
         noise; from a rough start, an offset learns faster, for it has a long way to go."""
-        usual, hasty = self.signal_model.learning_rate, self.signal_model.response_rate
+        usual, of_response = self.signal_model.learning_rate, self.signal_model.response_rate
         self.signal_model.learning_rate = usual * rate * self.calm
         if rate >= 1 and isinstance(self.signal_model.image_formation, Linear):
-            self.signal_model.response_rate = _HASTE * hasty
+            self.signal_model.response_rate = _HASTE * of_response
         try:
             return self.fit(noise_model, standardise=False, warm_up=_WARM_UP if rate < 1 else 0.0, **options)
         finally:
-            self.signal_model.learning_rate, self.signal_model.response_rate = usual, hasty
+            self.signal_model.learning_rate, self.signal_model.response_rate = usual, of_response
 
     def begin_and_alternate(
         self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, quiet: bool, progress: Progress | None

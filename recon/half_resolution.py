@@ -63,9 +63,9 @@ class HalfResolution:
     @staticmethod
     def exists_for(signal_model: TomographySignal) -> bool:
         """Whether field and projector know half the resolution, and there are voxels to save."""
-        field = signal_model.field
-        known = isinstance(signal_model.projector, SliceProjector) and field.coarser() is not None
-        return known and min(field.width, signal_model.projector.detector_width) >= _LEAST
+        field, projector = signal_model.field, signal_model.projector
+        large = min(field.width, projector.detector_width) >= _LEAST
+        return large and isinstance(projector, SliceProjector) and field.coarser() is not None
 
     def pixels(self, images: Tensor) -> Tensor:
         """Those that are fitted, of images (tilt, u, y)."""

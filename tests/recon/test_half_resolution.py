@@ -1,5 +1,6 @@
 """The first steps of a fit at half the resolution: the same scene, seen by fewer pixels."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from recon.metrics import compare
 from recon.occupancy import Occupancy
 from recon.projector import SliceProjector
 from recon.signal_model import TomographySignal
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 _ANGLES = np.arange(-60, 61, 8.0)
 _SHAPES = [(48, 40, 64), (50, 39, 63), (49, 42, 61)]  # (depth, height, width)
@@ -146,29 +149,21 @@ def test_a_fit_begins_at_half_the_resolution_where_it_can(noise_model, coarse_to
     assert seen == sizes
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-def slices(phantom):
+def slices(phantom, seed=0):
     """Some slices: truth, noisy series and true noise."""
-    whole, rows = make_scene(64, phantom=phantom, tilts="-60:60:4"), slice(24, 40)
+    whole, rows = make_scene(64, phantom=phantom, tilts="-60:60:4", seed=seed), slice(24, 40)
     return whole.truth[:, rows], replace(whole.noisy, images=whole.noisy.images[:, rows]), whole.noise_model
 
 
 def test_half_the_steps_at_half_the_resolution_lose_nothing():
     gains = []
-    for phantom in ("shells", "virions"):
-        truth, noisy, noise_model = slices(phantom)
+    for phantom, seed in itertools.product(("shells", "virions"), (0, 1)):  # by chance, one alone may differ by 0.15
+        truth, noisy, noise_model = slices(phantom, seed)
         fit = JointReconstructor(weight=0.4, noise_model=lambda noise_model=noise_model: noise_model)
         fits = [replace(fit, coarse_to_fine=wanted) for wanted in (True, False)]
         coarsely, finely = (compare(each(noisy).volume.attenuation, truth).psnr for each in fits)
         gains.append(coarsely - finely)
-    assert np.mean(gains) > -0.1
+    assert np.mean(gains) > -0.05
 
 
 def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):

@@ -21,13 +21,7 @@ from recon.signal_model import TomographySignal
 from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.tilt_series import TiltSeries, VolumeGrid
 
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
