@@ -184,7 +184,7 @@ class FitLoop:
             return self.held_out_log_prob(most)
         pixels = thinned(self.pixels.judge, most)
         with torch.no_grad():
-            return self.table.lookup(values_of(self._signal(pixels)), pixels)[0].double(), pixels.numel()
+            return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
 
     def _never_improves(self, schedule: Schedule) -> bool:
         """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""
@@ -238,15 +238,15 @@ class FitLoop:
 
     def _full_batch_loss(self) -> Tensor:
         signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
-        observation = self.pixels.observation
-        if self.table is not None:
-            log_prob = self.table.log_prob(signal)
-        elif needs_image(self.noise_model):
+        observation, weight = self.pixels.observation, self.pixels.weight
+        if self.table is not None:  # a step wants the gradient alone, and the tangent has the same
+            return -torch.dot(self.table.slope(signal).mul_(weight), signal)
+        if needs_image(self.noise_model):
             shape = self.pixels.shape
             log_prob = self.noise_model(signal.reshape(shape)).log_prob(observation.reshape(shape)).reshape(-1)
         else:
             log_prob = self.noise_model(signal).log_prob(observation)
-        return -torch.dot(log_prob, self.pixels.weight.to(log_prob.dtype))
+        return -torch.dot(log_prob, weight.to(log_prob.dtype))
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
         """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""

@@ -14,6 +14,7 @@ from noiseflow.tabulated import SIZES, Columns, RootScale, Rows, interpolate, lo
 
 _MAX_LEVELS = 1024
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
+_CHUNK = 2**18  # pixels; what a lookup writes for them stays in the cache
 _WORTHWHILE = 0.7  # error of finer columns, relative to that of the size before
 
 
@@ -49,7 +50,6 @@ class ObservationTable:
             signal_low, signal_high = resume["low"], resume["high"]
         self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
         self._observation, self._tolerance, self._size = observation, tolerance, 0
-        self._grid = torch.empty(observation.numel(), 2, dtype=observation.dtype, device=observation.device)
         self.error = math.inf
         if resume is None:
             self._refine(noise_model)
@@ -129,7 +129,7 @@ class ObservationTable:
             self._values = self._columns.values(self._signals)
         else:
             last = max(levels.numel() - 1, 1)
-            self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._grid.dtype) / last - 1
+            self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._observation.dtype) / last - 1
             self._rate, self._bounds = torch.zeros_like(self._offset), None
             column = torch.cat([levels, levels]) if levels.numel() == 1 else levels
             self._values = column[None, :].expand(num_rows, -1)
@@ -146,23 +146,35 @@ class ObservationTable:
             # ∂/∂s at fixed o = ∂/∂s at fixed r − t'(s) ∂/∂r
             (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
             slope[:, 1:-1] -= along * self._scale.slope(self._signals)
-        self._table = torch.stack([value, slope])[None].contiguous()
+        # two tables, for a lookup of both channels of one takes three times as long as that of a single one
+        self._value, self._slope = value[None, None].contiguous(), slope[None, None].contiguous()
 
-    def log_prob(self, signal: Tensor) -> Tensor:
-        """Log-likelihood of each pixel at (N,) signals, differentiable in the signal."""
-        found: Tensor = _Lookup.apply(signal, self)  # type: ignore[no-untyped-call]
+    def log_prob(self, signal: Tensor, part: slice | Tensor = slice(None)) -> Tensor:
+        """Log-likelihood at (N,) signals, without gradient; of a part of the pixels, or some, where they are given."""
+        signal = signal.detach()
+        clamped = signal.clamp(self.low, self.high)
+        places = self._places(clamped, part)
+        value, slope = (interpolate(table, places)[0] for table in (self._value, self._slope))
+        return torch.addcmul(value, slope, signal - clamped)
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Derivative of the log-likelihood of each pixel with respect to its signal, at (N,) signals."""
+        signal = signal.detach()
+        found = torch.empty_like(signal)
+        chunk = _CHUNK if signal.device.type == "cpu" else signal.numel()
+        for start in range(0, signal.numel(), chunk):
+            part = slice(start, start + chunk)
+            found[part] = interpolate(self._slope, self._places(signal[part].clamp(self.low, self.high), part))[0]
         return found
 
-    def lookup(self, signal: Tensor, part: slice | Tensor = slice(None)) -> tuple[Tensor, Tensor]:
-        """Log-likelihood and its signal derivative at (N,) signals; of a part of the pixels, or some, where they are given."""
-        grid, clamped = self._grid[part], signal.detach().clamp(self.low, self.high)
-        root = self._scale.signal(clamped)
-        torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=grid[:, 0])
+    def _places(self, signal: Tensor, part: slice | Tensor) -> Tensor:
+        """Texture coordinates of signals within the rows, (n, 2)."""
+        root, places = self._scale.signal(signal), signal.new_empty(2, signal.numel())
+        across = torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=places[0])
         if self._bounds is not None:
-            torch.clamp(grid[:, 0], self._bounds[0][part], self._bounds[1][part], out=grid[:, 0])
-        self._rows.position(root, grid[:, 1])
-        value, slope = interpolate(self._table, grid)
-        return torch.addcmul(value, slope, signal.detach() - clamped), slope
+            torch.clamp(across, self._bounds[0][part], self._bounds[1][part], out=across)
+        self._rows.position(root, out=places[1])
+        return places.T
 
     @torch.no_grad()
     def measure_error(self, noise_model: nn.Module, *, count: int = 1024) -> float:
@@ -176,17 +188,4 @@ class ObservationTable:
         row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
         jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
         signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)
-        return mean_error(self.lookup(signal, part)[0], noise_model(signal).log_prob(observation))
-
-
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, signal: Tensor, table: ObservationTable) -> Tensor:
-        value, slope = table.lookup(signal)
-        ctx.save_for_backward(slope)
-        return value
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (slope,) = ctx.saved_tensors
-        return gradient * slope, None
+        return mean_error(self.log_prob(signal, part), noise_model(signal).log_prob(observation))
