@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult
+from noiseflow.fit_pixels import thinned
 from noiseflow.observation_table import ObservationTable
 from noiseflow.picked import needs_image
 from recon.candidates import learns, num_steps_of, rate_of, starts_anew
@@ -31,6 +32,7 @@ _ENOUGH = 2  # of these stages, unless there is little noise
 _START = 10  # steps of noise that goes on to learn with the signal
 _SETTLED = 0.03  # nats per pixel
 _QUIET = 0.2  # noise relative to contrast
+_SOME = 10_000  # pixels
 _LATER_TURN, _NEXT_RATE = 0.4, 0.5  # share of the steps; learning rate relative to the turn before
 _MOST_TURNS = 6
 _TABULATED = 0.05  # nats per pixel
@@ -133,7 +135,13 @@ class Alternation:
         half.hand_over()
 
     def settle(
-        self, first: nn.Module, *, final: bool, thoroughly: bool = False, progress: Progress | None = None
+        self,
+        first: nn.Module,
+        *,
+        final: bool,
+        thoroughly: bool = False,
+        known: nn.Module | None = None,
+        progress: Progress | None = None,
     ) -> bool:
         """A fit with simple noise, longer and longer until held-out pixels gain little in its second half: what an unfinished
         signal misses would pass for noise, and be left as it is. Steps get smaller, as large ones may stop gaining long before
@@ -144,6 +152,7 @@ class Alternation:
             first: the simple noise; fitted in place.
             final: whether it is the model of choice, too; else the steps that follow are calmer the less noise there is.
             thoroughly: go all the way.
+            known: the noise of choice, if it is known: unless it looks at whole images, the first stage is then enough.
             progress: called with the steps of a stage and a note.
 
         Returns:
@@ -151,18 +160,25 @@ class Alternation:
         """
         response, self.calm = self.signal_model.image_formation, 1.0
         held = response if isinstance(response, Linear) and not final else nn.Identity()
+        known = None if known is None or needs_image(known) else known
         self.refine(first, standardise=True, num_steps=_START)
         for stage, num_steps in enumerate(_SETTLING):
             holding = frozen(held if thoroughly or stage >= _ENOUGH else nn.Identity())
             with self._half_resolution(first, wanted=stage == 0) as task, holding:
                 result = task.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
+            if known is not None:
+                break
             history = list(result.history.values())
             if not thoroughly and stage + 1 >= _ENOUGH and history[len(history) // 2] - min(history) < _SETTLED:
                 break
         with torch.no_grad():
             signal = self.signal_model.signal().view_as(self.observation)
-            residual = signal - self.observation if self.use is None else (signal - self.observation)[self.use]
-            noise = float(residual.square().mean().sqrt() / signal.std())
+            if known is None:
+                residual = signal - self.observation
+                variance = residual.square() if self.use is None else residual[self.use].square()
+            else:
+                variance = getattr(known, "model", known)(thinned(signal.flatten(), _SOME)).variance
+            noise = float(variance.mean().sqrt() / signal.std())
             self.calm = 1.0 if final else min(1.0, noise / _QUIET)
             return noise < _QUIET
 

@@ -191,9 +191,10 @@ class JointReconstructor:
         rough = copy.deepcopy(part.state_dict())
         task = self._task(part, tilt_series, rows, held_out=_HELD_OUT_TO_CHOOSE)
         first = given if isinstance(given, Gaussian) else first_noise(tilt_series.images).to(self.device)
-        quiet = task.settle(first, final=first is given)
-        if given is not None and self.weight is not None and not learns(given):
-            return _Chosen(given, None, first, quiet)
+        known = given if self.weight is not None and given is not None and not learns(given) else None
+        quiet = task.settle(first, final=first is given, known=known)
+        if known is not None:
+            return _Chosen(known, None, first, quiet)
         candidates = noise_candidates(tilt_series.images, quiet=quiet) if given is None else [given]
         noise_model = _best_noise_model(task, candidates)
         task.alternate(noise_model, num_steps=60, rate=WARM, standardise=len(candidates) == 1)
