@@ -124,10 +124,10 @@ class Alternation:
     def _half_resolution(self, noise_model: nn.Module, *, wanted: bool = True) -> Iterator[Alternation]:
         """The same task at half the resolution, if that is wanted and can be; else the task as it is."""
         wanted = wanted and self.coarse_to_fine and not needs_image(noise_model)
-        if not (wanted and HalfResolution.exists_for(self.signal_model)):
+        half, task = HalfResolution.of(self.signal_model) if wanted else None, copy.copy(self)
+        if half is None:
             yield self
             return
-        half, task = HalfResolution(self.signal_model), copy.copy(self)
         task.signal_model, task.observation = half.signal_model, half.pixels(self.observation)
         task.held_out = half.pixels(self.held_out)
         task.use = None if self.use is None else half.pixels(self.use)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.fields import Field
 from recon.occupancy import Occupancy
 from recon.projector import SliceProjector
 from recon.signal_model import TomographySignal
@@ -22,19 +23,24 @@ class HalfResolution:
     pixel at the edges: good enough for a start.
 
     Args:
-        signal_model: at full resolution; its field and image formation are shared.
+        signal_model: at full resolution; its image formation is shared.
+        full: its projector.
+        field: its field on the lattice half as fine.
 
     Attributes:
         signal_model: the one at half the resolution.
-
-    Raises:
-        ValueError: see `exists_for`.
     """
 
-    def __init__(self, signal_model: TomographySignal) -> None:
-        full, field = signal_model.projector, signal_model.field.coarser()
-        if field is None or not isinstance(full, SliceProjector):
-            raise ValueError("the field has no lattice half as fine, or the projector models defocus")
+    @staticmethod
+    def of(signal_model: TomographySignal) -> HalfResolution | None:
+        """None where the field has no lattice half as fine, the projector models defocus, or there are few voxels to save."""
+        full = signal_model.projector
+        if not isinstance(full, SliceProjector) or min(full.width, full.detector_width) < _LEAST:
+            return None
+        field = signal_model.field.coarser()
+        return None if field is None else HalfResolution(signal_model, full, field)
+
+    def __init__(self, signal_model: TomographySignal, full: SliceProjector, field: Field) -> None:
         tilts = np.arange(full.num_tilts)
         # of an odd number, the last pixel along u is left out at some tilts; rows are as many as coarse slices
         self._num_columns, self._first_columns = full.detector_width // 2, tilts % 2
@@ -59,13 +65,6 @@ class HalfResolution:
             learning_rate=signal_model.learning_rate,
             occupancy=None if occupancy is None else occupancy.coarser((field.depth, field.height, field.width)),
         )
-
-    @staticmethod
-    def exists_for(signal_model: TomographySignal) -> bool:
-        """Whether field and projector know half the resolution, and there are voxels to save."""
-        field, projector = signal_model.field, signal_model.projector
-        large = min(field.width, projector.detector_width) >= _LEAST
-        return large and isinstance(projector, SliceProjector) and field.coarser() is not None
 
     def pixels(self, images: Tensor) -> Tensor:
         """Those that are fitted, of images (tilt, u, y)."""

@@ -58,7 +58,7 @@ def images_of(model):
 @pytest.mark.parametrize("shape", _SHAPES)
 def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
     model = smooth_model(shape, occupancy=occupancy, offset=offset, detector_width=shape[2] + 5)
-    half = HalfResolution(model)
+    half = HalfResolution.of(model)
     seen, expected = images_of(half.signal_model), half.pixels(images_of(model))
     assert seen.shape == expected.shape
     assert 4 * seen.numel() <= 1.1 * model.num_pixels
@@ -74,12 +74,12 @@ def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
 def test_total_variation_weighs_as_much():
     model = smooth_model((64, 64, 64))
     model.smoothing = 1e-3
-    half = HalfResolution(model).signal_model
+    half = HalfResolution.of(model).signal_model
     assert float(half.penalty()) == pytest.approx(float(model.penalty()), rel=0.08)
 
 
 def test_pixels_come_from_everywhere_and_are_as_they_were():
-    half = HalfResolution(smooth_model(_SHAPES[0]))
+    half = HalfResolution.of(smooth_model(_SHAPES[0]))
     images = torch.arange(len(_ANGLES) * 64 * 40).view(len(_ANGLES), 64, 40)
     picked = half.pixels(images)
     columns, rows = picked // 40 % 64, picked % 40
@@ -93,7 +93,7 @@ def test_pixels_come_from_everywhere_and_are_as_they_were():
 
 def test_what_is_learnt_is_learnt_for_both():
     model = smooth_model(_SHAPES[1])
-    half = HalfResolution(model).signal_model
+    half = HalfResolution.of(model).signal_model
     before = model.volume()
     (half.signal().mean() + half.penalty()).backward()
     assert model.field.grids[-1].grad is None
@@ -106,7 +106,7 @@ def test_what_is_learnt_is_learnt_for_both():
 
 def test_the_full_resolution_begins_around_what_was_found():
     model = smooth_model(_SHAPES[0], occupancy=True)
-    HalfResolution(model).hand_over()
+    HalfResolution.of(model).hand_over()
     something = (model.field.volume() > 0.3 * model.field.scale).transpose(1, 2)
     assert something.any()
     assert model.occupancy.mask[something].all()
@@ -115,15 +115,12 @@ def test_the_full_resolution_begins_around_what_was_found():
 
 def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
     model = smooth_model(_SHAPES[0])
-    assert HalfResolution.exists_for(model)
+    assert HalfResolution.of(model)
     small = smooth_model((24, 24, half_resolution._LEAST - 1))
     voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
     blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
     for other in (small, voxels, blurred):
-        assert not HalfResolution.exists_for(other)
-    for other in (voxels, blurred):
-        with pytest.raises(ValueError, match="half as fine"):
-            HalfResolution(other)
+        assert HalfResolution.of(other) is None
 
 
 @pytest.mark.parametrize(
