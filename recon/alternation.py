@@ -93,15 +93,18 @@ class Alternation:
             noise_model: the model of choice, learnt; fitted further in place.
             num_steps: of the signal, unless it takes more turns.
             quiet: whether there is little noise; the simple one then settles the signal first.
-            progress: called with the steps done and a note.
+            progress: called with what is done, as a number of `num_steps`, and a note.
         """
+        if progress is not None:
+            more = sum(_SETTLING) - num_steps // 4 if quiet else 0
+            progress = partial(_in_all, progress, num_steps, num_steps + more)
         if quiet:
             begun = num_steps // 4
             self.settle(first, final=first is noise_model, thoroughly=True, progress=progress)
         else:
             begun = self.begin(first, noise_model, num_steps=num_steps, progress=progress)
-        rate = WARM if quiet else SECOND
-        return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=begun, progress=progress)
+        rate, told = (WARM, sum(_SETTLING)) if quiet else (SECOND, begun)
+        return self.alternate(noise_model, num_steps=num_steps - begun, rate=rate, begun=told, progress=progress)
 
     def begin(
         self, first: nn.Module, noise_model: nn.Module, *, num_steps: int, progress: Progress | None = None
@@ -153,7 +156,7 @@ class Alternation:
             final: whether it is the model of choice, too; else the steps that follow are calmer the less noise there is.
             thoroughly: go all the way.
             known: the noise of choice, if it is known: unless it looks at whole images, the first stage is then enough.
-            progress: called with the steps of a stage and a note.
+            progress: called with the steps done and a note.
 
         Returns:
             Whether there is little noise: what is left is small beside the contrast of the signal.
@@ -164,8 +167,9 @@ class Alternation:
         self.refine(first, standardise=True, num_steps=_START)
         for stage, num_steps in enumerate(_SETTLING):
             holding = frozen(held if thoroughly or stage >= _ENOUGH else nn.Identity())
+            later = None if progress is None else partial(_continue, progress, sum(_SETTLING[:stage]))
             with self._half_resolution(first, wanted=stage == 0) as task, holding:
-                result = task.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=progress)
+                result = task.fit_signal(first, num_steps=num_steps, rate=_NEXT_RATE**stage, progress=later)
             if known is not None:
                 break
             history = list(result.history.values())
@@ -240,6 +244,10 @@ class Alternation:
 
 def _continue(progress: Progress, done: int, step: int, note: str) -> None:
     progress(done + step, note)
+
+
+def _in_all(progress: Progress, total: int, expected: int, step: int, note: str) -> None:
+    progress(min(total, round(step * total / expected)), note)
 
 
 @contextmanager

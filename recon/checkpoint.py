@@ -85,9 +85,15 @@ class Journal:
         models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
         if not self._fresh and finished.exists():
             return _replay(read_state(finished), models, generator)
-        title = f"choosing, fit {self._num_fits}" if options.pop("progress", None) is None else "fitting the volume"
-        options |= {"progress": self._progress(title, options.get("num_steps", 500)), "resume": self._current()}
-        options |= {"digitise": False, "checkpoint": self._write_current, "checkpoint_interval": self.interval}
+        if options.get("progress") is None:
+            title = "choosing" if isinstance(signal, nn.Module) else "learning the noise"
+            options["progress"] = self.progress(f"{title}, fit {self._num_fits}", options.get("num_steps", 500))
+        options |= {
+            "resume": self._current(),
+            "digitise": False,
+            "checkpoint": self._write_current,
+            "checkpoint_interval": self.interval,
+        }
         self.in_fit = True
         result = fit(noise_model, signal, observation, **options)
         self.in_fit = False
@@ -103,7 +109,7 @@ class Journal:
     def run_stage(self, title: str, stage: Stage) -> None:
         """Take the steps of a stage that are left, told of and kept as those of a fit."""
         self._num_fits += 1
-        finished, report = self._finished(self._num_fits), self._progress(title, stage.num_steps)
+        finished, report = self._finished(self._num_fits), self.progress(title, stage.num_steps)
         if not self._fresh and finished.exists():
             stage.load_state(read_state(finished))
             return
@@ -124,6 +130,17 @@ class Journal:
         self.in_fit = False
         self._write(finished, stage.state())
         (self.folder / _CURRENT).unlink(missing_ok=True)
+
+    def progress(self, title: str, total: int) -> Callable[[int, str], None]:
+        """Tells of the steps of one piece of work, and stops it where that is asked for."""
+
+        def progress(done: int, note: str) -> None:
+            if self.report is not None:
+                self.report(title, done, total, note)
+            if self.stop_requested:
+                raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
+
+        return progress
 
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
@@ -161,15 +178,6 @@ class Journal:
         with atomic_path(self.folder / _RUN) as partial:
             partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
         self._fresh = False
-
-    def _progress(self, title: str, total: int) -> Callable[[int, str], None]:
-        def progress(done: int, note: str) -> None:
-            if self.report is not None:
-                self.report(title, done, total, note)
-            if self.stop_requested:
-                raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
-
-        return progress
 
     def _check_settings(self) -> None:
         advice = f"give the same input and options, or leave out --resume to start over ({self.folder})"

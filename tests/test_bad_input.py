@@ -142,7 +142,7 @@ def test_truncation_at_every_kilobyte_is_told(name: str, files: dict[str, Path],
 
 
 def test_a_whole_process_answers_in_one_line(files: dict[str, Path], tmp_path: Path) -> None:
-    line = "-m noiseflow.cli sample {good}/model.safetensors {bad}/absurd.mrc -o {out}/n.mrc"
+    line = "-m noiseflow sample {good}/model.safetensors {bad}/absurd.mrc -o {out}/n.mrc"
     done = subprocess.run([sys.executable, *words(line, files, tmp_path)], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stdout == ""

@@ -114,7 +114,7 @@ def test_a_program_that_is_stopped_ends_with_130(number: signal.Signals, good: P
     command = [
         sys.executable,
         "-m",
-        "noiseflow.cli",
+        "noiseflow",
         "reconstruct",
         good / "series" / "tilts.mrc",
         "-o",

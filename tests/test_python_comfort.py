@@ -243,7 +243,7 @@ def test_units_of_a_model_survive_its_file(tmp_path: Path) -> None:
 
 
 def program(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "noiseflow.cli", *words]
+    command = [sys.executable, "-m", "noiseflow", *words]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
 
 

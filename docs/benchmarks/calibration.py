@@ -274,7 +274,7 @@ def speed(size: int = 1024) -> dict[str, Any]:
         files = ["--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/model.safetensors"]
         started = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-m", "noiseflow.cli", "calibrate", *files, "--report", f"{folder}/report", "--json"],
+            [sys.executable, "-m", "noiseflow", "calibrate", *files, "--report", f"{folder}/report", "--json"],
             check=True,
             capture_output=True,
             text=True,

@@ -24,7 +24,7 @@ COMMANDS = {
     "import torch": [sys.executable, "-c", "import torch"],
     "import noiseflow": [sys.executable, "-c", "import noiseflow"],
     "all of noiseflow": [sys.executable, "-c", "import noiseflow; [getattr(noiseflow, n) for n in noiseflow.__all__]"],
-    "noiseflow -h": [sys.executable, "-m", "noiseflow.cli", "-h"],
+    "noiseflow -h": [sys.executable, "-m", "noiseflow", "-h"],
 }
 
 

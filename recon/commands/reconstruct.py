@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, step_report
+from noiseflow.console import DeviceOption, JsonOption, Output, Progress, SeedOption, choose_device, step_report
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import memory_line, open_journal, scratch_beside, stoppable, warnings_as_lines
 
@@ -179,15 +179,21 @@ def _solve(
 ) -> tuple[Outcome, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
     from recon.blocks import reconstruct_in_blocks
+    from recon.joint import JointReconstructor
     from recon.methods import reconstruct
     from recon.report import even_odd
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
+
+    def progress(title: str) -> Progress:
+        return journal.progress(title, options["num_steps"] or JointReconstructor.num_steps)
+
     if "scratch" in options:
-        return reconstruct_in_blocks(tilt_series, grid, **options, progress=lambda done, note: None), None
-    outcome = reconstruct(tilt_series, grid, **options, progress=lambda done, note: None)
+        return reconstruct_in_blocks(tilt_series, grid, **options, progress=progress("fitting a block")), None
+    outcome = reconstruct(tilt_series, grid, **options, progress=progress("fitting the volume"))
     if not fsc:
         return outcome, None
+    options["progress"] = progress("fitting half of the tilts")
     first, second = (reconstruct(half, grid, **options).volume for half in even_odd(tilt_series))
     return outcome, (first, second)
 

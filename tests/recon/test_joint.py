@@ -36,6 +36,17 @@ def small_signal_model(weight=1.0):
     return TomographySignal(VoxelField((5, 4, 6), scale=0.1), projector, Transmission(), weight=weight)
 
 
+@pytest.mark.parametrize("quiet", [False, True])
+def test_progress_counts_up_to_the_steps_that_were_asked_for(scene, quiet):
+    _, clean, noisy = scene
+    told = []
+    fit = JointReconstructor(weight=0.4, noise_model=noiseflow.Gaussian, num_steps=40)
+    fit(clean if quiet else noisy, progress=lambda done, note: told.append(done))
+    assert told == sorted(told)
+    assert told[0] <= 1
+    assert told[-1] == 40
+
+
 def test_signal_model_keeps_its_contract():
     model = small_signal_model()
     pixels = torch.tensor([0, 17, 5, 71])

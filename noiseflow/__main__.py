@@ -1,0 +1,5 @@
+"""``python -m noiseflow``: the command line."""
+
+from noiseflow.cli import main
+
+main()
