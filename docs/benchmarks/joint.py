@@ -35,7 +35,7 @@ SPEED: dict[str, Callable[[], dict[str, Any]]] = {
     "scaling": lambda: joint_speed.scaling([64, 96, 128, 192]),
     "scaling-quick": lambda: joint_speed.scaling([64, 96, 128]),
     "skipping-shells": lambda: joint_speed.skipping("shells", 96),
-    "skipping-shells-192": lambda: joint_speed.skipping("shells", 192, repeats=1),
+    "skipping-shells-192": lambda: joint_speed.skipping("shells", 192),
     "skipping-slab": lambda: joint_speed.skipping("slab", 96),
     "steps-shells": lambda: joint_speed.steps("shells", 96),
     "steps-shells-192": lambda: joint_speed.steps("shells", 192),
