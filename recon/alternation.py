@@ -24,7 +24,7 @@ from recon.signal_model import TomographySignal
 Progress = Callable[[int, str], None]
 # Learning rates of a second and of a late fit, relative to a rough start's: Adam's first steps are as large where little is left.
 SECOND, WARM = 0.5, 0.25
-# Of an offset at a rough start: a slab that fills every image looks nearly the same with a little more of it.
+# Of an offset at a rough start without vacuum: a slab that fills every image looks nearly the same with a little more of it.
 _HASTE = 4.0
 _WARM_UP = 0.1  # of the steps, but from a rough start
 _SETTLING = (40, 80, 160, 320)  # steps
@@ -73,10 +73,11 @@ class Alternation:
 
     def fit_signal(self, noise_model: nn.Module, *, rate: float, **options: Any) -> FitResult:
         """Fit volume and noise model at so many times the usual learning rate of the volume, and calmer where there is little
-        noise; from a rough start, an offset learns faster, for it has a long way to go."""
+        noise; from a rough start, an offset learns faster where no vacuum shows it, for it has a long way to go."""
         usual, of_response = self.signal_model.learning_rate, self.signal_model.response_rate
         self.signal_model.learning_rate = usual * rate * self.calm
-        if rate >= 1 and isinstance(self.signal_model.image_formation, Linear):
+        hidden = self.signal_model.occupancy is None and isinstance(self.signal_model.image_formation, Linear)
+        if rate >= 1 and hidden:
             self.signal_model.response_rate = _HASTE * of_response
         try:
             return self.fit(noise_model, standardise=False, warm_up=_WARM_UP if rate < 1 else 0.0, **options)

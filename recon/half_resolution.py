@@ -11,7 +11,7 @@ from recon.occupancy import Occupancy
 from recon.projector import SliceProjector
 from recon.signal_model import TomographySignal
 
-_LEAST = 48  # voxels; small lattices take no time
+_LEAST = 96  # voxels; smaller lattices take little time, and half of their resolution loses too much
 
 
 class HalfResolution:

@@ -26,6 +26,12 @@ from recon.signal_model import TomographySignal
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+
+@pytest.fixture(autouse=True)
+def _small_lattices_too(monkeypatch):
+    monkeypatch.setattr(half_resolution, "_LEAST", 48)
+
+
 _ANGLES = np.arange(-60, 61, 8.0)
 _SHAPES = [(48, 40, 64), (50, 39, 63), (49, 42, 61)]  # (depth, height, width)
 
