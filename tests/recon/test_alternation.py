@@ -8,6 +8,7 @@ import torch
 from noiseflow import Digitised, FitResult, Gaussian, Mixture, PoissonGaussian, SignalDependentGaussian
 from recon.alternation import Alternation
 from recon.image_formation import Linear, Transmission
+from recon.occupancy import Occupancy
 
 
 @pytest.mark.parametrize(("signal_nll", "turns"), [([1.0, 1.0], 2), ([1.0, 0.99], 2), ([1.0, 0.5, 0.5], 3)])
@@ -25,6 +26,7 @@ def test_turns_go_on_while_they_gain(signal_nll: list[float], turns: int) -> Non
 
     signal_model = SimpleNamespace(
         image_formation=None,
+        occupancy=None,
         learning_rate=1.0,
         response_rate=0.04,
         signal=lambda: torch.zeros(5 * 8 * 8),
@@ -53,7 +55,12 @@ def test_steps_are_calmer_the_less_noise_there_is(noise: float) -> None:
         return FitResult(noise_model, history={0: 1.0, 1: 1.0}, held_out_nll=1.0, num_steps=options["num_steps"])
 
     signal_model = SimpleNamespace(
-        learning_rate=1.0, response_rate=0.04, signal=lambda: signal, image_formation=offset, release=lambda: None
+        learning_rate=1.0,
+        response_rate=0.04,
+        signal=lambda: signal,
+        image_formation=offset,
+        occupancy=None,
+        release=lambda: None,
     )
     task = Alternation(signal_model, observation, None, 0, run_fit, coarse_to_fine=False)
     assert task.settle(Gaussian(), final=True) == (noise < 0.2)
@@ -90,8 +97,13 @@ def test_a_width_at_every_signal_is_read_off_anew(noise_model: torch.nn.Module, 
     assert seen == [anew]
 
 
-@pytest.mark.parametrize(("rate", "formation", "hasty"), [(1.0, "linear", 4), (0.5, "linear", 1), (1.0, "other", 1)])
-def test_an_offset_learns_faster_from_a_rough_start(rate: float, formation: str, hasty: float) -> None:
+@pytest.mark.parametrize(
+    ("rate", "formation", "vacuum", "hasty"),
+    [(1.0, "linear", False, 4), (1.0, "linear", True, 1), (0.5, "linear", False, 1), (1.0, "other", False, 1)],
+)
+def test_an_offset_that_no_vacuum_shows_learns_faster_from_a_rough_start(
+    rate: float, formation: str, vacuum: bool, hasty: float
+) -> None:
     seen = []
 
     def run_fit(noise_model, signal, observation, **options):
@@ -99,7 +111,10 @@ def test_an_offset_learns_faster_from_a_rough_start(rate: float, formation: str,
         return FitResult(noise_model)
 
     response = Linear() if formation == "linear" else Transmission()
-    model = SimpleNamespace(image_formation=response, learning_rate=1.0, response_rate=0.04, release=lambda: None)
+    occupancy = Occupancy(torch.ones(1, 1, 1), (4, 4, 4)) if vacuum else None
+    model = SimpleNamespace(
+        image_formation=response, occupancy=occupancy, learning_rate=1.0, response_rate=0.04, release=lambda: None
+    )
     Alternation(model, torch.zeros(5, 8, 8), None, 0, run_fit).fit_signal(Gaussian(), rate=rate, num_steps=1)
     assert seen == [pytest.approx(0.04 * hasty)]
     assert model.response_rate == 0.04
