@@ -75,8 +75,8 @@ class JointReconstructor:
         num_steps: steps of the fit.
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
-        coarse_to_fine: whether the first half of the steps is taken at half the resolution, where the field knows it; without
-            defocus.
+        coarse_to_fine: whether the first half of the steps is taken at half the resolution, where the field knows it and is 96
+            voxels wide or more; without defocus.
         defocus: blur to model, pixels per voxel out of the plane of focus, see `recon.defocused_projector.DefocusedProjector`.
         slab: slices used to choose; by default 24, or more where a weight is chosen and they are small.
         settled: a signal model fitted to other slices of the same series; its weight, response and scale are kept.
