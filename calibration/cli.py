@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, progress_bar
+from noiseflow.commands.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, progress_bar
 
 if TYPE_CHECKING:
-    from calibration.aligned import AlignedPair
-    from calibration.models import ModelScore
+    from calibration.detector.models import ModelScore
+    from calibration.detector.posterior import Interval
     from calibration.pipeline import Findings
-    from calibration.posterior import Interval
+    from calibration.registration.aligned import AlignedPair
 
 
 def calibrate(
@@ -41,10 +41,10 @@ def calibrate(
     """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
-    from calibration.models import require_kind
-    from calibration.report import write_report
+    from calibration.detector.models import require_kind
+    from calibration.report.page import write_report
     from noiseflow.io import check_folder, check_output
-    from noiseflow.model_files import MODEL_SUFFIXES
+    from noiseflow.io.model_files import MODEL_SUFFIXES
 
     check_output(output, suffixes=MODEL_SUFFIXES)
     if report is not None:
@@ -97,7 +97,7 @@ def _device(name: str) -> Any:
 
 
 def _tell(out: Output, findings: Findings) -> None:
-    from calibration.report import (
+    from calibration.report.page import (
         TABLE_HEADER,
         describe_burst,
         describe_detector,
@@ -118,8 +118,8 @@ def _tell(out: Output, findings: Findings) -> None:
 
 
 def _detector(findings: Findings) -> dict[str, Any] | None:
-    from calibration.detector import EXCESS_NOISE
-    from calibration.report import unknown_read_noise
+    from calibration.detector.measure import EXCESS_NOISE
+    from calibration.report.page import unknown_read_noise
 
     detector = findings.detector
     if detector is None:
@@ -144,7 +144,7 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
 
 
 def _registration(pair: AlignedPair) -> dict[str, Any]:
-    from calibration.residual import structured_share
+    from calibration.detector.residual import structured_share
 
     found = pair.registration
     names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")

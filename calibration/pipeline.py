@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.aligned import AlignedPair, align_pair
-from calibration.bursts import BurstReport, align_burst
-from calibration.detector import Detector, measure_detector
-from calibration.exposures import Burst, ExposurePair, Image
-from calibration.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
-from calibration.photon_transfer import NotMeasurable
+from calibration.detector.measure import Detector, measure_detector
+from calibration.detector.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
+from calibration.detector.photon_transfer import NotMeasurable
+from calibration.exposures.frames import Burst, ExposurePair, Image
+from calibration.registration.aligned import AlignedPair, align_pair
+from calibration.registration.bursts import BurstReport, align_burst
 from noiseflow.described import described
 
 if TYPE_CHECKING:
-    from noiseflow.console import Progress
+    from noiseflow.commands.console import Progress
 
 Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
 """``bar(title, total)``: a context that gives a progress callback."""

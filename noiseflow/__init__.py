@@ -5,6 +5,9 @@ Names load on first use, so importing the package costs nothing and ``noiseflow 
 
 import lazy_loader as _lazy
 
+from noiseflow._moved import MOVED as _MOVED
+from noiseflow.moved import keep_old_paths as _keep_old_paths
+
 _load, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 
 
@@ -13,4 +16,11 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("noiseflow")
+    if name == "adapters":
+        from importlib import import_module
+
+        return import_module("noiseflow.adapters")
     return _load(name)
+
+
+_keep_old_paths("noiseflow", _MOVED)

@@ -1,5 +1,5 @@
 """``python -m noiseflow``: the command line."""
 
-from noiseflow.cli import main
+from noiseflow.commands.cli import main
 
 main()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from noiseflow.distributions import NoiseDistribution
+    from noiseflow.distributions.base import NoiseDistribution
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from noiseflow.cli import build_app
+from noiseflow.commands.cli import build_app
 
 
 def run_command(*arguments: object) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from noiseflow.cli import main
+from noiseflow.commands.cli import main
 
 DATA = Path(__file__).parent.parent / "noiseflow" / "data"
 

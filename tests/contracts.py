@@ -65,7 +65,7 @@ def check_noise_model(model: nn.Module, signals: Tensor, *, seed: int = 0) -> No
 
 def check_sampler(model: nn.Module, signals: Tensor, draws: Tensor) -> None:
     """Kolmogorov–Smirnov: the draws follow the model's own CDF (at a level that one run in 10⁵ misses)."""
-    from noiseflow.metrics import kolmogorov_smirnov, probability_integral_transform
+    from noiseflow.metrics.evaluation import kolmogorov_smirnov, probability_integral_transform
 
     for column in range(signals.numel()):
         observed = draws[:, column].contiguous()

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import torch
 
-from noiseflow import console
-from noiseflow.cli import main
+from noiseflow.commands import console
+from noiseflow.commands.cli import main
 
 FORK = multiprocessing.get_context("fork")
 

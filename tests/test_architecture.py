@@ -31,7 +31,7 @@ def test_imports_go_one_way(package: str) -> None:
 
 def test_help_answers_without_torch() -> None:
     code = (
-        "import sys; from noiseflow.cli import build_app; build_app(); "
+        "import sys; from noiseflow.commands.cli import build_app; build_app(); "
         "sys.exit(any(name in sys.modules for name in ('torch', 'scipy', 'matplotlib', 'cv2')))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

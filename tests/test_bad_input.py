@@ -19,7 +19,7 @@ import calibration
 import noiseflow
 import recon
 from noiseflow import io
-from noiseflow.cli import main
+from noiseflow.commands.cli import main
 from tests.bad_cases import ROWS, USAGE
 from tests.bad_files import make_bad_files, make_good_files
 

@@ -17,7 +17,7 @@ import typer.main
 
 import noiseflow
 from noiseflow import io
-from noiseflow.cli import build_app
+from noiseflow.commands.cli import build_app
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs" / "guide").glob("*.md")])

@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import calibration.report
+import calibration.report.page
 import noiseflow
-import recon.benchmark_named
+import recon.benchmarks.named
 import recon.commands.results
-import recon.streaming
-from noiseflow import cli, console, io
-from recon.checkpoint import Journal
+import recon.simulate.streaming
+from noiseflow import io
+from noiseflow.commands import cli, console
 from recon.commands.running import StopSignal
+from recon.joint.checkpoint import Journal
 from tests.bad_files import make_good_files
 from tests.processes import finish, start
 
@@ -37,7 +38,7 @@ COMMANDS = {
     "benchmark": "--quick --size 12 --out {out}/benchmark",
     "demo": "--out {out}/demo",
 }
-LOADED = (calibration.report, recon.benchmark_named, recon.commands.results, recon.streaming)
+LOADED = (calibration.report, recon.benchmarks.named, recon.commands.results, recon.simulate.streaming)
 SPAN = {"sample": 0.3, "simulate": 0.8, "compare": 2.0, "evaluate": 4.0, "reconstruct": 6.0}
 """Seconds to stop within; about as long as the command takes, or some of the longer ones' many."""
 
@@ -134,7 +135,7 @@ def test_a_program_that_is_stopped_ends_with_130(number: signal.Signals, good: P
 def test_ctrl_c_while_an_object_is_cleared_away_is_not_lost() -> None:
     program = """
 import os, signal, time
-from noiseflow.cli import _keep_ctrl_c
+from noiseflow.commands.cli import _keep_ctrl_c
 
 class Cleared:
     def __del__(self):

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow import commands, console
-from noiseflow.cli import main
+from noiseflow.commands import console
+from noiseflow.commands import sampling as commands
+from noiseflow.commands.cli import main
 from tests.bad_files import ANGLES, make_good_files
 
 COLUMNS = 80

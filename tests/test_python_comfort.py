@@ -18,8 +18,8 @@ import calibration
 import noiseflow
 import recon
 from noiseflow import metrics
-from noiseflow.selection import select
-from noiseflow.spatial import spatial_structure
+from noiseflow.fitting.selection import select
+from noiseflow.metrics.spatial import spatial_structure
 
 RANDOM = np.random.default_rng(0)
 SIGNAL = RANDOM.uniform(20, 200, (40, 48)).astype(np.float32)
@@ -84,8 +84,8 @@ def test_noise_models_return_what_they_are_given(name: str, make: Callable[[], t
     [
         (lambda x: projector()(x), VOLUME),
         (lambda x: projector().T(x), RANDOM.random((7, 5, 8), dtype=np.float32)),
-        (lambda x: recon.sirt(x, projector(), num_iterations=3), RANDOM.random((7, 5, 8), dtype=np.float32)),
-        (lambda x: recon.wbp(x, projector()), RANDOM.random((7, 5, 8), dtype=np.float32)),
+        (lambda x: recon.projection.sirt(x, projector(), num_iterations=3), RANDOM.random((7, 5, 8), dtype=np.float32)),
+        (lambda x: recon.projection.wbp(x, projector()), RANDOM.random((7, 5, 8), dtype=np.float32)),
         (lambda x: recon.total_variation(x, smoothing=0.1), VOLUME),
         (lambda x: recon.fourier_shell_correlation(x, x), VOLUME),
         (lambda x: metrics.pixel_log_prob(noiseflow.Gaussian(), x, x), SIGNAL.ravel()),
@@ -274,7 +274,7 @@ def test_package_modules_are_found_lazily() -> None:
 
 
 def test_version_is_told_by_the_package_as_by_the_program(capsys: pytest.CaptureFixture[str]) -> None:
-    from noiseflow.cli import main
+    from noiseflow.commands.cli import main
 
     with pytest.raises(SystemExit):
         main(["--version"])

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
-from recon.methods import reconstruct
-from recon.report import even_odd, reconstruction_report
-from recon.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.tilt_series import Volume, VolumeGrid
+from recon.methods.methods import reconstruct
+from recon.report.page import even_odd, reconstruction_report
+from recon.series.tilt_series import Volume, VolumeGrid
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 SIZE = 20
 USER_TEXT = "<script>alert(1)</script></script><b>&\"'"

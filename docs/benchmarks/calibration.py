@@ -133,7 +133,7 @@ def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict
 def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     """One simulated Poisson-Gaussian pair of random parameters, already registered, with ratio 16."""
     from calibration import ExposurePair, align_with, measure_detector
-    from calibration.align import Registration
+    from calibration.registration.align import Registration
 
     generator = np.random.default_rng(seed)
     gain, read_noise, electrons = (
@@ -234,7 +234,7 @@ def published(folder: Path) -> dict[str, float]:
 
 def predicted_variance(folder: Path, frames: Image) -> dict[str, Any]:
     """Variance of frame differences over what the maps predict: for all pixels, the dim 60 %, and those that stand still."""
-    from calibration.masks import restless
+    from calibration.exposures.masks import restless
     from noiseflow.io import read
 
     gain, offset, variance = (

@@ -26,8 +26,8 @@ import joint_speed
 import torch
 from joint_accuracy import NOISES, PHANTOMS, accuracy, fields, offset
 
-from noiseflow.console import Output
-from recon.benchmark import Results
+from noiseflow.commands.console import Output
+from recon.benchmarks.scenes import Results
 
 RESULTS = Path(__file__).parent / "results" / "joint.json"
 SPEED: dict[str, Callable[[], dict[str, Any]]] = {

@@ -12,15 +12,15 @@ import numpy as np
 from torch import nn
 
 from noiseflow import Digitised, Gaussian
-from recon.benchmark import Scene, make_scene
-from recon.fields import Field, MultiresolutionField, VoxelField
-from recon.first_guess import contrast_slab
-from recon.joint import JointReconstructor
-from recon.metrics import compare
-from recon.noises import SkewedNoise
-from recon.phantoms import make_phantom
-from recon.simulation import ACQUISITIONS, Acquisition, add_noise, clean_tilt_series, tilt_range
-from recon.tilt_series import TiltSeries
+from recon.benchmarks.scenes import Scene, make_scene
+from recon.fields.fields import Field, MultiresolutionField, VoxelField
+from recon.joint.joint import JointReconstructor
+from recon.metrics.metrics import compare
+from recon.series.first_guess import contrast_slab
+from recon.series.tilt_series import TiltSeries
+from recon.simulate.noises import SkewedNoise
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, Acquisition, add_noise, clean_tilt_series, tilt_range
 
 PHANTOMS = ("shells", "virions", "filaments", "particles", "slab")
 NOISES = ("clipped", "skewed", "outliers", "low-dose", "8-bit")

@@ -13,14 +13,14 @@ import torch
 
 from noiseflow import Gaussian, fit
 from noiseflow.kept_memory import kept_memory
-from recon.benchmark import in_turn, make_scene
-from recon.coordinate_network import CoordinateNetwork
-from recon.fields import MultiresolutionField, VoxelField
-from recon.joint import JointReconstructor
-from recon.metrics import compare
-from recon.presets import PRESETS
-from recon.projector import SliceProjector
-from recon.signal_model import TomographySignal
+from recon.benchmarks.scenes import in_turn, make_scene
+from recon.fields.coordinate_network import CoordinateNetwork
+from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.joint.joint import JointReconstructor
+from recon.joint.signal_model import TomographySignal
+from recon.methods.kniesel2022.presets import PRESETS
+from recon.metrics.metrics import compare
+from recon.projection.projector import SliceProjector
 
 TILTS = "-59.5:58:1.5"
 _EIGHTY = np.linspace(-60, 60, 80)
@@ -179,7 +179,7 @@ def _bandwidth(ours: SliceProjector, columns: torch.Tensor, rays: torch.Tensor, 
 
 
 class _Astra:
-    """ASTRA's CPU projector of one slice (Joseph's interpolation), as in `recon.external`."""
+    """ASTRA's CPU projector of one slice (Joseph's interpolation), as in `recon.benchmarks.external`."""
 
     def __init__(self, size: int) -> None:
         import astra

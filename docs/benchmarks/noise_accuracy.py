@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.console import Output
-from noiseflow.selection import select
+from noiseflow.commands.console import Output
+from noiseflow.fitting.selection import select
 
 OURS = ("Gaussian", "SignalDependentGaussian", "PoissonGaussian", "Mixture", "RadialFlow", "SplineFlow", "PhysicsFlow")
 MODELS = ("automatic", *OURS, "zuko", "normflows", "paper", "paper-as-published")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.console import Output
+from noiseflow.commands.console import Output
 
 SIMULATED = ("gamma", "electrons-50-0.5")
 EXPOSURES = tuple((channel, time) for channel in (1, 2, 3) for time in ("010", "050"))

@@ -29,7 +29,7 @@ from noise_accuracy import MODELS, NOISES, measure, search
 from noise_exposures import exposures
 from noise_speed import speed
 
-from noiseflow.console import Output, choose_device
+from noiseflow.commands.console import Output, choose_device
 from noiseflow.io import atomic_path
 
 RESULTS = Path(__file__).parent / "results" / "noise_models.json"

@@ -14,7 +14,7 @@ from noise_truths import clean_image, noises
 from torch import Tensor, nn
 
 from noiseflow import metrics
-from noiseflow.console import Output
+from noiseflow.commands.console import Output
 
 SPEED_MODELS = ("RadialFlow", "SplineFlow", "zuko", "normflows", "paper")
 SAMPLE_SIDE, LOG_PROB_COUNT, RIVAL_COUNT = 1000, 10_000_000, 1_000_000

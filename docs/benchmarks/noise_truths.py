@@ -65,8 +65,8 @@ class Analytic(nn.Module):
         super().__init__()
         self.scale = scale
 
-    def forward(self, signal: Tensor) -> noiseflow.baselines.GaussianDistribution:
-        return noiseflow.baselines.GaussianDistribution(signal, torch.log(self.scale(signal)))
+    def forward(self, signal: Tensor) -> noiseflow.models.baselines.GaussianDistribution:
+        return noiseflow.models.baselines.GaussianDistribution(signal, torch.log(self.scale(signal)))
 
 
 def growing(signal: Tensor) -> Tensor:

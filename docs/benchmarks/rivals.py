@@ -19,8 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from noiseflow.io import atomic_path
-from recon import benchmark_ablations, benchmark_needle, benchmark_paper, benchmark_rivals, benchmark_search
-from recon.benchmark import Results
+from recon.benchmarks import ablations as benchmark_ablations
+from recon.benchmarks import needle as benchmark_needle
+from recon.benchmarks import paper as benchmark_paper
+from recon.benchmarks import rivals as benchmark_rivals
+from recon.benchmarks import search as benchmark_search
+from recon.benchmarks.scenes import Results
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"

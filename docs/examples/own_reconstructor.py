@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import noiseflow
-from noiseflow.console import progress_bar
+from noiseflow.commands.console import progress_bar
 from noiseflow.report import new_figure, show_image
 
 DATA = Path(noiseflow.__file__).parent / "data" / "exposures_miro"

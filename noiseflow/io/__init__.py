@@ -13,8 +13,8 @@ from .files import check_folder as check_folder
 from .files import check_output as check_output
 from .files import require_other as require_other
 from .folder import files_of as files_of
-from .images import SUFFIXES as SUFFIXES
-from .images import ImageFile as ImageFile
+from .image_file import SUFFIXES as SUFFIXES
+from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import text_lines
-from noiseflow.io.images import ImageFile
+from noiseflow.io.image_file import ImageFile
 
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")

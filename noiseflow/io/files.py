@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from noiseflow.io.image_file import WRITE_SUFFIXES
 from noiseflow.io.partials import clear_leftovers, partial_prefix
 
 
@@ -27,8 +28,6 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
-    from noiseflow.io.images import WRITE_SUFFIXES
-
     suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
     path = Path(path)
     if path.suffix.lower() not in suffixes:

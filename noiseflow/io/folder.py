@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.images import SUFFIXES, ImageFile, read
+from noiseflow.io.image_file import SUFFIXES, ImageFile
 
 _NUMBER = re.compile(r"([-+]*)(\d+(?:\.\d+)?)")
 _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 
-def read_folder(folder: Path) -> ImageFile:
+def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
     """Stack the images of a folder; files of another type than most are left out.
+
+    Args:
+        folder: of the images.
+        read: reads one of them.
 
     Raises:
         ValueError: fewer than two images, or images of different sizes.

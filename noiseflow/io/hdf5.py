@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from noiseflow.io.checks import require_room
-from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, recorded_angles
 from noiseflow.io.microscope import choose_member
 from noiseflow.io.units import in_angstrom

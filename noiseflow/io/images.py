@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,45 +12,24 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, as_array
 from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
+from noiseflow.io.image_file import (
+    HDF5_SUFFIXES,
+    MICROSCOPE_SUFFIXES,
+    MRC_SUFFIXES,
+    SUFFIXES,
+    TIFF_SUFFIXES,
+    ImageFile,
+    VoxelSize,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".rec", ".map"})
-TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
-MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
-HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
-WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
-SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
 _NO_IMAGES = {
     **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), "a file of tilt angles (--angles)"),
     ".xf": "a file of alignments (--transforms)",
     ".safetensors": "a noise model",
 }
-
-VoxelSize = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class ImageFile:
-    """What an image file holds.
-
-    Attributes:
-        data: the pixels in the file's own number type, (y, x) or (section, y, x).
-        voxel_size: Å along each axis of ``data``'s (z, y, x), or None where the file does not say.
-        tilt_angles: (section,) degrees, or None where the file does not say.
-    """
-
-    data: NDArray[Any]
-    voxel_size: VoxelSize | None = None
-    tilt_angles: NDArray[np.float64] | None = None
-
-    def __repr__(self) -> str:
-        size = "unknown" if self.voxel_size is None else " x ".join(f"{edge:.5g}" for edge in self.voxel_size) + " Å"
-        angles = self.tilt_angles
-        tilts = "" if angles is None else f", tilts {angles.min():g}° to {angles.max():g}°"
-        shape = " x ".join(map(str, self.data.shape))
-        return f"ImageFile({shape} {self.data.dtype}, voxel size {size}{tilts})"
 
 
 def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
@@ -73,7 +51,7 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
     name, _, member = str(path).partition("::")
     path = Path(name)
     if path.is_dir() and path.suffix.lower() != ".zarr":
-        return read_folder(path)
+        return read_folder(path, read)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:

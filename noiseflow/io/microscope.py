@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, require_room
-from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
 from noiseflow.io.units import in_angstrom
 from noiseflow.io.velox import stage_angles

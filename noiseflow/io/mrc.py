@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
-from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import require_room
-from noiseflow.io.images import ImageFile
+from noiseflow.io.image_file import ImageFile
 from noiseflow.io.metadata import recorded_angles
 from noiseflow.io.microscope import choose_member
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, require_room
-from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.units import in_angstrom
 
 _SMALLEST_EDGE = 64

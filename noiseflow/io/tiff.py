@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as, require_room
-from noiseflow.io.images import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.units import in_angstrom
 
 if TYPE_CHECKING:

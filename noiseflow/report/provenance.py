@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from noiseflow.console import invocation
+from noiseflow.commands.console import invocation
 from noiseflow.io import files_of
 
 _PACKAGES = ("noiseflow", "torch", "numpy", "scipy")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.console import JsonOption, Output, SeedOption
+from noiseflow.commands.console import JsonOption, Output, SeedOption
 
 
 def benchmark(
@@ -35,8 +35,8 @@ def benchmark(
     """Measure run time against error of every method, on this machine. Stopped, it goes on where it was."""
     from dataclasses import replace
 
-    from recon.benchmark_named import BENCHMARKS, Options
-    from recon.benchmark_rivals import QUICK, Effort
+    from recon.benchmarks.named import BENCHMARKS, Options
+    from recon.benchmarks.rivals import QUICK, Effort
 
     output = Output(json)
     names = names or ["rivals"]
@@ -62,8 +62,8 @@ def benchmark(
 
 
 def _check_scene(size: int | None, noise: str, phantom: str) -> None:
-    from recon.phantoms import PHANTOMS
-    from recon.simulation import ACQUISITIONS
+    from recon.simulate.phantoms import PHANTOMS
+    from recon.simulate.simulation import ACQUISITIONS
 
     noises = [name for name, acquisition in ACQUISITIONS.items() if acquisition.noise is not None]
     if size is not None and size < 8:

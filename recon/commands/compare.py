@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.console import JsonOption, Output, progress_bar
+from noiseflow.commands.console import JsonOption, Output, progress_bar
 from recon.commands.options import parse_mode
 
 
@@ -25,9 +25,9 @@ def compare(
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
-    from recon.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
-    from recon.metrics import reach_in_words
-    from recon.tilt_series import Volume
+    from recon.metrics.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
+    from recon.metrics.metrics import reach_in_words
+    from recon.series.tilt_series import Volume
 
     output = Output(json)
     if report is not None and report.exists() and not report.is_dir():

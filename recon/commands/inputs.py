@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.console import Output, StepReport
-from recon.alignment import Alignment
-from recon.alignment_search import find_alignment
+from noiseflow.commands.console import Output, StepReport
 from recon.commands.options import parse_mode
-from recon.contrast import check_contrast
-from recon.contrast import invert_contrast as inverted
-from recon.screening import Screening, screen
-from recon.tilt_series import TiltSeries, read_tilt_series
+from recon.series.alignment import Alignment
+from recon.series.alignment_search import find_alignment
+from recon.series.contrast import check_contrast
+from recon.series.contrast import invert_contrast as inverted
+from recon.series.screening import Screening, screen
+from recon.series.tilt_series import TiltSeries, read_tilt_series
 
 
 def load_tilt_series(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import nn
 
-    from recon.tilt_series import Mode
+    from recon.series.tilt_series import Mode
 
 
 def parse_mode(text: str) -> Mode:
@@ -30,7 +30,7 @@ def method_of(method: str, preset: str | None) -> str:
     """
     if preset is None:
         return method
-    from recon.presets import PRESETS
+    from recon.methods.kniesel2022.presets import PRESETS
 
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: choose {' or '.join(PRESETS)}")

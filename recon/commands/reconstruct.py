@@ -9,14 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.console import DeviceOption, JsonOption, Output, Progress, SeedOption, choose_device, step_report
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    Progress,
+    SeedOption,
+    choose_device,
+    step_report,
+)
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import memory_line, open_journal, scratch_beside, stoppable, warnings_as_lines
 
 if TYPE_CHECKING:
-    from recon.checkpoint import Journal
-    from recon.methods import Outcome
-    from recon.tilt_series import TiltSeries, Volume, VolumeGrid
+    from recon.joint.checkpoint import Journal
+    from recon.methods.methods import Outcome
+    from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
 def reconstruct(
@@ -107,9 +115,9 @@ def reconstruct(
     from noiseflow.io import require_other
     from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
-    from recon.methods import settings_of
-    from recon.report import read_reference
-    from recon.tilt_series import VolumeGrid
+    from recon.methods.methods import settings_of
+    from recon.report.page import read_reference
+    from recon.series.tilt_series import VolumeGrid
 
     output, targets = Output(json), Targets(out, report=report, noise_model=save_noise_model)
     require_other(out, tilts, angles, transforms, mask, reference)
@@ -178,10 +186,10 @@ def _solve(
     tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
 ) -> tuple[Outcome, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
-    from recon.blocks import reconstruct_in_blocks
-    from recon.joint import JointReconstructor
-    from recon.methods import reconstruct
-    from recon.report import even_odd
+    from recon.joint.joint import JointReconstructor
+    from recon.methods.methods import reconstruct
+    from recon.report.page import even_odd
+    from recon.scale.blocks import reconstruct_in_blocks
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 import noiseflow
 from noiseflow import io
-from noiseflow.console import Output
-from noiseflow.model_files import MODEL_SUFFIXES
+from noiseflow.commands.console import Output
+from noiseflow.io.model_files import MODEL_SUFFIXES
 from recon.commands.inputs import Prepared
-from recon.methods import Outcome
-from recon.report import reconstruction_report
-from recon.tilt_series import TiltSeries, Volume
+from recon.methods.methods import Outcome
+from recon.report.page import reconstruction_report
+from recon.series.tilt_series import TiltSeries, Volume
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from noiseflow.console import START_AGAIN, end_stopped
+from noiseflow.commands.console import START_AGAIN, end_stopped
 
 if TYPE_CHECKING:
-    from noiseflow.console import Output
-    from recon.checkpoint import Journal
-    from recon.tilt_series import TiltSeries, VolumeGrid
+    from noiseflow.commands.console import Output
+    from recon.joint.checkpoint import Journal
+    from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
 class StopSignal:
@@ -110,8 +110,8 @@ def memory_line(
     Raises:
         MemoryError: it does not fit.
     """
-    from recon.blocks import block_memory
-    from recon.memory import needed_memory, require_memory
+    from recon.scale.blocks import block_memory
+    from recon.scale.memory import needed_memory, require_memory
 
     fitted = not method.startswith(("sirt", "wbp"))
     if slices_at_once is None:
@@ -132,7 +132,7 @@ def scratch_beside(out: Path) -> Iterator[Path]:
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
     """The journal of the run that makes `out`, beside it. Raises as `Journal`."""
-    from recon.checkpoint import Journal
+    from recon.joint.checkpoint import Journal
 
     folder = out.with_name(f"{out.name}.checkpoint")
     journal = Journal(folder, settings, resume=resume, interval=interval)

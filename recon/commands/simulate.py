@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.console import JsonOption, Output, SeedOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, SeedOption, progress_bar
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
     from torch import nn
 
-    from recon.simulation import Acquisition
+    from recon.simulate.simulation import Acquisition
 
 _VALIDATION, _TEST = 14, 20
 
@@ -46,8 +46,8 @@ def simulate(
 ) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles to judge by."""
     from noiseflow import io
-    from recon.simulation import angles_between, tilt_range
-    from recon.streaming import Simulation
+    from recon.simulate.simulation import angles_between, tilt_range
+    from recon.simulate.streaming import Simulation
 
     output = Output(json)
     if size < 4:
@@ -84,7 +84,7 @@ def simulate(
 def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module | None]:
     from dataclasses import replace
 
-    from recon.simulation import ACQUISITIONS
+    from recon.simulate.simulation import ACQUISITIONS
 
     acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
     if mode is not None:

@@ -11,7 +11,7 @@ from noiseflow import io
 from recon.napari.files import LayerData
 
 if TYPE_CHECKING:
-    from recon.methods import Progress
+    from recon.methods.methods import Progress
 
 _STEPS = 200
 _BUTTON = "Reconstruct"
@@ -47,8 +47,8 @@ def reconstruct_layer(
     """
     import numpy as np
 
-    from recon.methods import reconstruct
-    from recon.tilt_series import TiltSeries, VolumeGrid
+    from recon.methods.methods import reconstruct
+    from recon.series.tilt_series import TiltSeries, VolumeGrid
 
     known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
     if known is None:
@@ -74,7 +74,7 @@ def reconstruct_widget() -> Any:
     from napari.layers import Image
     from napari.viewer import Viewer
 
-    from recon.methods import METHODS
+    from recon.methods.methods import METHODS
 
     def start(
         viewer: Viewer,

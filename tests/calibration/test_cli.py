@@ -11,8 +11,8 @@ import pytest
 from scipy import ndimage
 
 import noiseflow
-from calibration.models import KINDS
-from noiseflow.cli import main
+from calibration.detector.models import KINDS
+from noiseflow.commands.cli import main
 from noiseflow.io import write
 
 from .conftest import textured_scene
@@ -111,7 +111,7 @@ def test_bad_options_are_refused_before_any_work(folder, capsys, extra, message)
 
 
 def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
-    monkeypatch.setattr("calibration.models.NUM_STEPS", 100)
+    monkeypatch.setattr("calibration.detector.models.NUM_STEPS", 100)
     model, report = folder / "out" / "m.safetensors", folder / "out" / "report"
     files = (
         "--short",
@@ -141,7 +141,7 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
 
 
 def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
-    monkeypatch.setattr("calibration.models.NUM_STEPS", 40)
+    monkeypatch.setattr("calibration.detector.models.NUM_STEPS", 40)
     model = folder / "out" / "m.safetensors"
     files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", str(model))
     assert run(*files, "--kind", "signal-gaussian") == 0
@@ -150,7 +150,7 @@ def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
 
 
 def test_burst_with_dark_frames(folder, capsys, monkeypatch, exposures):
-    monkeypatch.setattr("calibration.models.NUM_STEPS", 20)
+    monkeypatch.setattr("calibration.detector.models.NUM_STEPS", 20)
     electrons = (exposures.signal - 100) / 2
     noise = RANDOM.standard_normal
     frames = [100 + 2 * (RANDOM.poisson(electrons) + noise(electrons.shape)) for _ in range(3)]

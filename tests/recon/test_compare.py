@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from recon.comparison import compare_volumes, project
-from recon.metrics import compare, compare_images, fourier_shell_correlation, resolution
-from recon.phantoms import make_phantom
-from recon.tilt_series import Volume
+from recon.metrics.comparison import compare_volumes, project
+from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, resolution
+from recon.series.tilt_series import Volume
+from recon.simulate.phantoms import make_phantom
 from tests.commands import run_command
 
 

@@ -14,8 +14,8 @@ import torch
 import noiseflow
 import recon.commands.results  # noqa: F401  or every child process would import it again
 from noiseflow import io
-from recon.checkpoint import Journal, read_state, write_state
-from recon.stages import Repeated
+from recon.joint.checkpoint import Journal, read_state, write_state
+from recon.joint.stages import Repeated
 from tests.processes import finish, start, wait_for
 
 

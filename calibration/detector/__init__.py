@@ -1,0 +1,5 @@
+"""Gain, offset and read noise from aligned exposures, and which noise model suffices."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

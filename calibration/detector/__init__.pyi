@@ -1,0 +1,8 @@
+from .measure import EXCESS_NOISE as EXCESS_NOISE
+from .measure import FEW_ELECTRONS as FEW_ELECTRONS
+from .measure import LEAST_GAIN as LEAST_GAIN
+from .measure import Detector as Detector
+from .measure import dark_offset as dark_offset
+from .measure import measure_detector as measure_detector
+from .measure import misfit as misfit
+from .measure import readings_of as readings_of

@@ -1,0 +1,142 @@
+"""The posterior density of a detector's parameters, and its maximum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.detector.levels import Levels
+from calibration.detector.likelihood import DetectorLikelihood
+from calibration.detector.photon_transfer import fit_photon_transfer
+from calibration.exposures.frames import Image
+
+NUM_RESCALINGS = 6
+"""Rounds, at most, of maximising the likelihood and bringing the signals to the scale it prefers."""
+
+READ_NOISE_RANGE = (0.1, 300.0)
+"""Electrons rms: the prior, flat in the logarithm; from under the best detectors made to beyond the worst."""
+
+
+class LogPosterior:
+    """log p(parameters | levels) for rows of (log gain, offset or log variance, log read noise).
+
+    The data fix the line of variance against signal; along it the read noise and the offset trade places. Where nothing
+    else tells the offset, the second coordinate is the log variance at the mean signal, in which that ridge is straight. The
+    priors are flat in log gain, in log read noise within `READ_NOISE_RANGE`, and in the offset below the brightest
+    level; or the offset's is normal where it was measured.
+
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+        offset: measured offset and its standard error, counts; None: unknown.
+    """
+
+    def __init__(self, levels: Sequence[Levels], offset: tuple[float, float] | None = None) -> None:
+        self.levels, self.offset = list(levels), offset
+        self.likelihood = DetectorLikelihood(levels)
+        signal = np.concatenate([one.signal[one.dark == 0] for one in levels])
+        count = np.concatenate([one.count[one.dark == 0] for one in levels])
+        self.reference = float(np.average(signal, weights=count))
+        self.brightest = float(signal.max())
+        self.by_offset = offset is not None or any(one.common.any() for one in levels)
+
+    def __call__(self, coordinates: Image) -> NDArray[np.float64]:
+        """(W, 3) -> (W,) nats, −inf outside the prior."""
+        coordinates = np.atleast_2d(coordinates)
+        low, high = np.log(READ_NOISE_RANGE)
+        inside = (coordinates[:, 2] > low) & (coordinates[:, 2] < high) & (np.abs(coordinates[:, 0]) < 50)
+        gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
+        inside &= offset < self.brightest
+        result = np.full(len(coordinates), -np.inf)
+        if inside.any():
+            result[inside] = self.likelihood(gain[inside], offset[inside], read_noise[inside])
+        if not self.by_offset:
+            result += coordinates[:, 1] - coordinates[:, 0]  # |∂offset / ∂log variance|
+        if self.offset is not None:
+            result -= 0.5 * ((offset - self.offset[0]) / self.offset[1]) ** 2
+        return np.where(np.isnan(result), -np.inf, result)
+
+    def parameters(self, coordinates: Image) -> tuple[Image, Image, Image]:
+        """Gain, offset and read noise of rows of coordinates, each (W,)."""
+        log_gain, second, log_read = np.atleast_2d(coordinates).T
+        gain, read_noise = np.exp(log_gain), np.exp(log_read)
+        if self.by_offset:
+            return gain, second, read_noise
+        return gain, self.reference + gain * read_noise**2 - np.exp(second) / gain, read_noise
+
+    def coordinates(self, gain: ArrayLike, offset: ArrayLike, read_noise: ArrayLike) -> Image:
+        """The coordinates of parameter sets, (W, 3)."""
+        g, o, r = (np.atleast_1d(np.asarray(value, float)) for value in (gain, offset, read_noise))
+        variance = g * (self.reference - o) + (g * r) ** 2
+        second = o if self.by_offset else np.log(np.maximum(variance, np.finfo(float).tiny))
+        return np.stack([np.log(g), second, np.log(r)], -1)
+
+    def rescaled(self, best: Image) -> LogPosterior | None:
+        """The same posterior about the scales that are most likely at `best`; None if they are that already."""
+        change = self.likelihood.rescaling(*(float(value[0]) for value in self.parameters(best)))
+        moved = max((abs(factor - 1) + abs(shift) / self.brightest for factor, shift in change.values()), default=0.0)
+        if moved < 1e-4:
+            return None
+        return LogPosterior([one.rescaled(change) for one in self.levels], self.offset)
+
+
+def maximum_likelihood(
+    log_posterior: LogPosterior, start: tuple[float, float, float] | None = None
+) -> tuple[LogPosterior, Image]:
+    """The most likely coordinates.
+
+    Args:
+        log_posterior: of the levels.
+        start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
+
+    Returns:
+        The posterior about the most likely scales of the signals, and the (3,) coordinates of its maximum.
+
+    Raises:
+        NotMeasurable: the noise does not grow with the signal.
+    """
+    best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
+    for _ in range(NUM_RESCALINGS):
+        best = _climb(log_posterior, best)
+        moved = log_posterior.rescaled(best)
+        if moved is None:
+            break
+        log_posterior = moved
+    return log_posterior, best
+
+
+def _climb(log_posterior: LogPosterior, start: Image) -> Image:
+    from scipy.optimize import minimize
+
+    along_offset = 0.3 * float(np.exp(start[0])) if log_posterior.by_offset else 0.03
+    simplex = np.vstack([start, start + np.diag([0.03, along_offset, 0.2])])
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-2, "maxiter": 400}
+    found = minimize(lambda p: -float(log_posterior(p)[0]), start, method="Nelder-Mead", options=options)
+    return np.asarray(found.x)
+
+
+def _start(log_posterior: LogPosterior) -> Image:
+    """The most likely of a set of guesses along the photon-transfer line, (3,)."""
+    line = fit_photon_transfer(log_posterior.levels)
+    variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
+    guesses = []
+    for factor in (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0):
+        gain = factor * line.gain
+        for fraction in (0.02, 0.1, 0.3, 0.6, 0.9):
+            read_noise = np.sqrt(fraction * variance) / gain
+            offset = log_posterior.reference - (1 - fraction) * variance / gain
+            guesses.append((gain, offset, read_noise))
+            known = [log_posterior.offset[0]] if log_posterior.offset else _common_offsets(log_posterior.levels)
+            guesses += [(gain, value, read_noise) for value in known]
+    coordinates = log_posterior.coordinates(*np.array(guesses).T)
+    low, high = np.log(READ_NOISE_RANGE)
+    coordinates[:, 2] = np.clip(coordinates[:, 2], low + 0.1, high - 0.1)
+    values = np.concatenate([log_posterior(part) for part in np.array_split(coordinates, 7)])
+    return np.asarray(coordinates[int(np.argmax(values))])
+
+
+def _common_offsets(levels: Sequence[Levels]) -> list[float]:
+    """Offsets that the scales of pairs taken with one detector setting tell."""
+    found = {one.scales[index] for one in levels for index in one.scale[one.common]}
+    return [scale.intercept / (1 - scale.slope) for scale in found]

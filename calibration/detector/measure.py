@@ -1,0 +1,233 @@
+"""From aligned exposures to the detector's parameters: readings collected, offset measured where it can be, posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.detector.cells import collect_cells
+from calibration.detector.levels import Levels, Readings, Scale, collect_levels
+from calibration.detector.likelihood import LevelMasses
+from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
+from calibration.detector.posterior import DetectorPosterior, sample_posterior
+from calibration.exposures.frames import Burst, Image, rails, rounding_step
+from calibration.exposures.masks import Mask, clear_of_rails
+from calibration.exposures.scaling import ring_mean
+from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from noiseflow.described import described
+
+if TYPE_CHECKING:
+    from noiseflow.commands.console import Progress
+
+EXCESS_NOISE = (
+    "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise shows only gain times "
+    "the excess-noise factor: read 'gain' as that product."
+)
+
+LEAST_GAIN = 1e-4
+"""Standard deviations of the noise below which a gain is none: such a noise would be that of 10⁸ electrons and more."""
+
+FEW_ELECTRONS = 25.0
+"""Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
+
+
+@described(offset="counts")
+@dataclass(frozen=True)
+class Detector:
+    """A detector's parameters and what they rest on.
+
+    Attributes:
+        posterior: gain, offset and read noise.
+        line: the photon-transfer points and line.
+        levels: the histograms.
+        offset: offset measured by dark frames and its standard error, counts; None without.
+        misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector.
+    """
+
+    posterior: DetectorPosterior
+    line: PhotonTransfer
+    levels: Sequence[Levels]
+    offset: tuple[float, float] | None
+    misfit: float
+
+
+def measure_detector(
+    pairs: Sequence[AlignedPair],
+    *,
+    dark: Burst | None = None,
+    flat: Burst | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Detector:
+    """Gain, offset and read noise from aligned pairs or a burst.
+
+    Args:
+        pairs: from `align_pair` or `align_burst`.
+        dark: frames without light: they measure the offset, and the read noise directly.
+        flat: equal frames of even illumination: one more level.
+        seed: of the sampler.
+        progress: called with the sampler's steps.
+
+    Raises:
+        NotMeasurable: the noise does not grow with the signal, or nearly all readings are clipped.
+        ValueError: the posterior does not converge.
+    """
+    plain, cells = [], []
+    for number, pair in enumerate(pairs):
+        residual, fine = readings_of(pair, number)
+        plain += residual
+        cells += fine
+    plain += [
+        one for burst, is_dark in ((dark, True), (flat, False)) if burst for one in _burst_readings(burst, is_dark)
+    ]
+    offset = dark_offset(dark) if dark else None
+    levels = [collect_levels(plain)] if plain else []
+    start = None
+    if cells:
+        levels, start = _with_cells(levels, cells, offset, _guess(pairs))
+    posterior = sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress)
+    levels = list(posterior.levels)
+    noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))
+    if posterior.gain.median < LEAST_GAIN * noise:
+        raise NotMeasurable(
+            "the noise grows so little with the signal that the gain cannot be told from none; give the exposure ratio, "
+            "dark frames, or exposures of more electrons"
+        )
+    return Detector(posterior, fit_photon_transfer(levels), levels, offset, misfit(levels, posterior.most_likely))
+
+
+def _with_cells(
+    plain: list[Levels],
+    cells: Sequence[Readings],
+    offset: tuple[float, float] | None,
+    guess: tuple[float, float, float],
+) -> tuple[list[Levels], tuple[float, float, float]]:
+    """Levels of residuals and of readings, the latter laid out by the parameters that a first fit of them finds; and
+    these."""
+    first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
+    gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
+    scales = first.levels[-1].scales
+    moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]
+    found = gain, middle, read_noise
+    return [*first.levels[:-1], collect_cells(moved, guess=found)], found
+
+
+def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
+    """Gain, offset and read noise as the variance lines of the pairs tell them, roughly."""
+    found: list[tuple[float, float, float]] = []
+    for pair in pairs:
+        line, share = pair.total_variance, 1 + _shares(pair)[0]
+        signal = float(pair.signal[pair.mask].mean())
+        variance = float(line(np.array(signal))) / share
+        gain = max(line.rate / share, 1e-2 * variance / max(abs(signal), 1.0))
+        lowest = signal - variance / gain
+        offset = max(pair.scaling.common_offset()[0], lowest) if pair.one_setting else lowest
+        read = max(variance - gain * (signal - offset), 0.05 * gain**2)
+        found.append((gain, offset, float(np.sqrt(read)) / gain))
+    gain, offset, read_noise = (float(np.median(column)) for column in zip(*found, strict=True))
+    return gain, offset, read_noise
+
+
+def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0) -> float:
+    """χ² per degree of freedom of the histograms, over cells where at least `least` readings are expected.
+
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+        parameters: (3,) gain, offset, read noise.
+        least: readings expected.
+    """
+    gain, offset, read_noise = (np.array([value]) for value in parameters)
+    squares, freedom = 0.0, -3
+    for one in levels:
+        number = one.histogram.sum(axis=1, keepdims=True)
+        expected = number * LevelMasses(one).masses(gain, offset, read_noise)[0]
+        used = expected > least
+        departure = one.weight[:, None] * (one.histogram - expected) ** 2
+        squares += float(np.sum(departure[used] / expected[used]))
+        freedom += int(used.sum()) - len(number) - int(np.sum(one.scale < 0))
+    return squares / max(freedom, 1)
+
+
+def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
+    """The trusted pixels of a pair, in two parts: for residuals, and for histograms of the readings themselves.
+
+    The latter are those of few electrons, of a noise as fine as the rounding, or near the converter's rails: their residuals
+    would lose what the likelihood can use. A burst, whose signals are as noisy as its readings, has only residuals, clear of
+    the rails.
+
+    Args:
+        pair: aligned.
+        number: of the pair, for its scale.
+
+    Raises:
+        NotMeasurable: too few pixels.
+    """
+    level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
+    clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
+    centre = float(pair.signal[pair.mask].mean())
+    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting)
+    weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
+    shares = _shares(pair)
+
+    def part(mask: Mask) -> list[Readings]:
+        if mask.sum() < MINIMUM_PIXELS:
+            return []
+        values = (pair.short[mask], pair.signal[mask], level[mask])
+        own = scale if pair.frames == 1 else None
+        return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
+
+    fine = np.zeros_like(clear) if pair.frames > 1 else ~clear | _fine(pair, level, step)
+    found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
+    if not found[0] and not found[1]:
+        raise NotMeasurable(
+            f"of {int(pair.mask.sum())} pixels none lie clear of the converter's rails, so that their noise is cut off; raise "
+            "the detector's offset, or expose for longer"
+        )
+    return found
+
+
+def _fine(pair: AlignedPair, level: Image, step: float) -> Mask:
+    """Pixels of few electrons, or whose noise is as fine as the rounding."""
+    variance = pair.total_variance(level)
+    gain = max(pair.total_variance.rate, 0.0)
+    return np.asarray((variance < FEW_ELECTRONS * gain**2) | (variance < (3 * step) ** 2))
+
+
+def _shares(pair: AlignedPair) -> tuple[float, float]:
+    """Variance of the signal estimate over that of the reading, for shot noise and for read noise.
+
+    One detector setting at a known exposure ratio makes them 1/ratio and 1/ratio², less what the interpolation smooths
+    away; otherwise the measured share stands for both.
+    """
+    if pair.exposure_ratio is not None and pair.one_setting:
+        noise = np.random.default_rng(0).standard_normal(pair.long.shape)
+        kept = float(np.var(pair.registration.warp(noise)[0][pair.mask]))
+        return kept / pair.exposure_ratio, kept / pair.exposure_ratio**2
+    signal = pair.signal[pair.mask]
+    share = float(np.mean(pair.signal_variance(signal)) / np.mean(pair.total_variance(signal)))
+    share = min(max(share, 0.0), 0.9)
+    return share / (1 - share), share / (1 - share)
+
+
+def dark_offset(dark: Burst) -> tuple[float, float]:
+    """Mean of the dark frames and its standard error, from the scatter between frames."""
+    means = dark.frames.mean(axis=(1, 2))
+    scatter = float(np.std(dark.frames - dark.frames.mean(0), ddof=0)) / np.sqrt(dark.frames.size)
+    return float(means.mean()), float(np.hypot(scatter, means.std(ddof=1) / np.sqrt(len(means))))
+
+
+def _burst_readings(burst: Burst, dark: bool) -> list[Readings]:
+    """Every frame beside the mean of the others, with no scene to align."""
+    number = len(burst.frames)
+    total, share = burst.frames.sum(0), 1 / (number - 1)
+    found = []
+    for frame in burst.frames:
+        others = (total - frame) / (number - 1)
+        signal = others + (frame - others).mean()
+        parts = (frame.ravel(), signal.ravel(), np.full(frame.size, frame.mean()))
+        found.append(Readings(*parts, share, share, 1 - 1 / number, dark, rounding_step(frame)))
+    return found

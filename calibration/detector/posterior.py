@@ -1,0 +1,232 @@
+"""Gain, offset and read noise of a detector with honest error bars: maximum likelihood, then the posterior by emcee."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.detector.levels import Levels
+from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.exposures.frames import Image
+from noiseflow.described import described
+
+if TYPE_CHECKING:
+    from noiseflow.commands.console import Progress
+
+NUM_WALKERS = 16
+
+NUM_TIMES = 50
+"""Autocorrelation times that a chain must last (doi:10.1086/670067)."""
+
+LARGEST_RHAT = 1.05
+"""Potential scale reduction above which chains do not agree (doi:10.1214/20-BA1221)."""
+
+FARTHEST = 12.0
+"""Nats below the maximum beyond which a walker has gone astray."""
+
+BURN_IN = 60
+"""Steps that only find out where the posterior lies."""
+
+
+@described()
+@dataclass(frozen=True)
+class Interval:
+    """Median and 5 % and 95 % quantiles of a parameter."""
+
+    median: float
+    q05: float
+    q95: float
+
+
+@described(samples="gain (counts per electron), offset (counts), read noise (electrons)", autocorrelation_time="steps")
+@dataclass(frozen=True)
+class DetectorPosterior:
+    """The posterior of a detector's parameters.
+
+    Attributes:
+        samples: (S, 3) gain (counts/electron), offset (counts), read noise (electrons rms).
+        most_likely: (3,) maximum of the posterior.
+        autocorrelation_time: steps, the longest of the three.
+        rhat: potential scale reduction, the largest of the three.
+        num_steps: steps kept.
+        levels: as sampled, about the most likely scales of their signals.
+    """
+
+    samples: Image
+    most_likely: Image
+    autocorrelation_time: float
+    rhat: float
+    num_steps: int
+    levels: tuple[Levels, ...] = ()
+
+    @property
+    def gain(self) -> Interval:
+        """Counts per electron; on a detector with excess noise, gain times the excess-noise factor."""
+        return _interval(self.samples[:, 0])
+
+    @property
+    def offset(self) -> Interval:
+        """Counts without light."""
+        return _interval(self.samples[:, 1])
+
+    @property
+    def read_noise(self) -> Interval:
+        """Electrons rms."""
+        return _interval(self.samples[:, 2])
+
+
+def sample_posterior(
+    levels: Sequence[Levels],
+    *,
+    offset: tuple[float, float] | None = None,
+    start: tuple[float, float, float] | None = None,
+    num_steps: int = 200,
+    largest_num_steps: int = 16000,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> DetectorPosterior:
+    """Sample the posterior of gain, offset and read noise with emcee (doi:10.1086/670067).
+
+    Walkers start around the maximum of the posterior and move by differential evolution, its snooker variant and
+    stretches; then also by independent draws from a Student distribution fitted to where they went. The chain is prolonged
+    until it lasts `NUM_TIMES` autocorrelation times and its halves and walkers agree.
+
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+        offset: measured offset and its standard error, counts; None: unknown.
+        start: see `maximum_likelihood`.
+        num_steps: steps before the first check.
+        largest_num_steps: steps after which it gives up.
+        seed: of the walkers and their moves.
+        progress: called with the steps done, of `largest_num_steps` at most, and a note.
+
+    Raises:
+        ValueError: the chain has not converged; the message says how many steps it needs.
+    """
+    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
+    walkers = _walkers(log_posterior, best, np.random.default_rng(seed))
+    first = _sampler(log_posterior, _local_moves(1.0), seed)
+    state = first.run_mcmc(walkers[:NUM_WALKERS], BURN_IN)
+    visited, value = (
+        first.get_chain(discard=BURN_IN // 2, flat=True),
+        first.get_log_prob(discard=BURN_IN // 2, flat=True),
+    )
+    visited = np.concatenate([visited[value > value.max() - FARTHEST], walkers])
+    sampler = _sampler(log_posterior, [(_independent_move(visited), 0.5), *_local_moves(0.5)], seed)
+    state = sampler.run_mcmc(state.coords, num_steps // 5)
+    sampler.reset()
+    while True:
+        state = sampler.run_mcmc(state, max(num_steps, sampler.iteration))
+        chain = sampler.get_chain()
+        time, rhat = float(np.max(sampler.get_autocorr_time(tol=0))), potential_scale_reduction(chain)
+        if progress is not None:
+            progress(len(chain), f"{len(chain) / time:.0f} autocorrelation times")
+        if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
+            break
+        if 2 * len(chain) > largest_num_steps:
+            raise ValueError(_not_converged(len(chain), time, rhat))
+    flat = chain.reshape(-1, 3)[:: max(1, int(time / 2))]
+    likely = np.concatenate(log_posterior.parameters(best))
+    samples = np.column_stack(log_posterior.parameters(flat))
+    return DetectorPosterior(samples, likely, time, rhat, len(chain), tuple(log_posterior.levels))
+
+
+def _local_moves(weight: float) -> list[Any]:
+    from emcee import moves
+
+    return [(moves.DEMove(), 0.7 * weight), (moves.DESnookerMove(), 0.1 * weight), (moves.StretchMove(), 0.2 * weight)]
+
+
+def _independent_move(visited: Image, *, freedom: float = 5.0) -> Any:
+    """Metropolis–Hastings proposals from a Student distribution of the mean and covariance of `visited`, (S, 3)."""
+    from emcee import moves
+    from scipy.stats import multivariate_t
+
+    target = multivariate_t(visited.mean(0), 1.1 * np.cov(visited.T), df=freedom)
+
+    def propose(coordinates: Image, random: Any) -> tuple[Image, Image]:
+        proposed = np.atleast_2d(target.rvs(len(coordinates), random_state=random))
+        return proposed, target.logpdf(coordinates) - target.logpdf(proposed)
+
+    return moves.MHMove(propose)
+
+
+def _sampler(log_posterior: LogPosterior, moves: list[Any], seed: int) -> Any:
+    import emcee
+
+    sampler = emcee.EnsembleSampler(NUM_WALKERS, 3, log_posterior, moves=moves, vectorize=True)
+    sampler.log_prob_fn = log_posterior  # not in emcee's wrapper, which prints a traceback on Ctrl-C
+    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own generator is of this kind
+    return sampler
+
+
+def _not_converged(num_steps: int, time: float, rhat: float) -> str:
+    needed = max(int(np.ceil(NUM_TIMES * time)), 2 * num_steps)
+    return (
+        f"the posterior has not converged after {num_steps} steps (autocorrelation time {time:.0f}, R-hat {rhat:.3f}); it "
+        f"needs about {needed - num_steps} more: raise largest_num_steps to {2 * needed}, or give dark frames, which fix "
+        "the offset"
+    )
+
+
+def potential_scale_reduction(chain: Image) -> float:
+    """Rank-normalised split R̂ (doi:10.1214/20-BA1221), the largest over the parameters.
+
+    Args:
+        chain: (step, walker, parameter).
+    """
+    from scipy.stats import norm, rankdata
+
+    half = len(chain) // 2
+    parts = np.concatenate([chain[:half], chain[half : 2 * half]], axis=1)
+    found = []
+    for values in np.moveaxis(parts, -1, 0):
+        z = norm.ppf((rankdata(values).reshape(values.shape) - 0.375) / (values.size + 0.25))
+        within = z.var(axis=0, ddof=1).mean()
+        between = z.mean(axis=0).var(ddof=1)
+        found.append(np.sqrt((half - 1) / half + between / within))
+    return float(max(found))
+
+
+def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Generator) -> Image:
+    """Points where the posterior is high, (W, 3): drawn from the Gaussian of its curvature at the maximum where it has one,
+    else along the coordinates."""
+    highest = log_posterior(best)[0]
+    scale = np.empty(3)
+    for axis, unit in enumerate(np.eye(3)):
+        steps = 100 * 0.5 ** np.arange(30)
+        around = np.stack([log_posterior(best + sign * steps[:, None] * unit) for sign in (1, -1)])
+        scale[axis] = steps[np.argmax(around.max(axis=0) > highest - 1.0)]
+    spread: Image = np.diag(scale**2)
+    for factor in (0.5, 1.0):  # the second time with steps along the axes of the first's ellipsoid
+        axes = factor * np.linalg.cholesky(spread).T
+        spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
+    found = best + generator.standard_normal((6 * NUM_WALKERS, 3)) @ np.linalg.cholesky(spread).T
+    nearer = [
+        best + share * (found[:NUM_WALKERS] - best) for share in (0.1, 0.01, 0.001)
+    ]  # the maximum may be at an edge
+    found = np.concatenate([found, *nearer])
+    return np.asarray(found[log_posterior(found) > highest - FARTHEST])
+
+
+def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback: Image) -> Image:
+    """Inverse curvature at the maximum by differences along the rows of `axes`; `fallback` where it is no ellipsoid."""
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    steps = np.concatenate([np.zeros((1, 3)), axes, -axes, [axes[i] + axes[j] for i, j in pairs]])
+    value = log_posterior(best + steps)
+    if not np.isfinite(value).all():
+        return fallback
+    curvature = np.diag(value[1:4] + value[4:7] - 2 * value[0])
+    for (i, j), both in zip(pairs, value[7:], strict=True):
+        curvature[i, j] = curvature[j, i] = both - value[1 + i] - value[1 + j] + value[0]
+    if np.linalg.eigvalsh(curvature).max() > -1e-3:
+        return fallback
+    return np.asarray(axes.T @ np.linalg.inv(-curvature) @ axes)
+
+
+def _interval(values: Image) -> Interval:
+    q05, median, q95 = (float(q) for q in np.percentile(values, (5, 50, 95)))
+    return Interval(median, q05, q95)

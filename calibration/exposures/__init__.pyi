@@ -1,0 +1,10 @@
+from .frames import MINIMUM_SIDE as MINIMUM_SIDE
+from .frames import Burst as Burst
+from .frames import ExposurePair as ExposurePair
+from .frames import Image as Image
+from .frames import checked_frame as checked_frame
+from .frames import rails as rails
+from .frames import read_burst as read_burst
+from .frames import read_pairs as read_pairs
+from .frames import rounding_step as rounding_step
+from .frames import saturation_level as saturation_level

@@ -1,0 +1,207 @@
+"""Frames, exposure pairs and bursts, checked once: what comes after may trust them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.described import described
+from noiseflow.io import as_array, read, require_contrast, require_finite
+from noiseflow.models.digitisation import detect_digitisation
+
+Image = NDArray[np.float64]
+
+MINIMUM_SIDE = 32
+"""Smallest frame side, in pixels, that can be registered and judged."""
+
+
+@described(short="detector units", long="detector units")
+@dataclass(frozen=True)
+class ExposurePair:
+    """One scene taken twice: a short, noisy exposure and a long, cleaner one.
+
+    Args:
+        short: (y, x) frame whose noise is to be learned, detector units; an array or a tensor.
+        long: (y, x) frame that tells its signal, in any linear scale of detector units.
+        exposure_ratio: exposure time (or dose) of the long frame over that of the short one, > 1; None: unknown.
+        short_name: how messages call the short frame.
+        long_name: how messages call the long frame.
+
+    Raises:
+        ValueError: a frame is not one grey image, too small, has NaN or infinite pixels, is flat or saturated; the two
+            differ in size or are identical; the ratio is not above 1.
+    """
+
+    short: Image
+    long: Image
+    exposure_ratio: float | None = None
+    short_name: str = "the short exposure"
+    long_name: str = "the long exposure"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "short", checked_frame(self.short, self.short_name))
+        object.__setattr__(self, "long", checked_frame(self.long, self.long_name))
+        _require_same_size(self.short, self.short_name, self.long, self.long_name)
+        if np.array_equal(self.short, self.long):
+            raise ValueError(
+                f"{self.short_name} and {self.long_name} hold identical pixels; "
+                "give two separate exposures of one scene"
+            )
+        if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
+            raise ValueError(
+                f"the exposure ratio is {self.exposure_ratio:g}; it is long over short and must be above 1: "
+                "swap --short and --long, or give equal exposures as a burst"
+            )
+
+
+@described(frames="detector units")
+@dataclass(frozen=True)
+class Burst:
+    """Equal exposures of one scene: every frame is judged against the mean of the others.
+
+    Args:
+        frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
+        name: how messages call the burst.
+
+    Raises:
+        ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
+    """
+
+    frames: Image
+    name: str = "the burst"
+
+    def __post_init__(self) -> None:
+        frames = as_array(self.frames)
+        if frames.ndim != 3 or len(frames) < 2:
+            raise ValueError(
+                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give a long "
+                "exposure with it, or a burst of at least two equal exposures"
+            )
+        checked = [checked_frame(frame, f"{self.name}, frame {i}") for i, frame in enumerate(frames)]
+        for i, (first, second) in enumerate(pairwise(checked)):
+            if np.array_equal(first, second):
+                raise ValueError(f"{self.name}: frames {i} and {i + 1} hold identical pixels; remove the copy")
+        object.__setattr__(self, "frames", np.stack(checked))
+
+
+def checked_frame(data: NDArray[Any], name: str) -> Image:
+    """One grey frame as float64, refused where calibration could not use it.
+
+    Args:
+        data: (y, x), or (1, y, x); any real number type.
+        name: how the message calls it.
+
+    Raises:
+        ValueError: not one grey image, smaller than `MINIMUM_SIDE`, NaN, flat, or half of it saturated.
+    """
+    data = as_array(data)
+    if data.ndim == 3 and data.shape[0] == 1:
+        data = data[0]
+    if data.ndim == 3 and min(data.shape[0], data.shape[-1]) <= 4:
+        raise ValueError(f"{name} is a colour image (shape {data.shape}); convert it to one grey channel first")
+    if data.ndim != 2:
+        raise ValueError(
+            f"{name} has shape {data.shape}; one 2D frame is needed here (a stack alone is read as a burst)"
+        )
+    if min(data.shape) < MINIMUM_SIDE:
+        raise ValueError(
+            f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {MINIMUM_SIDE} per side are needed"
+        )
+    require_finite(data, name)
+    rail = saturation_level(data)
+    saturated = float(np.mean(data >= rail))
+    if saturated > 0.5 and (saturated < 1 or rail == _largest_value(data)):
+        raise ValueError(
+            f"{name} is saturated: {saturated:.0%} of its pixels read {rail:g}; expose it for a shorter time"
+        )
+    require_contrast(data, name)
+    return data.astype(np.float64)
+
+
+def saturation_level(frame: NDArray[Any]) -> float:
+    """The upper rail of the analogue-to-digital converter, or infinity where the frame shows none.
+
+    Args:
+        frame: any shape, detector units.
+    """
+    return detect_digitisation(frame).high
+
+
+def rounding_step(frame: Image) -> float:
+    """1 where all readings are whole numbers, else 0: not rounded."""
+    return 1.0 if np.array_equal(frame, np.round(frame)) else 0.0
+
+
+def rails(frame: Image) -> tuple[float, float]:
+    """Lower and upper rail of the converter as the frame shows them; infinite where it shows none."""
+    found = detect_digitisation(frame)
+    return (0.0 if frame.min() == 0 else found.low), found.high
+
+
+def _largest_value(data: NDArray[Any]) -> float:
+    return float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else float("inf")
+
+
+def read_pairs(
+    short: Sequence[str | Path], long: Sequence[str | Path], *, exposure_ratio: float | None = None
+) -> list[ExposurePair]:
+    """Read exposure pairs, in the order given; one long exposure may serve several short ones.
+
+    Args:
+        short: files of the short exposures.
+        long: as many files of the long exposures, or one for all.
+        exposure_ratio: of every pair; None: unknown.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: the lists do not match, a file cannot be read, or `ExposurePair` refuses a pair.
+    """
+    if len(long) not in (1, len(short)) or not short:
+        raise ValueError(
+            f"{len(short)} short and {len(long)} long exposures were given; "
+            "give one long exposure per short one, or one for all"
+        )
+    longs = list(long) * (len(short) if len(long) == 1 else 1)
+    for one, other in zip(short, longs, strict=True):
+        if Path(one).resolve() == Path(other).resolve():
+            raise ValueError(f"{one} was given as short and as long exposure; give two separate exposures of one scene")
+    return [
+        ExposurePair(read(one).data, read(other).data, exposure_ratio, str(one), str(other))
+        for one, other in zip(short, longs, strict=True)
+    ]
+
+
+def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst:
+    """Read a burst from one stack, or from files of one frame each in the order taken.
+
+    Args:
+        paths: the files.
+        name: how messages call it; by default the file, or "the burst".
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: a file cannot be read, sizes differ, or `Burst` refuses the frames.
+    """
+    frames: list[NDArray[Any]] = []
+    for path in paths:
+        data = read(path).data
+        if data.ndim == 3 and data.shape[-1] in (3, 4) and data.shape[0] > 4:
+            raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+        frames += list(data) if data.ndim == 3 else [data]
+    for frame in frames[1:]:
+        _require_same_size(frames[0], "the first frame", frame, "a later one")
+    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"))
+
+
+def _require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
+    if first.shape != second.shape:
+        raise ValueError(
+            f"{first_name} is {first.shape} and {second_name} is {second.shape} pixels; both must have one size: "
+            "take them with the same binning and region"
+        )

@@ -1,0 +1,1 @@
+"""Where each pixel of one exposure lies in another."""

@@ -1,0 +1,297 @@
+"""Registration: where each pixel of a short exposure lies in the long one, and the long one warped onto it.
+
+Only the long exposure is ever interpolated: that of the short one would correlate and shrink the noise to be learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from calibration.exposures.frames import Image
+from calibration.registration.matching import (
+    INLIER_DISTANCE,
+    Guess,
+    Method,
+    band_pass,
+    correlation_guesses,
+    correlation_surface,
+    feature_guesses,
+)
+from noiseflow.described import described
+from noiseflow.io import as_array
+
+Motion = Literal["translation", "euclidean", "affine"]
+
+MOTIONS: dict[Motion, int] = {"translation": 2, "euclidean": 3, "affine": 6}
+"""The motions tried, and their numbers of parameters."""
+
+MINIMUM_OVERLAP = 0.25
+"""Fraction of the short frame that the long one must cover."""
+
+CLEAR_PEAK = 8.0
+"""Standard deviations by which the correlation of registered frames must stand out at zero shift. Unrelated frames
+reach 5.5 once the search over shifts, rotations and motions has picked their best."""
+
+TRUSTED_INLIERS = 10
+"""Matches that agree, from which on the correlation need not be asked."""
+
+LARGEST_ERROR = 0.5
+"""Standard error, in pixels, above which a transform is too uncertain to use."""
+
+SEARCH_MARGIN = 1.5
+"""Pixels from zero shift within which that peak must lie."""
+
+
+@described(rms_px="px", error_px="px")
+@dataclass(frozen=True)
+class Registration:
+    """Where the short frame's pixels lie in the long one.
+
+    Attributes:
+        matrix: (2, 3): (x, y, 1) of the short frame -> (x, y) of the long one, pixels.
+        motion: the simplest motion that the data support.
+        method: what gave the first guess, refined by maximising the enhanced correlation coefficient.
+        inliers: matches that agree with it (0 for phase correlation).
+        matches: matches before the consensus.
+        rms_px: root mean square distance of the inlier matches from the transform; for phase correlation `error_px`.
+        error_px: standard error of the transform, rms over the frame, from the noise of the short exposure.
+        peak: height of the correlation at zero shift over its scatter at others.
+        inverted: the two frames have opposite contrast.
+    """
+
+    matrix: Image
+    motion: Motion
+    method: Method
+    inliers: int
+    matches: int
+    rms_px: float
+    error_px: float
+    peak: float
+    inverted: bool
+
+    @property
+    def rotation(self) -> float:
+        """Degrees, positive from x towards y."""
+        return float(
+            np.degrees(np.arctan2(self.matrix[1, 0] - self.matrix[0, 1], self.matrix[0, 0] + self.matrix[1, 1]))
+        )
+
+    @property
+    def scale(self) -> float:
+        """Magnification, the square root of the area's."""
+        return float(np.sqrt(np.linalg.det(self.matrix[:, :2])))
+
+    def shift(self, shape: tuple[int, ...]) -> tuple[float, float]:
+        """Displacement (x, y) of the middle of a frame of `shape`, pixels."""
+        centre = (np.array(shape[::-1]) - 1) / 2
+        x, y = self.matrix[:, :2] @ centre + self.matrix[:, 2] - centre
+        return float(x), float(y)
+
+    def warp(self, long: Image) -> tuple[Image, NDArray[np.bool_]]:
+        """The long frame on the short one's pixels, and which of them it covers (a pixel off its border).
+
+        A shift below a hundredth of a pixel is not worth the smoothing of an interpolation: the frame is then
+            returned as it is."""
+        import cv2
+
+        size = long.shape[::-1]
+        corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], float)
+        if np.abs(corners @ self.matrix.T - corners[:, :2]).max() < 0.01:
+            return long, np.ones(long.shape, bool)
+        flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpAffine(long, self.matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(warped, float), covered(self.matrix, long.shape)
+
+
+def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:
+    """Which pixels of the short frame fall inside the long one, `border` pixels off its edge."""
+    row, column = np.indices(shape)
+    x, y = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([column, row])) + matrix[:, 2][:, None, None]
+    inside: NDArray[np.bool_] = (
+        (x >= border) & (x <= shape[1] - 1 - border) & (y >= border) & (y <= shape[0] - 1 - border)
+    )
+    return inside
+
+
+def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short", "the long exposure")) -> Registration:
+    """Find the transform from the short frame to the long one.
+
+    SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
+    has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
+    sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
+    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift. Few matches may
+    all be wrong, as where a handful of round particles looks like another: the correlation's guess is then asked too, and
+    the clearer of the two counts.
+
+    Args:
+        short: (y, x) detector units.
+        long: (y, x) of the same size, any linear scale.
+        names: how messages call the two.
+
+    Raises:
+        ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
+    """
+    short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
+    tried = _Tried()
+    found: list[Registration] = []
+    for guesses in (feature_guesses(short, long), correlation_guesses(short, long)):
+        one = _first_refined(short, long, guesses, tried)
+        found += [] if one is None else [one]
+        if one is not None and one.inliers >= TRUSTED_INLIERS:
+            break
+    if found:
+        return max(found, key=lambda one: one.peak)
+    overlap, most_matches = tried.overlap, tried.most_matches
+    reason = (
+        f"they overlap by {overlap:.0%} only"
+        if overlap < MINIMUM_OVERLAP
+        else f"SIFT found {most_matches} consistent matches and their correlation has no clear peak"
+    )
+    raise ValueError(
+        f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
+        "at the same magnification, or give a longer short exposure"
+    )
+
+
+@dataclass
+class _Tried:
+    """What the last guesses came to, for the message where all fail."""
+
+    overlap: float = 1.0
+    most_matches: int = 0
+
+
+def _first_refined(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Registration | None:
+    """The first of the guesses that stands, if any does."""
+    for guess in guesses:
+        tried.most_matches = max(tried.most_matches, len(guess.points))
+        if not _plausible(guess.matrix):
+            continue
+        tried.overlap = float(covered(guess.matrix, short.shape).mean())
+        if tried.overlap < MINIMUM_OVERLAP:
+            continue
+        found = _refined(short, long, guess)
+        if found is not None:
+            return found
+    return None
+
+
+def _plausible(matrix: Image) -> bool:
+    """No mirror, and no magnification or shear beyond what drift, or two camera settings, explain."""
+    singular = np.linalg.svd(matrix[:, :2], compute_uv=False)
+    return bool(np.linalg.det(matrix[:, :2]) > 0 and singular[0] < 1.3 and singular[1] > 0.75)
+
+
+def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
+    """How clearly two frames correlate under a transform, band-passed at `blur` pixels.
+
+    Returns:
+        The correlation's extreme within `SEARCH_MARGIN` pixels of zero shift over its standard deviation at all shifts,
+        with its sign; and the distance, in pixels, of the highest peak of all from zero shift.
+    """
+    mask = covered(matrix, short.shape)
+    surface = correlation_surface(band_pass(short, blur), band_pass(_interpolated(long, matrix), blur), mask)
+    reach = int(np.ceil(SEARCH_MARGIN))
+    near = np.roll(surface, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
+    extreme = near.flat[np.argmax(np.abs(near))]
+    where = np.array(np.unravel_index(np.argmax(np.abs(surface)), surface.shape))
+    return float(extreme), float(np.hypot(*np.minimum(where, np.array(surface.shape) - where)))
+
+
+def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
+    """Refine a guess with each motion, keep the best by the information criterion, and check it; None if it fails."""
+    sign = 1.0 if correlation_at(short, long, guess.matrix, blur=2.0)[0] >= 0 else -1.0
+    found: dict[Motion, Image] = {}
+    for motion in MOTIONS:
+        matrix = _maximise_correlation(short, sign * long, _restricted(guess.matrix, motion, short.shape), motion)
+        if matrix is not None and _plausible(matrix) and covered(matrix, short.shape).mean() >= MINIMUM_OVERLAP:
+            found[motion] = matrix
+    if not found:
+        return None
+    mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
+    smooth = ndimage.gaussian_filter(long, 1.0)  # or the motion whose interpolation smooths more would win
+    motion = max(
+        found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
+    )
+    matrix = found[motion]
+    checks = [correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0)]
+    clear = [abs(peak) for peak, distance in checks if abs(peak) >= CLEAR_PEAK and distance <= SEARCH_MARGIN]
+    error = _standard_error(short, long, matrix, motion)
+    if not clear or error > LARGEST_ERROR:
+        return None
+    residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
+    inlier = residual < INLIER_DISTANCE
+    rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
+    return Registration(
+        matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, max(clear), sign < 0
+    )
+
+
+def _restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
+    """The transform of this motion that moves the frame's middle as `matrix` does."""
+    centre = (np.array(shape[::-1]) - 1) / 2
+    target = matrix[:, :2] @ centre + matrix[:, 2]
+    left, _, right = np.linalg.svd(matrix[:, :2])
+    linear = {"translation": np.eye(2), "euclidean": left @ right, "affine": matrix[:, :2]}[motion]
+    return np.column_stack([linear, target - linear @ centre])
+
+
+def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motion) -> Image | None:
+    """Refine a transform by the enhanced correlation coefficient, coarse then fine; None where it diverges."""
+    import cv2
+
+    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
+        motion
+    ]
+    first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
+    matrix = start.astype(np.float32)
+    for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
+        try:
+            _, matrix = cv2.findTransformECC(first, second, matrix, kind, criteria, None, blur)  # type: ignore[call-overload]
+        except cv2.error:  # its way of saying that the iteration does not converge
+            return None
+    return np.asarray(matrix, float) if np.isfinite(matrix).all() else None
+
+
+def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool_]) -> float:
+    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one,
+    nats."""
+    coefficient = np.corrcoef(short[mask], _interpolated(long, matrix)[mask])[0, 1]
+    return float(-mask.sum() * np.log1p(-(coefficient**2)))
+
+
+def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) -> float:
+    """Rms displacement error over the frame, pixels, by the Cramer-Rao bound at the observed residual variance."""
+    mask = covered(matrix, short.shape)
+    smooth = ndimage.gaussian_filter(_interpolated(long, matrix), 1.0)
+    slope, offset = np.polyfit(smooth[mask], short[mask], 1)
+    variance = float(np.var((short - slope * smooth - offset)[mask]))
+    row, column = np.indices(short.shape)
+    x, y = ((index - (size - 1) / 2)[mask] for index, size in zip((column, row), short.shape[::-1], strict=True))
+    one, none = np.ones_like(x), np.zeros_like(x)
+    along_x, along_y = {
+        "translation": ([one, none], [none, one]),
+        "euclidean": ([one, none, -y], [none, one, x]),
+        "affine": ([one, none, x, y, none, none], [none, one, none, none, x, y]),
+    }[motion]
+    gradient_y, gradient_x = (slope * part[mask] for part in np.gradient(smooth))
+    jacobian = np.stack(along_x) * gradient_x + np.stack(along_y) * gradient_y
+    information = jacobian @ jacobian.T
+    if np.linalg.cond(information) > 1e14:
+        return float("inf")
+    spread = (np.stack(along_x) @ np.stack(along_x).T + np.stack(along_y) @ np.stack(along_y).T) / mask.sum()
+    return float(np.sqrt(variance * np.trace(np.linalg.solve(information, spread))))
+
+
+def _interpolated(long: Image, matrix: Image) -> Image:
+    import cv2
+
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(long, matrix, long.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT))

@@ -1,0 +1,185 @@
+"""First guesses of the transform between two frames: matched features, and correlation where there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from calibration.exposures.frames import Image
+
+Method = Literal["sift", "phase correlation"]
+
+RATIO = 0.8
+"""Lowe's ratio test: a match must be this much nearer than the next best (doi:10.1023/B:VISI.0000029664.99615.94)."""
+
+INLIER_DISTANCE = 2.0
+"""Pixels within which a match agrees with a transform."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A transform to refine: (x, y) of the short frame -> (x, y) of the long one.
+
+    Attributes:
+        matrix: (2, 3) in pixels.
+        method: where it came from.
+        points: (inlier, 2, 2): [:, 0] in the short, [:, 1] in the long frame; none without features.
+        matches: number of matches before the consensus.
+    """
+
+    matrix: Image
+    method: Method
+    points: Image
+    matches: int
+
+
+def feature_guesses(short: Image, long: Image) -> Iterator[Guess]:
+    """Guesses from SIFT and RANSAC, from the least smoothing that may do to the most, the most likely ones first.
+
+    The smoothed, stretched 8-bit copies serve the matching only.
+    """
+    for blur in (1.0, 2.0, 4.0):
+        yield from _guesses_at(short, long, blur)
+
+
+def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0) -> Iterator[Guess]:
+    """Guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without
+    features.
+
+    Args:
+        short: (y, x).
+        long: (y, x).
+        largest_angle: degrees searched either way, in steps that move the frame's edge by about a pixel and a half.
+
+    Yields:
+        The best guess for the finest and for a coarser band, clearest peak first.
+    """
+    guesses = []
+    for blur in (1.5, 4.0):
+        factor = max(1, int(blur / 1.5), max(short.shape) // 512)
+        first, second = (_binned(band_pass(image, blur), factor) for image in (short, long))
+        step = np.degrees(3.0 / max(first.shape))
+        angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
+        found = [_best_shift(first, second, angle) for angle in angles]
+        peak, matrix = max(found, key=lambda item: item[0])
+        matrix = _scaled(matrix, factor)
+        guesses.append((peak, Guess(matrix, "phase correlation", np.empty((0, 2, 2)), 0)))
+    yield from (guess for _, guess in sorted(guesses, key=lambda item: -item[0]))
+
+
+def band_pass(image: Image, blur: float) -> Image:
+    """Remove noise finer than `blur` pixels and shading coarser than eight times that; mean 0, standard deviation 1."""
+    band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, 8 * blur)
+    band = np.clip(band, *np.percentile(band, (0.05, 99.95)))
+    return np.asarray((band - band.mean()) / max(band.std(), np.finfo(float).tiny))
+
+
+def correlation_surface(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
+    """Correlation of two frames at every shift, over its standard deviation at all shifts.
+
+    Each shift is scaled by the root of its overlap, so that unrelated frames give unit variance everywhere; shifts that
+    leave less than a quarter of the frame are set to 0.
+
+    Args:
+        first: (y, x) of mean 0.
+        second: (y, x) of mean 0.
+        mask: (y, x) pixels to use; all by default.
+
+    Returns:
+        (2y, 2x) or somewhat larger: value d is that of first(p)·second(p + d), with d = 0 at [0, 0].
+    """
+    valid = np.ones(first.shape) if mask is None else mask.astype(float)
+    overlap = _cross_correlation(valid, valid)
+    enough = overlap > 0.25 * valid.size
+    surface = np.zeros_like(overlap)
+    surface[enough] = _cross_correlation(valid * first, valid * second)[enough] / np.sqrt(overlap[enough])
+    return surface / max(float(surface[enough].std()), np.finfo(float).tiny) if enough.any() else surface
+
+
+def _cross_correlation(first: Image, second: Image) -> Image:
+    shape = [fft.next_fast_len(2 * n, real=True) for n in first.shape]
+    product = np.conj(fft.rfft2(first, shape)) * fft.rfft2(second, shape)
+    return np.asarray(fft.irfft2(product, shape))
+
+
+def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
+    """The (2, 3) matrix that turns (x, y) by `angle` degrees about the middle of a frame."""
+    theta = np.radians(angle)
+    rotation = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    centre = (np.array(shape[::-1]) - 1) / 2
+    return np.column_stack([rotation, centre - rotation @ centre])
+
+
+def _guesses_at(short: Image, long: Image, blur: float) -> Iterator[Guess]:
+    import cv2
+
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    keys, descriptors = sift.detectAndCompute(_eight_bits(short, blur), None)
+    for sign in (1.0, -1.0):  # -1: the contrast of one frame is inverted
+        other_keys, other = sift.detectAndCompute(_eight_bits(sign * long, blur / 2), None)
+        if descriptors is None or other is None or len(keys) < 2 or len(other_keys) < 2:
+            continue
+        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, other, k=2)
+        kept = [p[0] for p in pairs if len(p) == 2 and p[0].distance < RATIO * p[1].distance]
+        points = np.array([[keys[m.queryIdx].pt, other_keys[m.trainIdx].pt] for m in kept]).reshape(-1, 2, 2)
+        guess = _consensus(points)
+        if guess is not None:
+            yield guess
+
+
+def _consensus(points: Image) -> Guess | None:
+    """RANSAC for the transform most matches agree with; None where too few do."""
+    import cv2
+
+    if len(points) < 4:
+        return None
+    cv2.setRNGSeed(0)
+    options: dict[str, Any] = {"ransacReprojThreshold": INLIER_DISTANCE, "maxIters": 5000, "confidence": 0.9999}
+    first, second = (np.ascontiguousarray(points[:, i]) for i in (0, 1))
+    matrix, inlier = cv2.estimateAffinePartial2D(first, second, method=cv2.RANSAC, **options)
+    if matrix is None or inlier.sum() < max(4, 0.05 * len(points)):
+        return None
+    return Guess(np.asarray(matrix, float), "sift", points[inlier[:, 0] > 0], len(points))
+
+
+def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
+    smooth = ndimage.gaussian_filter(image, blur)
+    low, high = np.percentile(smooth, (0.5, 99.8))
+    stretched = np.clip((smooth - low) / max(high - low, np.finfo(float).tiny), 0, 1)
+    return np.asarray(np.round(255 * stretched), dtype=np.uint8)
+
+
+def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image]:
+    """Height of the correlation's highest peak of either sign when `second` is turned back by `angle`, and its
+    matrix."""
+    import cv2
+
+    turn = about_centre(angle, first.shape)
+    turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    surface = np.abs(correlation_surface(first, np.asarray(turned, float)))
+    row, column = np.unravel_index(np.argmax(surface), surface.shape)
+    shift = [
+        float(index if index < size / 2 else index - size)
+        for index, size in zip((column, row), surface.shape[::-1], strict=True)
+    ]
+    matrix = turn.copy()
+    matrix[:, 2] += turn[:, :2] @ np.array(shift)
+    return float(surface[row, column]), matrix
+
+
+def _binned(image: Image, factor: int) -> Image:
+    rows, columns = (n // factor * factor for n in image.shape)
+    tiles = image[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
+    return np.asarray(tiles.mean(axis=(1, 3)))
+
+
+def _scaled(matrix: Image, factor: int) -> Image:
+    """The same transform in pixels `factor` times smaller (pixel centres at whole numbers in both)."""
+    middle = (factor - 1) / 2
+    linear = matrix[:, :2]
+    return np.column_stack([linear, factor * matrix[:, 2] + middle - linear @ np.array([middle, middle])])

@@ -1,0 +1,142 @@
+"""The pictures of the calibration's report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.detector.measure import Detector
+from calibration.detector.models import ModelScore, Pixels
+from calibration.detector.residual import smoothed_residual
+from calibration.exposures.frames import Image
+from calibration.registration.aligned import AlignedPair
+from noiseflow.report import new_figure, show_image
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻")
+
+
+def registration_figure(pair: AlignedPair) -> Figure:
+    """Overlay of short (magenta) and long exposure (green) before and after registration."""
+    figure, axes = new_figure(2, width=9.0, height=4.2)
+    before = pair.scaling.slope * pair.long + pair.scaling.intercept
+    for axis, image, title in zip(axes[0], (before, pair.signal), ("before", "after registration"), strict=True):
+        axis.imshow(_overlay(pair.short, image), interpolation="nearest")
+        axis.set_title(title, fontsize=10)
+        axis.set_axis_off()
+    return figure
+
+
+def residual_figure(pair: AlignedPair) -> Figure:
+    """Smoothed residual over the frame, and its mean along rows and columns with the band that noise alone would keep."""
+    figure, axes = new_figure(3, width=12.0, height=3.8)
+    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
+    residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
+    show_image(axes[0, 0], smoothed_residual(pair)[0], "residual smoothed over 3 px, σ", limits=(-4.0, 4.0))
+    for axis, along, name in ((axes[0, 1], 1, "row"), (axes[0, 2], 0, "column")):
+        number = np.maximum(pair.mask.sum(axis=along), 1)
+        axis.plot(residual.sum(axis=along) / number, linewidth=0.8)
+        for sign in (-1, 1):
+            axis.plot(sign * 2 / np.sqrt(number), color="0.5", linewidth=0.8, linestyle="--")
+        axis.set_ylim(*(5 * np.median(2 / np.sqrt(number)) * np.array([-1, 1])))
+        axis.set_xlabel(name)
+        axis.set_title(f"mean residual of each {name}, σ (dashed: 2 s.e.)", fontsize=10)
+    return figure
+
+
+def histogram_figure(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> Figure:
+    """Residual histograms of the pixels kept apart at each of some signal levels, with every model's density on top."""
+    figure, axes = new_figure(3, -(-num_levels // 3), width=12.0, height=3.2)
+    signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
+    order = np.argsort(signal)
+    for axis, group in zip(axes.flat, np.array_split(order, num_levels), strict=False):
+        residual = observation[group] - signal[group]
+        low, high = np.percentile(residual, (0.1, 99.9))
+        edges = np.linspace(low, high, 61)
+        axis.hist(residual, bins=edges, density=True, color="0.8", label="data")
+        for score in scores:
+            density = _mean_density(score, signal[group], edges)
+            axis.plot((edges[1:] + edges[:-1]) / 2, density, label=score.name, linewidth=1.2)
+        axis.set_title(f"signal {signal[group].min():.4g} … {signal[group].max():.4g}", fontsize=10)
+        axis.set_yscale("log")
+        axis.set_ylim(bottom=2e-3 / (edges[-1] - edges[0]))
+    axes.flat[0].legend(fontsize=8)
+    return figure
+
+
+def pit_figure(scores: Sequence[ModelScore]) -> Figure:
+    """Probability integral transform of the pixels kept apart: flat where a model is calibrated; and its quantile plot."""
+    figure, axes = new_figure(2, width=10.0, height=3.6)
+    for score in scores:
+        pit = np.asarray(score.evaluation.pit)
+        edges = np.linspace(0, 1, len(pit) + 1)
+        axes[0, 0].stairs(pit, edges, label=score.name, linewidth=1.2)
+        axes[0, 1].plot(edges, np.concatenate([[0], np.cumsum(pit)]) / len(pit) - edges, label=score.name)
+    error = np.sqrt(len(edges) / scores[0].evaluation.num_pixels)
+    axes[0, 0].axhspan(1 - 2 * error, 1 + 2 * error, color="0.9")
+    axes[0, 0].set_title("PIT histogram (grey: 2 s.e.)", fontsize=10)
+    axes[0, 1].axhspan(-scores[0].evaluation.ks_floor, scores[0].evaluation.ks_floor, color="0.9")
+    axes[0, 1].set_title("QQ: observed minus expected probability (grey: 95 %)", fontsize=10)
+    axes[0, 1].legend(fontsize=8)
+    return figure
+
+
+def photon_transfer_figure(detector: Detector) -> Figure:
+    """Variance against signal with the posterior's band of lines."""
+    figure, axes = new_figure(1, width=7.0, height=4.2)
+    axis, line = axes[0, 0], detector.line
+    style = {"fmt": "o", "markersize": 3, "linewidth": 1, "color": "0.3"}
+    axis.errorbar(line.signal, line.variance, line.variance_error, label="levels, ± s.e.", **style)
+    signal = np.linspace(min(line.signal.min(), detector.posterior.offset.median), line.signal.max(), 100)
+    gain, offset, read_noise = detector.posterior.samples[:, :, None].transpose(1, 0, 2)
+    variance = gain * np.maximum(signal - offset, 0) + (gain * read_noise) ** 2
+    low, middle, high = np.percentile(variance, (5, 50, 95), axis=0)
+    axis.fill_between(signal, low, high, alpha=0.3, label="posterior, 90 %")
+    axis.plot(signal, middle, linewidth=1)
+    axis.set_xlabel("signal, counts")
+    axis.set_ylabel("variance, counts²")
+    axis.legend(fontsize=8)
+    return figure
+
+
+def corner_figure(detector: Detector) -> Figure:
+    """The posterior of each parameter and of each pair of them."""
+    figure, axes = new_figure(3, 3, width=8.0, height=2.6)
+    samples = detector.posterior.samples
+    for row in range(3):
+        for column in range(3):
+            axis = axes[row, column]
+            if column > row:
+                axis.set_axis_off()
+            elif column == row:
+                axis.hist(samples[:, row], bins=50, color="0.6")
+                axis.set_yticks([])
+            else:
+                axis.hist2d(samples[:, column], samples[:, row], bins=50, cmap="Greys")
+            axis.tick_params(labelsize=7)
+            if row == 2:
+                axis.set_xlabel(PARAMETERS[column], fontsize=9)
+            if column == 0 and row > 0:
+                axis.set_ylabel(PARAMETERS[row], fontsize=9)
+    return figure
+
+
+def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
+    """Density of observation − signal in each bin, averaged over a sample of the level's signals."""
+    import torch
+
+    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 200)]).float()
+    with torch.no_grad():
+        below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
+    return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
+
+
+def _overlay(short: Image, long: Image) -> Any:
+    """Short in magenta, long in green, both between the 1st and 99.5th percentiles of the long."""
+    low, high = np.percentile(long, (1, 99.5))
+    first, second = (np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) for image in (short, long))
+    return np.stack([first, second, first], -1)

@@ -1,0 +1,288 @@
+"""The calibration's page: was the pair registered, which noise model fits, and a verdict in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.detector.measure import EXCESS_NOISE, Detector
+from calibration.detector.models import ModelScore, simplest_sufficient
+from calibration.detector.residual import structured_share
+from calibration.pipeline import Findings
+from calibration.registration.aligned import AlignedPair
+from calibration.registration.bursts import BurstReport
+from calibration.report.figures import (
+    corner_figure,
+    histogram_figure,
+    photon_transfer_figure,
+    pit_figure,
+    registration_figure,
+    residual_figure,
+)
+from noiseflow.report import Report, provenance
+
+LARGEST_MISFIT = 1.3
+"""χ² per degree of freedom above which the readings do not come from a Poisson-Gaussian detector."""
+
+LARGEST_MISALIGNMENT = 0.1
+"""Pixels of registration error that leave no trace in the residuals."""
+
+UNKNOWN_READ_NOISE = (
+    "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it."
+)
+
+LARGEST_STRUCTURE = 0.05
+"""Share of the residual's variance that may be smooth structure: it biases the gain by as much."""
+
+LEAST_DIVERGENCE = 5e-4
+"""Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
+
+LABELS = {
+    "gaussian": "Gaussian, one width",
+    "poisson": "Poisson",
+    "poisson-gaussian": "Poisson-Gaussian",
+    "signal-gaussian": "Gaussian, width by signal",
+    "mixture": "mixture of Gaussians",
+    "flow": "radial flow",
+    "spline": "spline flow",
+}
+"""How the report calls the models."""
+
+TABLE_HEADER = (
+    *("model", "held-out NLL", "± s.e.", "above best", "± s.e."),
+    *("JSD", "floor", "1 − BC", "floor", "distance", "floor", "JSD by signal", "floor"),
+)
+
+
+def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
+    """The figures of each model as text; divergences in units of 10⁻⁴."""
+    return [_row(score) for score in scores]
+
+
+def _row(score: ModelScore) -> list[str]:
+    judged, overall = score.evaluation, score.evaluation.overall
+    likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
+    pairs = (
+        *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
+        *(judged.mean_jsd, judged.mean_jsd_floor),
+    )
+    return [score.name, *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
+
+
+def verdict(scores: Sequence[ModelScore]) -> str:
+    """One or two sentences: which model suffices, and by how much the others fail."""
+    chosen = simplest_sufficient(scores)
+    simpler = [score for score in scores[: list(scores).index(chosen)] if np.isfinite(score.excess)]
+    text = f"The {LABELS[chosen.name]} model suffices: no model predicts the pixels kept apart better beyond its error."
+    if simpler:
+        nearest = min(simpler, key=lambda score: score.excess)
+        text += (
+            f" The nearest simpler one, {LABELS[nearest.name]}, loses {nearest.excess:.4f} ± "
+            f"{nearest.excess_error:.4f} nats per pixel."
+        )
+    overall = chosen.evaluation.overall
+    if overall.jsd > max(3 * overall.jsd_floor, LEAST_DIVERGENCE):
+        text += (
+            f" Yet its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
+            "finite-sample floor: look at the histograms before trusting it."
+        )
+    return text
+
+
+def describe_detector(detector: Detector) -> str:
+    """Gain, offset and read noise with their 90 % intervals, and what they rest on."""
+    found = detector.posterior
+    parts = [
+        f"{name} {value.median:#.4g} {unit} (90 %: {value.q05:#.4g} … {value.q95:#.4g})"
+        for name, unit, value in (
+            ("gain", "counts/e⁻", found.gain),
+            ("offset", "counts", found.offset),
+            ("read noise", "e⁻ rms", found.read_noise),
+        )
+    ]
+    text = ", ".join(parts) + f". Chain of {found.num_steps} steps, {found.num_steps / found.autocorrelation_time:.0f} "
+    text += f"autocorrelation times, R-hat {found.rhat:.3f}. "
+    if unknown_read_noise(detector):
+        text += UNKNOWN_READ_NOISE + " "
+    if detector.misfit > LARGEST_MISFIT:
+        text += (
+            f"The readings depart from any Poisson-Gaussian detector (χ² per degree of freedom {detector.misfit:.2f}), so "
+            "the true errors are larger than these intervals. "
+        )
+    return text + EXCESS_NOISE
+
+
+def describe_burst(burst: BurstReport) -> str:
+    """What moved or faded along a burst, in words."""
+    if not np.isfinite(burst.drift):
+        drift = "The scene has too few features to measure a drift."
+    else:
+        drift = f"Largest drift between frames {burst.drift:.2f} px; " + (
+            "the other frames were moved onto each before they were compared."
+            if burst.drifting
+            else "the frames were compared as they are."
+        )
+    dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
+    return drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
+
+
+def describe_registration(pair: AlignedPair) -> str:
+    """The registration's figures in a sentence."""
+    found = pair.registration
+    x, y = found.shift(pair.short.shape)
+    method = f"SIFT, {found.inliers} of {found.matches} matches" if found.method == "sift" else "phase correlation"
+    counts = pair.counts
+    ratio = f"long over short {1 / pair.scaling.slope:.4g} by their scale"
+    if pair.exposure_ratio is not None and not pair.one_setting:
+        ratio += (
+            f", not {pair.exposure_ratio:.4g} as given: one detector setting did not take both as they are, so that their "
+            "scale tells no offset"
+        )
+    return (
+        f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
+        f"{found.scale:.5f}, standard error {found.error_px:.3f} px, matches' rms {found.rms_px:.2f} px; {ratio}. Left out: "
+        f"{counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
+        f"{counts.dead} dead" + (f", {counts.restless} in places that change." if counts.restless else ".")
+    )
+
+
+def write_report(
+    folder: str | Path,
+    findings: Findings,
+    *,
+    title: str = "Detector calibration",
+    inputs: Sequence[str | Path] = (),
+    seed: int | None = None,
+) -> Path:
+    """Write ``report.html`` into a folder, which is made if need be; returns its path.
+
+    Args:
+        folder: where to write.
+        findings: what to tell.
+        title: of the page.
+        inputs: files that were read, for their checksums.
+        seed: of the random choices.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    page = Report(title)
+    page.facts(_facts(findings))
+    page.heading("Verdict")
+    for sentence in judge(findings):
+        page.text(sentence)
+    _add_detector(page, findings)
+    _add_models(page, findings)
+    _add_registration(page, findings)
+    page.heading("Provenance")
+    page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
+    return page.save(folder / "report.html")
+
+
+def _facts(findings: Findings) -> list[tuple[str, str]]:
+    facts = []
+    if findings.detector is not None:
+        found = findings.detector.posterior
+        for name, unit, value in (
+            ("Gain", "counts/e⁻", found.gain),
+            ("Offset", "counts", found.offset),
+            ("Read noise", "e⁻ rms", found.read_noise),
+        ):
+            facts.append((f"{name}, {unit}", f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"))
+    facts.append(("Noise model that suffices", LABELS[simplest_sufficient(findings.scores).name]))
+    return facts
+
+
+def judge(findings: Findings) -> list[str]:
+    """What to believe, in words: the noise model, the detector's parameters, the registration."""
+    found = [verdict(findings.scores)]
+    detector = findings.detector
+    if detector is None:
+        found.append(f"The detector was not measured: {findings.no_detector}.")
+    else:
+        apart = detector.misfit > LARGEST_MISFIT
+        found.append(
+            (
+                "The intervals of gain, offset and read noise are too narrow: the readings depart from those of one "
+                "Poisson-Gaussian detector"
+                if apart
+                else "Gain, offset and read noise can be believed: the readings are those of a Poisson-Gaussian detector"
+            )
+            + f" (χ² per degree of freedom {detector.misfit:.2f}; 1 is perfect)."
+            + (f" {UNKNOWN_READ_NOISE}" if unknown_read_noise(detector) else "")
+        )
+    if findings.burst is None:
+        worst = max(pair.registration.error_px for pair in findings.pairs)
+        found.append(
+            f"The exposures lie on each other to {worst:.3f} px"
+            + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
+        )
+        shares = [share for share in map(structured_share, findings.pairs) if np.isfinite(share)]
+        found += [_judge_structure(max(shares))] if shares else []
+    return found
+
+
+def _judge_structure(share: float) -> str:
+    text = f"Of the residual's variance {100 * max(share, 0.0):.1f} % is smooth structure, which is no noise"
+    if share > LARGEST_STRUCTURE:
+        return (
+            text
+            + ": scene or illumination changed between the exposures. Look at the residual map, and take them anew."
+        )
+    return text + ": too little to matter."
+
+
+def unknown_read_noise(detector: Detector) -> bool:
+    """Whether the exposures leave the read noise open by more than a factor of three."""
+    interval = detector.posterior.read_noise
+    return interval.q95 > 3 * interval.q05
+
+
+def _add_detector(page: Report, findings: Findings) -> None:
+    page.heading("Detector")
+    if findings.detector is None:
+        page.text(f"Not measured: {findings.no_detector}")
+        return
+    words = describe_detector(findings.detector)
+    page.text(words[0].upper() + words[1:])
+    page.figure(
+        photon_transfer_figure(findings.detector),
+        caption="Photon transfer: variance against signal; band: 90 % of the posterior.",
+    )
+    page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
+
+
+def _add_models(page: Report, findings: Findings) -> None:
+    page.heading("Noise models")
+    caption = (
+        "NLL: negative log-likelihood of pixels kept apart from the fit, nats per pixel, lower is better. JSD (nats), "
+        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: what the model's own samples would give."
+    )
+    page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
+    histograms = histogram_figure(findings.pixels, findings.scores)
+    page.figure(
+        histograms,
+        caption="Residuals of the pixels kept apart at each level of signal (grey), with every model on top.",
+    )
+    page.figure(
+        pit_figure(findings.scores),
+        caption="Each model on the pixels kept apart: histogram of its probability integral transform (PIT), and QQ.",
+    )
+
+
+def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
+    page.heading("Registration and residual")
+    if findings.burst is not None:
+        page.text(describe_burst(findings.burst))
+    for number, pair in enumerate(findings.pairs[:most], 1):
+        page.text(f"Pair {number}: {describe_registration(pair)}")
+        page.figure(
+            registration_figure(pair),
+            caption="Overlay before and after registration. Magenta: short, green: long; grey where they agree.",
+        )
+        page.figure(
+            residual_figure(pair), caption="What is left: map, and row and column profiles. It must be structureless."
+        )
+    if len(findings.pairs) > most:
+        page.text(f"{len(findings.pairs) - most} more pairs are not drawn.")

@@ -1,0 +1,5 @@
+"""The program `noiseflow` and the commands that need no other package."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,2 @@
+from .sampling import evaluate as evaluate
+from .sampling import sample as sample

@@ -1,0 +1,210 @@
+"""The program `noiseflow`: finds its commands by entry point, and turns user mistakes into one clear line.
+
+Nothing here imports torch, so that ``noiseflow -h`` answers at once.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import signal
+import sys
+import threading
+import warnings
+from importlib.metadata import entry_points, version
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from noiseflow.commands.console import START_AGAIN, Invocation, end_stopped, invoked
+
+_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
+_TYPED = "noiseflow.typed"
+_UNASKED = ("DEFAULT", "DEFAULT_MAP")
+
+
+def build_app() -> typer.Typer:
+    """The command-line application with every installed command."""
+    app = typer.Typer(
+        name="noiseflow",
+        cls=_Group,
+        help="Learn a microscope's noise, sample it, and reconstruct clean volumes from noisy tilt series.",
+        no_args_is_help=True,
+        add_completion=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(_options)
+    found = {point.name: point for point in entry_points(group="noiseflow.commands")}
+    for name in sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
+        app.command(name, cls=_ListCommand)(found[name].load())
+    return app
+
+
+class _Group(TyperGroup):
+    """The program itself: Ctrl-C ends whatever it runs with one line and exit code 130."""
+
+    def get_params(self, ctx: Any) -> Any:
+        return _flags_without_type(super().get_params(ctx))
+
+    def make_context(self, *words: Any, **more: Any) -> Any:
+        try:
+            return super().make_context(*words, **more)
+        except KeyboardInterrupt:
+            end_stopped(f"stopped; {START_AGAIN}")
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            end_stopped(f"{ctx.invoked_subcommand} stopped; {str(stop) or START_AGAIN}")
+
+
+class _ListCommand(TyperCommand):
+    """A command that remembers how it was called, and whose list options take several values.
+
+    ``--short a b c`` stands for ``--short a --short b --short c``.
+    """
+
+    def get_params(self, ctx: Any) -> Any:
+        return _flags_without_type(super().get_params(ctx))
+
+    def invoke(self, ctx: Any) -> Any:
+        given = {name: ctx.get_parameter_source(name).name not in _UNASKED for name in ctx.params}
+        options = {name: (value, given[name]) for name, value in ctx.params.items()}
+        with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+            return super().invoke(ctx)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta[_TYPED] = tuple(args)
+        lists = {name for option in self.params if getattr(option, "multiple", False) for name in option.opts}
+        spread: list[str] = []
+        current = None
+        for argument in args:
+            if argument.startswith("-") and argument != "-":
+                current = argument if argument in lists else None
+            elif current is not None and spread[-1] != current:
+                spread.append(current)
+            spread.append(argument)
+        rest: list[str] = super().parse_args(ctx, spread)
+        return rest
+
+
+def _flags_without_type(parameters: list[Any]) -> list[Any]:
+    """The help shows a flag as what is typed, ``--resume``: without a type, which would look like a value to give."""
+    for parameter in parameters:
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    return parameters
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        print(f"noiseflow {version('noiseflow')}")
+        raise typer.Exit()
+
+
+def _options(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
+    ] = False,
+) -> None:
+    """Learn a microscope's noise, sample it, and reconstruct clean volumes from noisy tilt series."""
+    del context, debug, show_version
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug, interrupts = "--debug" in arguments, _Interrupts()
+    if not debug:
+        warnings.showwarning = _show_warning
+        logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
+    try:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, interrupts)  # a batch system's stop leaves nothing half done
+            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                signal.signal(signal.SIGINT, interrupts)
+            _keep_ctrl_c()
+        build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
+    except KeyboardInterrupt:
+        end_stopped(f"stopped; {START_AGAIN}")
+    except SystemExit as end:
+        untold = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # stopped again, before a line was printed
+        if end.code == 130 and untold:
+            end_stopped(f"stopped; {START_AGAIN}")
+        raise
+    except BrokenPipeError:
+        sys.exit(1)
+    except Exception as error:
+        if interrupts.came:
+            end_stopped(f"stopped; {START_AGAIN}")
+        if debug:
+            raise
+        print(f"noiseflow: {_in_one_line(error)}", file=sys.stderr)
+        sys.exit(1)
+
+
+class _Interrupts:
+    """Raises `KeyboardInterrupt`, and remembers it: compiled libraries make errors of other kinds of it on its way."""
+
+    came = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        self.came = True
+        raise KeyboardInterrupt
+
+
+def _keep_ctrl_c() -> None:
+    """Let an interrupt that came while an object was cleared away, where Python drops it, come again a moment later."""
+    others, main_thread = sys.unraisablehook, threading.main_thread().ident
+    if others.__module__ == __name__ or not hasattr(signal, "pthread_kill") or main_thread is None:
+        return
+
+    def again(found: Any) -> None:
+        if isinstance(found.exc_value, KeyboardInterrupt):
+            threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
+        else:
+            others(found)
+
+    sys.unraisablehook = again
+
+
+def _in_one_line(error: Exception) -> str:
+    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
+    if isinstance(error, (ValueError, ModuleNotFoundError)):
+        return text or type(error).__name__
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return (
+            f"out of memory ({text[:200] or 'no more could be had'}); take a smaller or binned input, or fewer voxels"
+        )
+    if isinstance(error, OSError):
+        return _system_error(error)
+    return (
+        f"unexpected {type(error).__name__}: {text[:300]}; this is a fault of noiseflow: please report it with --debug"
+    )
+
+
+def _system_error(error: OSError) -> str:
+    if error.errno is None or (error.filename is None and error.strerror is None):
+        return " ".join(str(error).split())
+    where = "" if error.filename is None else f"{error.filename}: "
+    fix = {
+        errno.ENOSPC: "free some space, or write to another disk",
+        errno.EDQUOT: "free some space, or write to another disk",
+        errno.EFBIG: "the limit on file sizes is reached: write to another disk, or raise it (ulimit -f)",
+        errno.EACCES: "check the permissions, or choose another path",
+        errno.EPERM: "check the permissions, or choose another path",
+        errno.EROFS: "choose a folder that can be written to",
+        errno.ENOENT: "check the path",
+        errno.ENAMETOOLONG: "choose a shorter name",
+    }.get(error.errno, "check the path and the disk")
+    return f"{where}{(error.strerror or 'system error').lower()}; {fix}"
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if category is UserWarning:
+        print(f"noiseflow: warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -1,0 +1,113 @@
+"""The command `noiseflow demo`: the other commands in sequence on small shipped files, ending with one report."""
+
+from __future__ import annotations
+
+import contextlib
+import io as textio
+import json as jsonlib
+import time
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output, SeedOption, progress_shown
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate, sample and reconstruct on real data that ships with the library; ends with a report."""
+    from noiseflow.io import check_folder
+    from noiseflow.report import Report
+
+    output = Output(json)
+    started = time.perf_counter()
+    check_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    report = Report("noiseflow demo", "Everything below was made by the commands shown; repeat them on your own files.")
+    report.text(
+        "Three uses on real data: calibrate a detector from a short and a long exposure, sample its noise, and reconstruct "
+        "volumes from noisy tilt series."
+    )
+    run = _Runner(output, report, str(seed))
+    with as_file(files("noiseflow") / "data") as data:
+        short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
+        model = out / "detector.safetensors"
+        calibration = run("calibrate", "--short", short, "--long", long, "-o", model, "--report", out / "calibration")
+        clean, noisy = out / "clean.tif", out / "sampled.tif"
+        _write_clean(long, clean, calibration["registration"][0])
+        run("sample", model, clean, "-o", noisy)
+        _draw_samples(report, short, clean, noisy)
+        needle = data / "tilt_needle" / "needle_aligned.mrc"
+        run("reconstruct", needle, "-o", out / "needle.mrc", "--mode", "linear", "--report", out / "needle")
+    phantom = out / "phantom"
+    run("simulate", phantom, "--size", "64")
+    run(
+        "reconstruct",
+        phantom / "tilts.mrc",
+        "-o",
+        out / "phantom.mrc",
+        "--report",
+        out / "phantom-report",
+        "--reference",
+        phantom / "truth.mrc",
+    )
+    run("compare", out / "phantom.mrc", phantom / "truth.mrc", "--report", out / "comparison")
+    page = report.save(out / "report.html")
+    output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
+    output.result({"report": page.resolve(), "seconds": time.perf_counter() - started})
+
+
+class _Runner:
+    """Runs a command of this program, shows it, and takes its report into the page."""
+
+    def __init__(self, output: Output, report: Any, seed: str) -> None:
+        self.output, self.report, self.seed = output, report, seed
+
+    def __call__(self, command: str, *arguments: str | Path) -> dict[str, Any]:
+        from noiseflow.commands.cli import build_app
+
+        words = [command, *map(str, arguments)]
+        shown = "noiseflow " + " ".join(words)
+        self.output.line(f"\n$ {shown}")
+        self.report.command(f"$ {shown}")
+        if command != "compare":
+            words += ["--seed", self.seed]
+        printed = textio.StringIO()
+        shown_progress = contextlib.nullcontext() if self.output.json_mode else progress_shown()
+        with contextlib.redirect_stdout(printed), shown_progress:
+            build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
+        result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
+        if result.get("report"):
+            self.report.include(result["report"])
+        return result
+
+
+def _write_clean(long: Path, target: Path, registration: dict[str, Any]) -> None:
+    """The long exposure at the short exposure's scale: a nearly clean image in the detector's units."""
+    import numpy as np
+
+    from noiseflow import io
+
+    scaled = registration["slope"] * io.read_image(long).astype(np.float32) + registration["intercept"]
+    io.write(target, scaled.astype(np.float32))
+
+
+def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
+    import numpy as np
+
+    from noiseflow import io
+    from noiseflow.report import new_figure, show_image
+
+    images = [io.read_image(path) for path in (clean, noisy, short)]
+    low, high = np.percentile(images[2], (0.5, 99.5))
+    figure, axes = new_figure(3)
+    for axis, image, title in zip(
+        axes[0], images, ("clean (long exposure)", "sampled noise", "real short exposure"), strict=True
+    ):
+        show_image(axis, image[100:300, 100:300], title, limits=(float(low), float(high)))
+    report.figure(figure, caption="The sampled image should be impossible to tell from the real short exposure.")

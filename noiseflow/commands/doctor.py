@@ -1,0 +1,122 @@
+"""The command `noiseflow doctor`: what is installed, what is missing, and whether it works on this machine."""
+
+from __future__ import annotations
+
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, entry_points, requires, version
+from typing import Any
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output
+
+
+def doctor(json: JsonOption = False) -> None:
+    """Check the installation: versions, devices, extras, and a self-test of a few seconds."""
+    out = Output(json)
+    packages = _packages()
+    python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
+    out.line(f"noiseflow {version('noiseflow')}, {python}\n")
+    out.table(("package", "version"), [(name, found or "missing") for name, found in packages.items()])
+    devices = _devices()
+    out.line(f"\ndevices: {'; '.join(devices)}\n")
+    extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
+    rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
+    for name, advice in rows:
+        out.line(f"extra [{name}]: {advice}")
+    tests = run_self_tests()
+    out.line("")
+    for name, result in tests.items():
+        out.line(f"self-test {name}: {result['problem'] or 'ok'} ({result['seconds']:.1f} s)")
+    healthy = all(packages.values()) and not any(result["problem"] for result in tests.values())
+    out.result(
+        {
+            "healthy": healthy,
+            "versions": {"noiseflow": version("noiseflow"), "python": platform.python_version(), **packages},
+            "devices": devices,
+            "extras": {
+                name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
+            },
+            "self_tests": tests,
+        }
+    )
+    if not healthy:
+        raise typer.Exit(1)
+
+
+def run_self_tests() -> dict[str, dict[str, Any]]:
+    """Every self-test of the installed packages (entry points ``noiseflow.self_tests``): its problem, or None, and time."""
+    results = {}
+    for point in sorted(entry_points(group="noiseflow.self_tests"), key=lambda point: point.name):
+        started = time.perf_counter()
+        try:
+            problem = point.load()()
+        except Exception as error:  # whatever breaks is what the user wants to know
+            problem = f"{type(error).__name__}: {error}"
+        results[point.name] = {"problem": problem, "seconds": time.perf_counter() - started}
+    return results
+
+
+def check_noise_models() -> str | None:
+    """Fit a signal-dependent Gaussian to noise of known strength and sample it; returns the problem, or None."""
+    import torch
+
+    import noiseflow
+
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.linspace(10, 100, 5_000)
+    observation = signal + signal.sqrt() * torch.randn(signal.shape, generator=generator)
+    model = noiseflow.SignalDependentGaussian()
+    noiseflow.fit(model, signal, observation, num_steps=60, generator=generator)
+    sampled = model(signal).sample(generator=generator) - signal
+    ratio = float(sampled.std() / (observation - signal).std())
+    return None if 0.8 < ratio < 1.25 else f"the fitted model's noise is {ratio:.2f} times the true one"
+
+
+def _packages() -> dict[str, str | None]:
+    return {name: _version(name) for name in _requirements().get("", [])}
+
+
+def _extras() -> dict[str, list[str]]:
+    """Extra -> its packages that are missing."""
+    return {
+        extra: [name for name in names if _version(name) is None] for extra, names in _requirements().items() if extra
+    }
+
+
+def _requirements() -> dict[str, list[str]]:
+    """Extra ("" for the core) -> names of the packages it needs on this machine."""
+    from packaging.requirements import Requirement
+
+    found: dict[str, list[str]] = {}
+    for line in requires("noiseflow") or []:
+        requirement = Requirement(line)
+        _, _, extra = line.partition("extra == ")
+        extra = extra.strip(" \"')")
+        if requirement.name != "noiseflow" and (
+            requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+        ):
+            found.setdefault(extra, []).append(requirement.name)
+    return found
+
+
+def _advice(extra: str, missing: list[str]) -> str:
+    return f"missing {', '.join(missing)}; install with: pip install 'noiseflow[{extra}]'" if missing else "installed"
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _devices() -> list[str]:
+    import torch
+
+    found = [f"cpu ({torch.get_num_threads()} threads)"]
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        found.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
+    return found if len(found) > 1 else [*found, "no CUDA GPU"]

@@ -1,0 +1,178 @@
+"""The commands `noiseflow sample` and `noiseflow evaluate`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    Progress,
+    SeedOption,
+    StepReport,
+    choose_device,
+    progress_bar,
+    step_report,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+_PIECE = 2**20  # pixels sampled at once
+_BASELINE_STEPS = 500
+
+
+def sample(
+    model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
+    clean: Annotated[Path, typer.Argument(help="Clean image or stack, in the model's units.")],
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noisy image to write (.tif, .mrc, .npy).")],
+    seed: SeedOption = 0,
+    device: DeviceOption = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Put realistic noise on a clean image or stack."""
+    import noiseflow
+    from noiseflow import io
+
+    io.check_output(output)
+    io.require_other(output, clean)
+    image = io.read(clean)
+    io.require_finite(image.data, clean)
+    noise_model = noiseflow.load(model).to(choose_device(device))
+    num_pieces = max(1, -(-image.data.size // _PIECE))
+    with progress_bar("Sampling", num_pieces, json_mode=json) as progress:
+        noisy = _sample(noise_model, _tensor(image.data), seed, progress)
+    io.write(output, noisy.numpy(), voxel_size=image.voxel_size)
+    out = Output(json)
+    standardisation = next((m for m in noise_model.modules() if hasattr(m, "signal_low")), None)
+    if standardisation is not None:
+        low, high = (getattr(standardisation, name).item() for name in ("signal_low", "signal_high"))
+        outside = float(((image.data < low) | (image.data > high)).mean())
+        if outside > 0.01:
+            out.line(
+                f"note: {outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
+                "they get the noise of the nearest end"
+            )
+    out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))}, mean {noisy.double().mean():.6g}")
+    out.result({"output": str(output), "shape": list(noisy.shape), "mean": float(noisy.double().mean()), "seed": seed})
+
+
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
+    signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; once for each pair.")],
+    observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of the same size.")],
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Fit Gaussian and Poisson models on one half, judge all on the other.")
+    ] = False,
+    seed: SeedOption = 0,
+    device: DeviceOption = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Judge a noise model on pairs of clean and noisy images: likelihood and divergences, each beside its floor."""
+    import numpy as np
+    import torch
+
+    import noiseflow
+    from noiseflow import metrics
+    from noiseflow.metrics.spatial import spatial_structure
+
+    out = Output(json)
+    where = choose_device(device)
+    models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
+    pairs = _read_pairs(signal, observation)
+    clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
+    if baselines:
+        # NumPy's stream, not torch's: noise that `sample` drew with the same seed must not decide which pixels judge
+        half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
+        train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
+        with step_report(json_mode=json) as report:
+            models |= _fitted_baselines(train_signal, train_observation, seed, report)
+    with progress_bar("Judging", len(models) + len(pairs), json_mode=json) as progress:
+        results, structures = {}, []
+        for name, item in models.items():
+            results[name] = metrics.evaluate(item, clean, noisy, seed=seed)
+            progress(len(results), name)
+        for pair in pairs:
+            structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
+            progress(len(results) + len(structures), "neighbours")
+    out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
+    for path, structure in zip(observation, structures, strict=True):
+        out.line(f"{path}: {structure.in_words()}")
+    out.result(
+        {
+            "models": {name: asdict(result) for name, result in results.items()},
+            "num_pixels": clean.numel(),
+            "spatial": [asdict(structure) for structure in structures],
+        }
+    )
+
+
+def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, report: StepReport) -> dict[str, nn.Module]:
+    import torch
+
+    import noiseflow
+
+    fitted: dict[str, nn.Module] = {}
+    for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
+        name, generator = type(baseline).__name__, torch.Generator().manual_seed(seed)
+
+        def progress(done: int, note: str, title: str = f"Fitting {name}") -> None:
+            report(title, done, _BASELINE_STEPS, note)
+
+        fitted[name] = noiseflow.fit(
+            baseline.to(signal.device),
+            signal,
+            observation,
+            num_steps=_BASELINE_STEPS,
+            generator=generator,
+            progress=progress,
+        ).noise_model
+    return fitted
+
+
+def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Tensor, Tensor]]:
+    import numpy as np
+
+    from noiseflow import io
+
+    if len(signals) != len(observations):
+        raise ValueError(
+            f"{len(signals)} --signal and {len(observations)} --observation files; give one of each per pair"
+        )
+    pairs = []
+    for paths in zip(signals, observations, strict=True):
+        clean, noisy = (io.read(path).data for path in paths)
+        for data, path in zip((clean, noisy), paths, strict=True):
+            io.require_finite(data, path)
+        if clean.shape != noisy.shape:
+            raise ValueError(
+                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes"
+            )
+        if np.array_equal(clean, noisy):
+            raise ValueError(f"{paths[0]} and {paths[1]} hold the same pixels; give the noisy image as --observation")
+        pairs.append((_tensor(clean), _tensor(noisy)))
+    return pairs
+
+
+def _sample(noise_model: nn.Module, signal: Tensor, seed: int, progress: Progress) -> Tensor:
+    import torch
+
+    device = next(noise_model.parameters()).device
+    generator = torch.Generator(device).manual_seed(seed)
+    pieces = []
+    for piece in torch.split(signal.reshape(-1), _PIECE):
+        pieces.append(noise_model(piece.to(device)).sample(generator=generator).cpu())
+        progress(len(pieces), "")
+    return torch.cat(pieces).reshape(signal.shape)
+
+
+def _tensor(data: Any) -> Tensor:
+    import numpy as np
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(data, dtype=np.float32))

@@ -1,0 +1,5 @@
+"""What noise models return, and the maps and laws these are built from."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,324 @@
+"""Fast lookup of likelihoods and quantiles: both are functions of two scalars, so tabulate them and interpolate.
+
+Lookups are bilinear and run as one fused pass over the pixels (``grid_sample``), at about the cost of a normal log-density.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from noiseflow.distributions.picked import needs_image
+
+LARGE = 2**18
+"""Inputs of at least so many pixels are tabulated where no gradient is asked for."""
+
+SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
+_LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
+_COARSE = 65
+_CHUNK = 2**16
+_LATENT_LIMIT = 6.5
+
+
+@dataclass(frozen=True)
+class RootScale:
+    """A scale of readings on which noise is about equally wide everywhere: √((reading − low)/(high − low) + shift).
+
+    Below `low` it goes on along its slope, for observations fall below every signal.
+    """
+
+    low: float
+    high: float
+    shift: float
+
+    @staticmethod
+    def of(noise_model: nn.Module, low: float, high: float, like: Tensor) -> RootScale:
+        """The scale for signals from `low` to `high`: the variance of the noise as a straight line between its extremes."""
+        variance = _variance(noise_model, low, high, like)
+        least, most = float(variance.min()), float(variance.max())
+        found = least / (most - least) if most > least else math.inf
+        return RootScale(low, high, min(max(found, _LEAST_SHIFT), _MOST_SHIFT))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The scale at `low` and at `high`."""
+        return self.shift**0.5, (1 + self.shift) ** 0.5
+
+    def signal(self, signal: Tensor) -> Tensor:
+        """The scale at signals inside the range."""
+        scale = 1 / (self.high - self.low)
+        return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
+
+    def observation(self, observation: Tensor) -> Tensor:
+        """The scale at any readings."""
+        share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
+        root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
+        return root
+
+    def inverse(self, root: Tensor) -> Tensor:
+        """The readings at places of the scale."""
+        start = self.shift**0.5
+        share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
+        readings: Tensor = self.low + (self.high - self.low) * share
+        return readings
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Growth of the scale per unit of signal."""
+        return 0.5 / ((self.high - self.low) * self.signal(signal))
+
+
+def _variance(noise_model: nn.Module, low: float, high: float, like: Tensor) -> Tensor:
+    coarse = torch.linspace(low, high, _COARSE, dtype=like.dtype, device=like.device)
+    variance: Tensor = getattr(noise_model, "model", noise_model)(coarse).variance.detach()
+    return variance
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Signals spaced evenly on a scale."""
+
+    scale: RootScale
+    count: int
+
+    def signals(self, like: Tensor) -> Tensor:
+        """The rows' signals, (rows, 1)."""
+        root = torch.linspace(*self.scale.ends, self.count, dtype=torch.float64)
+        return self.scale.inverse(root).to(like)[:, None]
+
+    def position(self, root: Tensor, out: Tensor) -> Tensor:
+        """Row coordinate in [−1, 1] of places of the scale, written to `out`."""
+        start, stop = self.scale.ends
+        return torch.add(root * (2 / (stop - start)), -2 * start / (stop - start) - 1, out=out)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Equally spaced residuals on a scale, with a column at each end for observations on a rail.
+
+    In texture coordinates an observation's column is offset − rate · (the signal's place on the scale); on a rail the rate is 0.
+    """
+
+    scale: RootScale
+    start: float
+    stop: float
+    count: int
+    rail_low: float
+    rail_high: float
+    wide: bool
+
+    @property
+    def step(self) -> float:
+        return (self.stop - self.start) / (self.count - 1)
+
+    def values(self, signals: Tensor) -> Tensor:
+        """Observations tabulated for the rows' signals (rows, 1): (rows, columns)."""
+        residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64, device=signals.device)
+        inner = self.scale.inverse(self.scale.signal(signals.double()) + residuals[None, :]).to(signals)
+        ends = [
+            torch.full_like(signals, rail if math.isfinite(rail) else 0.0) for rail in (self.rail_low, self.rail_high)
+        ]
+        return torch.cat([ends[0], inner, ends[1]], dim=1)
+
+    def position(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
+        """Offset, rate and, where some residuals may lie outside the columns, the bounds that keep them off the rails."""
+        unit = 2 / (self.count + 1)
+        root = self.scale.observation(observation)
+        offset = root * (unit / self.step) + ((1 - self.start / self.step) * unit - 1)
+        rate = torch.full_like(offset, unit / self.step)
+        low, high = torch.full_like(offset, unit - 1), torch.full_like(offset, 1 - unit)
+        if math.isfinite(self.rail_low) or math.isfinite(self.rail_high):
+            on_low, on_high = observation <= self.rail_low, observation >= self.rail_high
+            offset = torch.where(on_low, -1.0, torch.where(on_high, 1.0, offset))
+            on_rail = on_low | on_high
+            rate = rate.masked_fill_(on_rail, 0.0)
+            low, high = torch.where(on_rail, offset, low), torch.where(on_rail, offset, high)
+        return offset, rate, (low, high) if self.wide else None
+
+    @staticmethod
+    def of(noise_model: nn.Module, observation: Tensor, scale: RootScale, count: int) -> Columns:
+        """Columns for the residuals of given observations and the scale's signals."""
+        rail_low, rail_high = (
+            getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf))
+        )
+        inside = observation[(observation > rail_low) & (observation < rail_high)]
+        inside = inside if inside.numel() else observation
+        root = scale.observation(torch.stack(torch.aminmax(inside)))
+        start, stop = float(root[0]) - scale.ends[1], float(root[1]) - scale.ends[0]
+        coarse = torch.linspace(scale.low, scale.high, _COARSE, dtype=observation.dtype, device=observation.device)
+        width = _variance(noise_model, scale.low, scale.high, observation).sqrt() * scale.slope(coarse)
+        reach = 100 * float(width.max())
+        wide = stop - start > reach  # a few far outliers must not take the resolution from all others
+        if wide:
+            start, stop = max(start, -reach / 2), min(stop, reach / 2)
+        return Columns(scale, start, max(stop, start + 1e-9), count, rail_low, rail_high, wide)
+
+
+def interpolate(table: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear lookup in a (1, C, rows, columns) table at (N, 2) coordinates; (C, N)."""
+    return F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0]
+
+
+def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, between_rails: bool) -> Tensor:
+    """Log-likelihood on a table. With `between_rails` only the outer columns know of the rails, so that neighbours of a rail
+    interpolate cleanly."""
+    if between_rails and hasattr(noise_model, "without_rails"):
+        free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
+        outer = [noise_model(signals).log_prob(end) for end in ends]
+        value = torch.cat([outer[0], free(signals).log_prob(values[:, 1:-1]), outer[1]], dim=1)
+    else:
+        value = noise_model(signals).log_prob(values)
+    return torch.nan_to_num(value, nan=-1e5, neginf=-1e5, posinf=1e5).clamp(-1e5, 1e5)
+
+
+def mean_error(found: Tensor, exact: Tensor) -> float:
+    possible = torch.isfinite(exact)
+    error = float((found - exact)[possible].abs().mean()) if bool(possible.any()) else 0.0
+    return error if math.isfinite(error) else math.inf
+
+
+def _apart(low: float, high: float) -> tuple[float, float]:
+    return low, max(high, low + 1e-6 * (1 + abs(low)))
+
+
+def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
+    """Whether `log_prob` may take the place of the exact likelihood: many pixels, no gradient asked for."""
+    differentiable = torch.is_grad_enabled() and (
+        signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
+    )
+    large = observation.numel() >= LARGE and signal.shape == observation.shape
+    return large and not differentiable and not needs_image(noise_model)
+
+
+# the last table of each model, or None where none was accurate enough
+_likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Columns, Tensor] | None]] = (
+    weakref.WeakKeyDictionary()
+)
+_quantiles: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Tensor] | None]] = weakref.WeakKeyDictionary()
+
+
+def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
+    """What tells whether a model, and the range of its inputs, are still those that something was computed for."""
+    tensors = [*noise_model.parameters(), *noise_model.buffers()]
+    return (*limits, *((tensor.data_ptr(), tensor._version) for tensor in tensors))
+
+
+def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
+    """`log_prob` where the input is large, the model allows it (its ``tabulate``) and a table is accurate enough; else None."""
+    if not (getattr(noise_model, "tabulate", True) and is_large(noise_model, signal, observation)):
+        return None
+    return log_prob(noise_model, signal, observation)
+
+
+@torch.no_grad()
+def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = 1e-3) -> Tensor | None:
+    """Tabulated log-likelihood of many pixels, shaped like `observation`; None where no table is accurate enough.
+
+    The table is kept for the next call with the same model and the same range of values.
+    """
+    flat_signal, flat = signal.reshape(-1), observation.reshape(-1)
+    limits = tuple(float(bound) for tensor in (flat_signal, flat) for bound in torch.aminmax(tensor))
+    state = state_of(noise_model, *limits)
+    kept = _likelihoods.get(noise_model)
+    if kept is None or kept[0] != state:
+        made = _make_likelihood(noise_model, flat_signal, flat, limits, tolerance)
+        kept = _likelihoods[noise_model] = (state, made)
+    return None if kept[1] is None else _look_up(*kept[1], flat_signal, flat).reshape(observation.shape)
+
+
+def _make_likelihood(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, limits: tuple[float, ...], tolerance: float
+) -> tuple[Rows, Columns, Tensor] | None:
+    if not all(map(math.isfinite, limits)):
+        return None
+    part = slice(None, None, max(1, observation.numel() // 2048))
+    exact = noise_model(signal[part]).log_prob(observation[part])
+    scale = RootScale.of(noise_model, *_apart(*limits[:2]), observation)
+    for num_rows, num_columns in SIZES:
+        rows = Rows(scale, num_rows)
+        columns = Columns.of(noise_model, torch.tensor(limits[2:]).to(observation), scale, num_columns)
+        signals = rows.signals(observation)
+        values = log_likelihood(noise_model, signals, columns.values(signals), between_rails=True)
+        table = values[None, None].contiguous()
+        error = mean_error(_look_up(rows, columns, table, signal[part], observation[part]), exact)
+        if error <= tolerance / 2:  # half, because a sample of the pixels measured it
+            return rows, columns, table
+    return None
+
+
+def _look_up(rows: Rows, columns: Columns, table: Tensor, signal: Tensor, observation: Tensor) -> Tensor:
+    """Tabulated values of (N,) pixels, in pieces that stay in the cache."""
+    found = torch.empty_like(observation)
+    grid = torch.empty(min(_CHUNK, observation.numel()), 2, dtype=observation.dtype, device=observation.device)
+    for start in range(0, observation.numel(), _CHUNK):
+        s, o = signal[start : start + _CHUNK], observation[start : start + _CHUNK]
+        at = grid[: o.numel()]
+        offset, rate, bounds = columns.position(o)
+        root = rows.scale.signal(s)
+        torch.addcmul(offset, root, rate, value=-1, out=at[:, 0])
+        if bounds is not None:
+            torch.clamp(at[:, 0], *bounds, out=at[:, 0])
+        rows.position(root, at[:, 1])
+        found[start : start + _CHUNK] = interpolate(table, at)[0]
+    return found
+
+
+@torch.no_grad()
+def sample(
+    flow: nn.Module, signal: Tensor, generator: torch.Generator | None, *, tolerance: float = 1e-3
+) -> Tensor | None:
+    """Draw one observation per pixel by a table of quantiles over (signal, normal latent); None where none is accurate enough.
+
+    Args:
+        flow: a noise model whose distribution has ``from_latent``.
+        signal: any shape.
+        generator: source of the random numbers.
+        tolerance: accepted mean interpolation error, in standard deviations of the noise.
+    """
+    flat = signal.reshape(-1)
+    limits = tuple(float(bound) for bound in torch.aminmax(flat))
+    state = state_of(flow, *limits)
+    kept = _quantiles.get(flow)
+    if kept is None or kept[0] != state:
+        made = _make_quantiles(flow, flat, limits, tolerance)
+        kept = _quantiles[flow] = (state, made)
+    if kept[1] is None:
+        return None
+    rows, table = kept[1]
+    drawn = torch.randn(flat.shape, generator=generator, dtype=flat.dtype, device=flat.device)
+    for start in range(0, flat.numel(), _CHUNK):
+        piece = drawn[start : start + _CHUNK]
+        piece.copy_(_quantile(rows, table, flat[start : start + _CHUNK], piece))
+    return drawn.reshape(signal.shape)
+
+
+def _make_quantiles(
+    flow: nn.Module, signal: Tensor, limits: tuple[float, ...], tolerance: float
+) -> tuple[Rows, Tensor] | None:
+    if not all(map(math.isfinite, limits)):
+        return None
+    picked = signal[:: max(1, signal.numel() // 2048)]
+    latent = torch.randn(picked.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(picked)
+    distribution = flow(picked)
+    exact, scale = distribution.from_latent(latent), distribution.stddev
+    root = RootScale.of(flow, *_apart(*limits), signal)
+    for num_rows, num_columns in ((64, 512), (128, 1024), (256, 2048)):
+        rows = Rows(root, num_rows)
+        signals = rows.signals(signal)
+        nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, num_columns, dtype=torch.float64).to(signal)
+        table = (flow(signals).from_latent(nodes.expand(num_rows, -1)) - signals)[None, None].contiguous()
+        if mean_error(_quantile(rows, table, picked, latent) / scale, exact / scale) <= tolerance:
+            return rows, table
+    return None
+
+
+def _quantile(rows: Rows, table: Tensor, signal: Tensor, latent: Tensor) -> Tensor:
+    grid = torch.empty(signal.numel(), 2, dtype=signal.dtype, device=signal.device)
+    torch.mul(latent, 1 / _LATENT_LIMIT, out=grid[:, 0])
+    rows.position(rows.scale.signal(signal), grid[:, 1])
+    return signal + interpolate(table, grid)[0]

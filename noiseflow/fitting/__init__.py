@@ -1,0 +1,1 @@
+"""The optimisation loop, its tables, and the choice among noise models."""

@@ -1,0 +1,169 @@
+"""Fitting a noise model: alone on known signals, or jointly with any model of the signal. One call for both."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from noiseflow.arrays import as_tensor
+from noiseflow.distributions.picked import needs_image
+from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.fitting.pixels import FitPixels
+from noiseflow.fitting.signal_models import KnownSignal
+from noiseflow.models.digitisation import Digitisation, detect_digitisation
+from noiseflow.models.digitised import Digitised
+from noiseflow.models.scan_noise import ScanNoise, shared_axis
+
+_log = logging.getLogger("noiseflow")
+
+
+@torch.enable_grad()
+def fit(
+    noise_model: nn.Module,
+    signal: Tensor | NDArray[Any] | nn.Module,
+    observation: Tensor | NDArray[Any],
+    *,
+    mask: Tensor | NDArray[np.bool_] | None = None,
+    skip_non_finite: bool = False,
+    digitise: bool = True,
+    held_out: float | Tensor | NDArray[np.bool_] = 0.1,
+    num_steps: int = 500,
+    batch_size: int = 8192,
+    learning_rate: float = 1e-2,
+    warm_up: float = 0.0,
+    noise_interval: int = 10,
+    noise_steps: int = 10,
+    standardise: bool = True,
+    tabulate: bool = True,
+    generator: torch.Generator | None = None,
+    progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
+    checkpoint_interval: float | None = None,
+    resume: dict[str, Any] | None = None,
+) -> FitResult:
+    """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
+
+    The loss is the mean negative log-likelihood of the training pixels, plus the signal model's ``penalty()`` where it has one.
+    Learning rates fall geometrically to 1 %; in a joint fit more slowly at first, and to nothing at the end.
+
+    Args:
+        noise_model: the model to fit; one without trainable parameters stays as it is.
+        signal: clean signals, a tensor or an array shaped like `observation`, or a `SignalModel`. A trainable one may offer
+            ``parameter_groups()``, parameter groups with their learning rates for Adam.
+        observation: noisy readings, a tensor or an array of any shape and real type, detector units; for models that look
+            beyond single pixels, images (..., y, x).
+        mask: pixels to use, shaped like `observation`; all by default.
+        skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
+        digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
+            model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
+        held_out: fraction of the pixels, or those, boolean, that judge the fit and never train it.
+        num_steps: optimisation steps.
+        batch_size: pixels per noise-model step.
+        learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``.
+        warm_up: share of the steps of a joint fit in which its rates grow to their full size. Adam's first steps move everything
+            as far, which a rough start gains from and a good one is lost to.
+        noise_interval, noise_steps: in a joint fit, this many noise-model steps after every so many signal steps.
+        standardise: measure the data's scaling first and store it in the noise model.
+        tabulate: in a joint fit of many pixels, look the likelihood up in a table.
+        generator: source of the random choices.
+        progress: called with the steps done and a note.
+        checkpoint: called at every look at the held-out pixels, and on Ctrl-C, with all that `resume` needs.
+        checkpoint_interval: call it after a step every so many seconds instead.
+        resume: a state that `checkpoint` was given; the fit goes on from there.
+
+    Returns:
+        The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
+
+    Raises:
+        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, or no finite step could be made.
+    """
+    if not 0 <= warm_up < 1:
+        raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
+    if isinstance(signal, np.ndarray):
+        signal = as_tensor(signal)
+    observation = as_tensor(observation)
+    mask = mask if mask is None else as_tensor(mask)
+    held_out = as_tensor(held_out) if isinstance(held_out, np.ndarray) else held_out
+    if isinstance(signal, Tensor) and signal.shape != observation.shape:
+        raise ValueError(
+            f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
+        )
+    signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
+    use = _usable(signal_model, observation, mask, skip_non_finite)
+    digitisation = Digitisation()
+    if digitise and _may_be_wrapped(noise_model):
+        noise_model, digitisation = _behind_converter(noise_model, observation, use)
+    axis = shared_axis(noise_model)
+    if needs_image(noise_model) and observation.ndim < 2:
+        raise ValueError(
+            f"{type(noise_model).__name__} looks beyond single pixels: give images (..., y, x); these pixels have shape "
+            f"{tuple(observation.shape)}"
+        )
+    choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
+    pixels = choose(_as_floating(observation), use, held_out, _own_generator(generator))
+    loop = FitLoop(noise_model, signal_model, pixels, FitResult(noise_model, digitisation))
+    loop.prepare(num_steps, learning_rate, standardise and resume is None)
+    if resume is not None:
+        loop.load_state(resume)
+    schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
+    return loop.run(schedule, progress, checkpoint)
+
+
+def _usable(signal_model: nn.Module, observation: Tensor, mask: Tensor | None, skip_non_finite: bool) -> Tensor:
+    """The pixels to use, (N,) boolean."""
+    flat = observation.reshape(-1)
+    use = torch.ones_like(flat, dtype=torch.bool) if mask is None else mask.reshape(-1).bool()
+    if use.shape != flat.shape:
+        raise ValueError(f"mask has {use.numel()} pixels, observation {flat.numel()}; they must be equal")
+    finite = torch.isfinite(flat)
+    if isinstance(signal_model, KnownSignal):
+        finite &= torch.isfinite(signal_model.flat)
+    if skip_non_finite:
+        return use & finite
+    count = int((use & ~finite).sum())
+    if count:
+        raise ValueError(
+            f"{count} pixels of signal or observation are NaN or infinite; pass skip_non_finite=True or a mask that leaves "
+            "them out"
+        )
+    return use
+
+
+def _as_floating(observation: Tensor) -> Tensor:
+    return observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
+
+
+def _may_be_wrapped(noise_model: nn.Module) -> bool:
+    """Whether the model can learn, and none of its parts describes single readings already."""
+    known = any(getattr(module, "describes_single_readings", False) for module in noise_model.modules())
+    return not known and any(parameter.requires_grad for parameter in noise_model.parameters())
+
+
+def _behind_converter(noise_model: nn.Module, observation: Tensor, use: Tensor) -> tuple[nn.Module, Digitisation]:
+    """The model behind the rounding and rails that its readings show, and these; the model itself where they show none."""
+    readings = observation.detach().reshape(-1)[use].cpu()
+    found = detect_digitisation((readings.float() if readings.dtype == torch.bfloat16 else readings).numpy())
+    if not found.found or not (needs_image(noise_model) or _has_intervals(noise_model, observation.device)):
+        return noise_model, Digitisation()
+    _log.warning(
+        "readings are %s: the model is fitted behind that, and the result's noise_model describes it (digitise=False: do not)",
+        found.in_words(),
+    )
+    return noise_model.behind(found) if isinstance(noise_model, ScanNoise) else Digitised(noise_model, *found), found
+
+
+def _has_intervals(noise_model: nn.Module, device: torch.device) -> bool:
+    """Whether the model's distributions give the mass of an interval; those of other libraries do not."""
+    return hasattr(noise_model(torch.zeros(1, device=device)), "log_interval_prob")
+
+
+def _own_generator(generator: torch.Generator | None) -> torch.Generator:
+    """A stream of its own: data sampled with the same seed must not share its random numbers with the choice of pixels."""
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))

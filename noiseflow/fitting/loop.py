@@ -1,0 +1,338 @@
+"""The one optimisation loop: steps of the noise model and of the signal model, looks at the held-out pixels, recovery."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.described import described
+from noiseflow.distributions.picked import Signal, needs_image, pick, values_of, window_size
+from noiseflow.fitting.average import BestState, WeightAverage
+from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.pixels import FitPixels, thinned
+from noiseflow.fitting.steps import adam, take_step
+from noiseflow.models.digitisation import Digitisation
+
+Progress = Callable[[int, str], None]
+Checkpoint = Callable[[dict[str, Any]], None]
+_STANDARDISE_COUNT = 1_000_000
+_TABLE_COUNT = 30_000
+_LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
+_FIXED_COUNT = 2**20
+_ACCURATE = 2e-3  # nats per pixel
+_MAX_RECOVERIES = 8
+_LAST_RATE = 0.01
+_DECAY = 0.3  # of a joint fit, besides a straight line to nothing
+_LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
+
+
+@described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
+@dataclass
+class FitResult:
+    """What a fit reached.
+
+    Attributes:
+        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or rails were found.
+        digitisation: the rounding and rails it was put behind; none where it was left as it is.
+        held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
+        num_steps: steps taken.
+        seconds: wall time.
+        recoveries: how often a non-finite step was undone with half the learning rate.
+        history: step → held-out NLL, in the order measured.
+        table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
+    """
+
+    noise_model: nn.Module
+    digitisation: Digitisation = field(default_factory=Digitisation)
+    held_out_nll: float = math.nan
+    num_steps: int = 0
+    seconds: float = 0.0
+    recoveries: int = 0
+    history: dict[int, float] = field(default_factory=dict)
+    table_error: float | None = None
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How a fit goes: see `noiseflow.fit`."""
+
+    num_steps: int
+    batch_size: int
+    warm_up: float
+    noise_interval: int
+    noise_steps: int
+    tabulate: bool
+    checkpoint_interval: float | None
+
+
+class FitLoop:
+    """A noise model, a signal model and pixels, on their way to the most likely parameters."""
+
+    def __init__(self, noise_model: nn.Module, signal_model: nn.Module, pixels: FitPixels, result: FitResult) -> None:
+        self.noise_model, self.signal_model, self.pixels, self.result = noise_model, signal_model, pixels, result
+        self.best = BestState()
+        self.average: WeightAverage | None = None
+        self.done = 0
+        self.table: ObservationTable | None = None
+        self.resumed_table: dict[str, Any] | None = None
+        self.fixed_part: Tensor | None = None
+
+    def prepare(self, num_steps: int, learning_rate: float, standardise: bool) -> None:
+        """Scale the noise model to the data and set up the optimisers."""
+        if standardise and hasattr(self.noise_model, "standardise"):
+            with torch.no_grad():
+                pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
+                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
+        noise = [p for p in self.noise_model.parameters() if p.requires_grad]
+        self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
+        self.signal_optimiser = None
+        if any(p.requires_grad for p in self.signal_model.parameters()):
+            everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
+            own = getattr(self.signal_model, "parameter_groups", None)
+            self.signal_optimiser = adam(own() if own is not None else everything)
+        self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
+        if noise and self.signal_optimiser is None:
+            self.average = WeightAverage(self.noise_model)
+        self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
+
+    def run(self, schedule: Schedule, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
+        """Take all steps that are left, and end at the best held-out state."""
+        started = saved = time.perf_counter()
+        num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
+        large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
+        if joint and schedule.tabulate and large:
+            self.table = self._make_table()
+        if not joint and self.pixels.train.ndim == 1:
+            self.fixed_part = self._compute_fixed_part()
+        check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
+        good = self._models()
+        if self.done == 0:
+            self._judge(0)  # a good start must not be lost to worse steps
+        try:
+            for step in range(self.done + 1, num_steps + 1):
+                past = (step - 1) / num_steps
+                rate = (1 - past) * _DECAY**past if joint else _LAST_RATE**past
+                if joint and step < schedule.warm_up * num_steps:
+                    rate *= step / (schedule.warm_up * num_steps)
+                self._set_rates(rate / 2**self.result.recoveries)
+                if not self._take_step(step, schedule):
+                    self._recover(good)
+                self.done = step
+                look = step % check_every == 0 or step == num_steps
+                if look:
+                    good = self._judge(step) or good
+                    self._check_table(rarely=step < num_steps)
+                interval = schedule.checkpoint_interval
+                due = look if interval is None else time.perf_counter() - saved >= interval
+                if checkpoint is not None and due:
+                    checkpoint(self.state())
+                    saved = time.perf_counter()
+                if not joint and self._never_improves(schedule):
+                    break
+                if progress is not None:
+                    progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                checkpoint(self.state())
+            raise
+        if self.best.state is not None:
+            self._load_models(self.best.state)
+            scores, count = self.held_out_log_prob()
+            self.result.held_out_nll = -float(scores.sum()) / count
+        self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
+        return self.result
+
+    def _take_step(self, step: int, schedule: Schedule) -> bool:
+        """One step of whatever learns; False where it met a number that is not finite."""
+        joint = self.signal_optimiser is not None
+        finite = self._signal_step(schedule.batch_size)
+        if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
+            for _ in range(schedule.noise_steps if joint else 1):
+                finite &= take_step(self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size)))
+            if self.average is not None and finite:
+                self.average.update()
+            if self.table is not None:
+                self.table.rebuild(self.noise_model)
+        return finite
+
+    def _judge(self, step: int) -> dict[str, Any] | None:
+        """Look at the held-out pixels with the average of the weights, where there is one; the weights to go back to."""
+        with nullcontext() if self.average is None else self.average.in_place():
+            scores, count = self._look()
+            nll = -float(scores.sum()) / count
+            if not math.isfinite(nll):
+                return None
+            # a joint fit moves on slowly, and each of its looks is as good as its weights: there the best look counts
+            models = self._models()
+            if self.best.judge(models, scores, start=step == 0, strict=self.average is None):
+                self.result.held_out_nll = nll
+        self.result.history[step] = nll
+        return models if self.average is None else self._models()
+
+    def _look(self) -> tuple[Tensor, int]:
+        """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""
+        most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
+        if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
+            return self.held_out_log_prob(most)
+        pixels = thinned(self.pixels.judge, most)
+        with torch.no_grad():
+            return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
+
+    def _never_improves(self, schedule: Schedule) -> bool:
+        """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""
+        history = self.result.history
+        return self.done >= 0.4 * schedule.num_steps and history.get(0, math.inf) <= min(history.values(), default=0.0)
+
+    def _check_table(self, *, rarely: bool) -> None:
+        """Signals may leave the table; a model that learns may outgrow it, but slowly: seen in every fifth look."""
+        table = self.table
+        if table is None:
+            return
+        table.cover(self.noise_model, self._some_signals())
+        if self.noise_optimiser is not None and (not rarely or len(self.result.history) % 5 == 0):
+            table.check(self.noise_model)
+        self.result.table_error = table.error
+
+    def _make_table(self) -> ObservationTable:
+        signal = self._some_signals()
+        observed = self.pixels.observation[self.pixels.train]
+        low = float(torch.minimum(signal.min(), observed.min()))
+        high = float(torch.maximum(signal.max(), observed.max()))
+        return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=self.resumed_table)
+
+    @torch.no_grad()
+    def _some_signals(self) -> Tensor:
+        return values_of(self._signal(thinned(self.pixels.train, 100_000)))
+
+    def _signal_step(self, batch_size: int) -> bool:
+        def loss() -> Tensor:
+            whole = hasattr(self.signal_model, "signal") and self.pixels.train.ndim == 1
+            value = self._full_batch_loss() if whole else self._loss(self.pixels.batch(batch_size), learn_signal=True)
+            return value + self.signal_model.penalty() if hasattr(self.signal_model, "penalty") else value  # type: ignore[operator]
+
+        return self.signal_optimiser is None or take_step(self.signal_optimiser, loss)
+
+    @torch.no_grad()
+    def _compute_fixed_part(self) -> Tensor | None:
+        """What of every pixel's likelihood no step can change, where the noise model knows such a thing."""
+        pixels = torch.cat([self.pixels.train, self.pixels.judge])
+        if not hasattr(self.noise_model, "fixed_part") or pixels.numel() > _FIXED_COUNT:
+            return None
+        fixed: Tensor | None = None
+        for part in torch.split(pixels, 32768):
+            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[operator]
+            if found is None:
+                return None
+            if fixed is None:
+                fixed = found.new_zeros((self.pixels.observation.numel(), found.shape[-1]))
+            fixed[part] = found
+        return fixed
+
+    def _full_batch_loss(self) -> Tensor:
+        signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
+        observation, weight = self.pixels.observation, self.pixels.weight
+        if self.table is not None:  # a step wants the gradient alone, and the tangent has the same
+            return -torch.dot(self.table.slope(signal).mul_(weight), signal)
+        if needs_image(self.noise_model):
+            shape = self.pixels.shape
+            log_prob = self.noise_model(signal.reshape(shape)).log_prob(observation.reshape(shape)).reshape(-1)
+        else:
+            log_prob = self.noise_model(signal).log_prob(observation)
+        return -torch.dot(log_prob, weight.to(log_prob.dtype))
+
+    def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
+        """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""
+        log_prob = self._log_prob(pixels, learn_signal=learn_signal)
+        return -log_prob.mean() if pixels.ndim == 1 else -log_prob.sum() / self._count(pixels)
+
+    def _log_prob(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
+        """Log-likelihood of each pixel, or of each line, (P,)."""
+        with torch.set_grad_enabled(learn_signal):
+            signal = self._signal(pixels)
+        found: Tensor
+        if self.fixed_part is not None:
+            found = self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[operator]
+            return found
+        distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
+        found = distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
+        return found
+
+    def _count(self, pixels: Tensor) -> int:
+        return int(torch.isfinite(self.pixels.observation[pixels]).sum())
+
+    def _signal(self, pixels: Tensor) -> Signal:
+        if needs_image(self.noise_model):
+            return pick(self.signal_model, pixels, self.pixels.image, window_size(self.noise_model))
+        predicted: Tensor = self.signal_model(pixels)
+        return predicted
+
+    @torch.no_grad()
+    def held_out_log_prob(self, most: int = 100_000) -> tuple[Tensor, int]:
+        """Log-likelihoods of at most so many held-out pixels, or of lines of as many, and the number of pixels."""
+        pixels = thinned(self.pixels.judge, most)
+        parts = torch.split(pixels, max(1, 32768 // pixels[0].numel()))
+        return torch.cat([self._log_prob(part).double() for part in parts]), self._count(pixels)
+
+    def _models(self) -> dict[str, Any]:
+        models = {"noise_model": self.noise_model.state_dict()}
+        if self.signal_optimiser is not None:
+            models["signal_model"] = self.signal_model.state_dict()
+        return copy.deepcopy(models)
+
+    def _load_models(self, state: dict[str, Any]) -> None:
+        self.noise_model.load_state_dict(state["noise_model"])
+        if "signal_model" in state:
+            self.signal_model.load_state_dict(state["signal_model"])
+
+    def _recover(self, good: dict[str, Any]) -> None:
+        self.result.recoveries += 1
+        if self.result.recoveries > _MAX_RECOVERIES:
+            raise ValueError(
+                "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
+            )
+        self._load_models(good)
+        if self.average is not None:
+            self.average.restart()
+        for optimiser in self.optimisers:
+            optimiser.state.clear()
+
+    def _set_rates(self, factor: float) -> None:
+        for optimiser, rates in zip(self.optimisers, self.base_rates, strict=True):
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on from here."""
+        return {
+            **self._models(),
+            "best": self.best.saved(),
+            "average": None if self.average is None else self.average.state(),
+            "optimisers": copy.deepcopy([o.state_dict() for o in self.optimisers]),
+            "generator": self.pixels.generator.get_state(),
+            "history": dict(self.result.history),
+            "held_out_nll": self.result.held_out_nll,
+            "recoveries": self.result.recoveries,
+            "done": self.done,
+            "table": None if self.table is None else self.table.state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go back to a state that `state` returned."""
+        self._load_models(state)
+        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(saved)
+        self.pixels.generator.set_state(state["generator"])
+        self.best.load(state["best"])
+        self.done = state["done"]
+        if self.average is not None:
+            self.average.load_state(state["average"])
+        self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
+        self.result.recoveries, self.resumed_table = state["recoveries"], state["table"]

@@ -1,0 +1,191 @@
+"""The tabulated likelihood of a joint fit: observations stay fixed while their signals change."""
+
+from __future__ import annotations
+
+import copy
+import math
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.tabulated import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood, mean_error
+
+_MAX_LEVELS = 1024
+_STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
+_CHUNK = 2**18  # pixels; what a lookup writes for them stays in the cache
+_WORTHWHILE = 0.7  # error of finer columns, relative to that of the size before
+
+
+class ObservationTable:
+    """log p(o | s) and its signal derivative for pixels whose observations stay fixed while their signals change.
+
+    Rows are signals, columns residuals (noise changes fast along the residual and slowly along the signal). Where that is not
+    accurate enough and the observations have few levels (counts of a few electrons), columns are the levels themselves. Beyond
+    the rows the log-likelihood continues along its slope, so that a stray signal is still pulled back.
+
+    Args:
+        noise_model: the model to tabulate; call `rebuild` after it changes.
+        observation: (N,) readings.
+        signal_low, signal_high: range of the signals to expect.
+        tolerance: accepted mean absolute interpolation error, nats per pixel.
+        resume: what `state` returned; the table takes the same rows and columns again.
+
+    Attributes:
+        error: the error last measured, nats per pixel.
+    """
+
+    def __init__(
+        self,
+        noise_model: nn.Module,
+        observation: Tensor,
+        signal_low: float,
+        signal_high: float,
+        *,
+        tolerance: float = 1e-3,
+        resume: dict[str, Any] | None = None,
+    ) -> None:
+        if resume is not None:
+            signal_low, signal_high = resume["low"], resume["high"]
+        self.low, self.high = signal_low, max(signal_high, signal_low + 1e-6 * (1 + abs(signal_low)))
+        self._observation, self._tolerance, self._size = observation, tolerance, 0
+        self.error = math.inf
+        if resume is None:
+            self._refine(noise_model)
+        else:
+            self._build_again(noise_model, resume)
+
+    def state(self) -> dict[str, Any]:
+        """What makes the same rows and columns again: their number, the range of signals, the model they were laid out for."""
+        return {"low": self.low, "high": self.high, "size": self._size, "laid_out_for": self._laid_out_for}
+
+    def _exists(self, size: int) -> bool:
+        """Whether there is such a size: rows and columns, or rows with all levels of the observations for columns."""
+        return size < len(SIZES) or (size < 2 * len(SIZES) and self._levels is not None)
+
+    @cached_property
+    def _levels(self) -> Tensor | None:
+        """All levels of the observations, if they are few."""
+        some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
+        return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
+
+    def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
+        present, self._size = copy.deepcopy(noise_model.state_dict()), state["size"]
+        noise_model.load_state_dict(state["laid_out_for"])
+        self._build(noise_model, self._size)
+        noise_model.load_state_dict(present)
+        self.rebuild(noise_model)
+        self.error = self.measure_error(noise_model)
+
+    def _refine(self, noise_model: nn.Module) -> None:
+        """Take the first size from the present one on that is accurate enough, or else the most accurate one; sizes between
+        are left out where finer columns gain little."""
+        errors: dict[int, float] = {}
+        size = self._size
+        while self._exists(size):
+            errors[size] = self.error = self._build(noise_model, size)
+            self._size = size
+            if self.error <= self._tolerance:
+                return
+            stalled = self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
+            size = max(size + 1, len(SIZES)) if stalled else size + 1
+        best = min(errors, key=lambda size: errors[size])
+        if best != self._size:
+            self._size = best
+            self.error = self._build(noise_model, best)
+
+    def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
+        """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
+        likelihood has no curvature, and where rails hide the observations nothing else would hold a signal back."""
+        stray = int(_STRAY * signal.numel())
+        low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
+        if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
+            return
+        span = max(self.high - self.low, high - low)
+        # a wide margin at the weak end would take the resolution from weak signals, whose noise is the narrowest
+        self.low = 2 * low - self.low - _LOW_MARGIN * span if low < self.low else self.low
+        self.high = high + _MARGIN * span if high > self.high else self.high
+        self._refine(noise_model)
+
+    def check(self, noise_model: nn.Module) -> float:
+        """Measure the error again, and refine the table where the model has outgrown it."""
+        self.error = self.measure_error(noise_model)
+        if self.error > self._tolerance and self._exists(self._size + 1):
+            self._refine(noise_model)
+        return self.error
+
+    def _build(self, noise_model: nn.Module, size: int) -> float:
+        num_rows, num_columns = SIZES[size % len(SIZES)]
+        levels = self._levels if size >= len(SIZES) else None
+        self._laid_out_for = copy.deepcopy(noise_model.state_dict())
+        self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
+        self._rows = Rows(self._scale, num_rows)
+        self._signals = self._rows.signals(self._observation)
+        self._columns = None
+        if levels is None:
+            self._columns = Columns.of(noise_model, self._observation, self._scale, num_columns)
+            self._offset, self._rate, self._bounds = self._columns.position(self._observation)
+            self._values = self._columns.values(self._signals)
+        else:
+            last = max(levels.numel() - 1, 1)
+            self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._observation.dtype) / last - 1
+            self._rate, self._bounds = torch.zeros_like(self._offset), None
+            column = torch.cat([levels, levels]) if levels.numel() == 1 else levels
+            self._values = column[None, :].expand(num_rows, -1)
+        self.rebuild(noise_model)
+        return self.measure_error(noise_model)
+
+    @torch.no_grad()
+    def rebuild(self, noise_model: nn.Module) -> None:
+        """Tabulate the model as it is now."""
+        value = log_likelihood(noise_model, self._signals, self._values, between_rails=self._columns is not None)
+        (slope,) = torch.gradient(value, spacing=(self._signals[:, 0],), dim=0)
+        if self._columns is not None:
+            # along a column of equal residual r = t(o) − t(s) the observation moves with the signal:
+            # ∂/∂s at fixed o = ∂/∂s at fixed r − t'(s) ∂/∂r
+            (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
+            slope[:, 1:-1] -= along * self._scale.slope(self._signals)
+        # two tables, for a lookup of both channels of one takes three times as long as that of a single one
+        self._value, self._slope = value[None, None].contiguous(), slope[None, None].contiguous()
+
+    def log_prob(self, signal: Tensor, part: slice | Tensor = slice(None)) -> Tensor:
+        """Log-likelihood at (N,) signals, without gradient; of a part of the pixels, or some, where they are given."""
+        signal = signal.detach()
+        clamped = signal.clamp(self.low, self.high)
+        places = self._places(clamped, part)
+        value, slope = (interpolate(table, places)[0] for table in (self._value, self._slope))
+        return torch.addcmul(value, slope, signal - clamped)
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Derivative of the log-likelihood of each pixel with respect to its signal, at (N,) signals."""
+        signal = signal.detach()
+        found = torch.empty_like(signal)
+        chunk = _CHUNK if signal.device.type == "cpu" else signal.numel()
+        for start in range(0, signal.numel(), chunk):
+            part = slice(start, start + chunk)
+            found[part] = interpolate(self._slope, self._places(signal[part].clamp(self.low, self.high), part))[0]
+        return found
+
+    def _places(self, signal: Tensor, part: slice | Tensor) -> Tensor:
+        """Texture coordinates of signals within the rows, (n, 2)."""
+        root, places = self._scale.signal(signal), signal.new_empty(2, signal.numel())
+        across = torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=places[0])
+        if self._bounds is not None:
+            torch.clamp(across, self._bounds[0][part], self._bounds[1][part], out=across)
+        self._rows.position(root, out=places[1])
+        return places.T
+
+    @torch.no_grad()
+    def measure_error(self, noise_model: nn.Module, *, count: int = 1024) -> float:
+        """Mean absolute interpolation error, nats, at pixels paired with signals in proportion to their likelihood."""
+        part = slice(None, None, max(1, self._observation.numel() // count))
+        observation = self._observation[part]
+        generator = torch.Generator().manual_seed(0)
+        coarse = torch.linspace(self.low, self.high, 64, dtype=observation.dtype, device=observation.device)
+        likelihood = noise_model(coarse[:, None]).log_prob(observation.expand(coarse.numel(), -1)).cpu()
+        gumbel = -torch.log(-torch.log(torch.rand(likelihood.shape, generator=generator).clamp(1e-7, 1 - 1e-7)))
+        row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
+        jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
+        signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)
+        return mean_error(self.log_prob(signal, part), noise_model(signal).log_prob(observation))

@@ -1,0 +1,1 @@
+"""Noise models for other programs."""

@@ -1,0 +1,238 @@
+"""Where to climb the likelihood of a shot-plus-read-noise detector from: its maxima are many when electrons are resolved."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.electrons import log_density
+
+_NUM_LEVELS = 32
+_SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
+_NUM_CLIMBS = 3
+_SETTLED, _SETTLED_BEHIND, _SETTLING_STEPS = 49152, 16384, 12
+_SHARP = 0.4  # electrons; beyond, the noise hardly tells one electron's shift
+_FLATTEST = 0.04
+
+
+class Detector(NamedTuple):
+    """Gain (counts per electron), offset (counts) and read noise (electrons)."""
+
+    gain: float
+    offset: float
+    read_noise: float
+
+
+def find_detector(signal: Tensor, observation: Tensor) -> Detector:
+    """The most likely detector for (N,) signals and observations: many starts are scored, the best are climbed.
+
+    Starts with the measured variances come from a straight line of variance against signal; starts with a comb of electrons from
+    the strongest frequencies of the readings, which give the comb's spacing, phase and sharpness.
+
+    Raises:
+        ValueError: the observations equal the signals.
+    """
+    signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
+    variance = float((observation - signal).square().mean())
+    if not variance > 0:
+        raise ValueError(
+            "observation − signal is 0 everywhere: there is no noise to learn; check that the two images differ"
+        )
+    gain = _slope(signal, observation)
+    starts = [*_smooth_starts(signal, variance, gain), *_comb_starts(signal, observation, variance, gain)]
+    few = _part(signal, _SCORED)
+    ranked = sorted(starts, key=lambda start: -_score(start, signal[few], observation[few]))
+    many = _part(signal, _CLIMBED)
+    climbed = [_climb(start, signal[many], observation[many]) for start in _distinct(ranked)]
+    return max(climbed, key=lambda found: _score(found, signal[many], observation[many]))
+
+
+def likelihood_axes(detector: Detector, signal: Tensor, observation: Tensor) -> Tensor:
+    """(3, 3) steps of (log gain, offset, log read noise), in columns, that each cost about half a nat per pixel.
+
+    The inverse square root of the likelihood's curvature; directions in which it is flat get a step of five natural units.
+    """
+    signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
+    part = _part(signal, _SCORED)
+
+    def loss(change: Tensor) -> Tensor:
+        return -_log_prob(signal[part], observation[part], *_changed(detector, change))
+
+    with torch.enable_grad():
+        curvature = torch.autograd.functional.hessian(loss, torch.zeros(3, dtype=torch.float64))  # type: ignore[no-untyped-call]
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
+    root = (vectors / values.abs().clamp(min=_FLATTEST).sqrt()) @ vectors.T
+    units = torch.tensor([1.0, detector.gain * detector.read_noise, 1.0], dtype=torch.float64)
+    axes: Tensor = units[:, None] * root
+    return axes
+
+
+def _changed(start: Detector, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    read_noise = start.read_noise * torch.exp(change[2])
+    offset = start.offset + start.gain * start.read_noise * change[1]
+    return start.gain * torch.exp(change[0]), offset, read_noise.clamp(min=1e-2)
+
+
+def _part(signal: Tensor, count: int) -> Tensor:
+    """Indices of `count` pixels that cover the range of signals."""
+    order = torch.argsort(signal, stable=True)
+    return order[:: max(1, signal.numel() // count)]
+
+
+def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+    """Readings of few levels are spread over their cells: a density could otherwise grow without bound at the levels."""
+    levels = torch.unique(observation)
+    if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
+        return signal, observation
+    step = float(torch.diff(levels).min())
+    generator = torch.Generator().manual_seed(0)
+    return signal, observation + step * (torch.rand(observation.shape, generator=generator, dtype=torch.float64) - 0.5)
+
+
+def _slope(signal: Tensor, observation: Tensor) -> float:
+    """Slope of variance against signal, by weighted least squares over levels; at least 1e-3 standard deviations."""
+    order = torch.argsort(signal)
+    levels = [part for part in torch.tensor_split(order, _NUM_LEVELS) if part.numel() > 1]
+    mean = torch.stack([signal[part].mean() for part in levels])
+    variance = torch.stack([(observation[part] - signal[part]).square().mean() for part in levels])
+    weight = 1 / variance.clamp(min=1e-3 * float(variance.mean())) ** 2
+    centre = (weight * mean).sum() / weight.sum()
+    spread = (weight * (mean - centre) ** 2).sum()
+    slope = float((weight * (mean - centre) * variance).sum() / spread) if spread > 0 else 0.0
+    return max(slope, 1e-3 * math.sqrt(float(variance.mean())))
+
+
+def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detector]:
+    mean, low = float(signal.mean()), float(signal.min())
+    spread = math.sqrt(variance)
+    gains = [slope * factor for factor in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)]
+    gains += [spread * factor for factor in (0.03, 0.1, 0.3, 0.6, 1.0)]
+    starts = []
+    for gain in gains:
+        for read_noise in (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 5.0):
+            starts.append(Detector(gain, mean - variance / gain + gain * read_noise**2, read_noise))
+        for offset in (low, low - spread, low - 4 * spread):
+            rest = variance - gain * (mean - offset)
+            if rest > 0:
+                starts.append(Detector(gain, offset, math.sqrt(rest) / gain))
+    return starts
+
+
+def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[Detector]:
+    """Detectors whose electrons stand at the crests of the strongest frequencies near one per gain."""
+    readings = observation[_part(signal, _COMB)]
+    reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
+    if not 0 < reach < 400 * slope:
+        return []
+    frequency = torch.arange(0.6 / slope, 1.7 / slope, 0.2 / reach, dtype=torch.float64)
+    angle = 2 * math.pi * (readings - readings.mean())
+    wave = torch.stack([torch.exp(1j * f * angle).mean() for f in frequency])
+    size = torch.nn.functional.pad(wave.abs(), (1, 1))
+    crest = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (wave.abs() > 4 / math.sqrt(readings.numel()))
+    best = sorted(torch.nonzero(crest).flatten().tolist(), key=lambda i: -float(wave[i].abs()))[:4]
+    starts = []
+    for index in best:
+        gain = 1 / float(frequency[index])
+        read_noise = math.sqrt(max(-2 * math.log(float(wave[index].abs())), 0.01)) / (2 * math.pi)
+        phase = float(readings.mean()) + gain * float(wave[index].angle()) / (2 * math.pi)
+        expected = float(signal.mean()) - variance / gain + gain * read_noise**2
+        nearest = round((expected - phase) / gain)
+        starts += [Detector(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
+    return starts
+
+
+def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
+    """Climb the likelihood of (N,) pixels under `noise_model` in ``detector.change``; the detector is part of that model.
+
+    Detectors one electron further up or down tell themselves apart by little, and a maximum of some pixels may be one off: all
+    three are climbed with many pixels.
+    """
+    change = detector.change
+    part = _part(signal, _SETTLED if noise_model is detector else _SETTLED_BEHIND)  # intervals cost more
+    signal, observation = signal[part], observation[part]
+    start, learns = change.detach().clone(), change.requires_grad
+
+    def loss() -> Tensor:
+        log_prob: Tensor = noise_model(signal).log_prob(observation)
+        return -log_prob.double().mean()
+
+    change.requires_grad_(True)
+    found = [(_settled(change, start, loss), change.detach().clone())]
+    if float(detector.read_noise.detach()) < _SHARP:
+        along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
+        step = float(detector.gain.detach()) * along_offset.to(change)
+        found += [(_settled(change, start + side * step, loss), change.detach().clone()) for side in (-1, 1)]
+    with torch.no_grad():
+        change.copy_(min(found, key=lambda each: each[0])[1])
+    change.requires_grad_(learns)
+
+
+def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:
+    """Climb from `start`, in place; the loss reached, never above that of the start."""
+    with torch.no_grad():
+        change.copy_(start)
+        first = float(loss())
+    optimiser = torch.optim.LBFGS([change], max_iter=_SETTLING_STEPS, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = loss()
+        value.backward()  # type: ignore[no-untyped-call]
+        return value.detach()
+
+    with torch.enable_grad():
+        optimiser.step(closure)  # type: ignore[no-untyped-call]
+    change.grad = None
+    with torch.no_grad():
+        last = float(loss())
+        if last <= first:
+            return last
+        change.copy_(start)
+    return first if math.isfinite(first) else math.inf
+
+
+def _distinct(ranked: list[Detector]) -> list[Detector]:
+    """The first few that differ by more than a climb would: in gain, or by half an electron."""
+    kept: list[Detector] = []
+    for start in ranked:
+        near = any(
+            abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain
+            for one in kept
+        )
+        if not near:
+            kept.append(start)
+    return list(itertools.islice(kept, _NUM_CLIMBS))
+
+
+def _log_prob(signal: Tensor, observation: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> Tensor:
+    rate = (signal - offset).clamp(min=0) / gain
+    return (log_density((observation - signal) / gain, rate, read_noise) - torch.log(gain)).mean()
+
+
+@torch.no_grad()
+def _score(detector: Detector, signal: Tensor, observation: Tensor) -> float:
+    found = float(_log_prob(signal, observation, *(torch.tensor(each, dtype=torch.float64) for each in detector)))
+    return found if math.isfinite(found) else -math.inf
+
+
+def _climb(start: Detector, signal: Tensor, observation: Tensor) -> Detector:
+    """Maximum likelihood by a quasi-Newton method from one start."""
+    change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([change], max_iter=40, history_size=10, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        value = -_log_prob(signal, observation, *_changed(start, change))
+        value.backward()  # type: ignore[no-untyped-call]
+        return value.detach()
+
+    with torch.enable_grad():
+        optimiser.step(loss)  # type: ignore[no-untyped-call]
+    found = Detector(*(float(each.detach()) for each in _changed(start, change)))
+    better = all(map(math.isfinite, found)) and _score(found, signal, observation) > _score(start, signal, observation)
+    return found if better else start

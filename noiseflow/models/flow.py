@@ -1,0 +1,355 @@
+"""Conditional normalizing flows in one dimension: p(observation | signal) as a stack of monotone maps to a standard normal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions import tabulated
+from noiseflow.distributions.base import LatentDistribution, normal_quadrature
+from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
+from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
+from noiseflow.models.base import ArrayModel
+from noiseflow.models.standardisation import Standardisation, interpolate_cubic
+
+_NUM_NODES = 257
+_MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One map of a flow: how many raw parameters it takes, where they start, and how they become a transform.
+
+    Args:
+        initial: starting values of the raw parameters.
+        build: raw parameters (..., P) to a transform; any real parameters must give a valid one.
+        conditional: whether the parameters depend on the signal.
+    """
+
+    initial: tuple[float, ...]
+    build: Callable[[Tensor], Transform]
+    conditional: bool = True
+
+
+def affine_layer(*, conditional: bool = True) -> Layer:
+    """Location and scale of the standardised residual."""
+    return Layer((0.0, 0.0), lambda raw: Affine(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)), conditional)
+
+
+def scale_layer(*, conditional: bool = True) -> Layer:
+    """Scale of the standardised residual alone."""
+    return Layer((0.0,), lambda raw: Affine(torch.zeros_like(raw[..., 0]), _bounded(raw[..., 0], 5)), conditional)
+
+
+def radial_layer(centre: float = 0.0, *, conditional: bool = True) -> Layer:
+    """One radial map; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
+
+    def build(raw: Tensor) -> Transform:
+        return Radial(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 3), _bounded(raw[..., 2], 3))
+
+    return Layer((centre, 0.0, 0.0), build, conditional)
+
+
+def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = True) -> Layer:
+    """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
+
+    def build(raw: Tensor) -> Transform:
+        widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
+        return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
+
+    return Layer((0.0,) * (3 * num_bins + 1), build, conditional)
+
+
+def tail_layer(*, conditional: bool = False) -> Layer:
+    """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
+
+    def build(raw: Tensor) -> Transform:
+        weight = 0.4 * torch.sigmoid(_bounded(raw, 10))
+        return StudentTail(weight[..., 0], weight[..., 1])
+
+    return Layer((-4.0, -4.0), build, conditional)
+
+
+def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
+    """A small network of features of the signal; its outputs start at zero, and its weights at the same numbers always."""
+    generator = torch.Generator().manual_seed(0)
+    first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
+    with torch.no_grad():
+        for layer in (first, hidden):
+            nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+            nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+        last.weight.zero_()
+        last.bias.zero_()
+    return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)
+
+
+def conditioning_features(coordinate: Tensor) -> Tensor:
+    """(..., 2) features of signal coordinates in [0, 1]."""
+    return torch.stack([2 * coordinate - 1, 2 * coordinate * coordinate - 1], -1)
+
+
+def signal_nodes(like: Tensor) -> Tensor:
+    """The (257,) signal coordinates at which networks run; in between, what they give is interpolated linearly."""
+    return torch.linspace(0, 1, _NUM_NODES, dtype=like.dtype, device=like.device)
+
+
+def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Number of the node below each signal coordinate, and the weight of the node above."""
+    position = coordinate * (_NUM_NODES - 1)
+    row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
+    return row, (position - row).to(dtype)
+
+
+def _bounded(raw: Tensor, limit: float) -> Tensor:
+    return limit * torch.tanh(raw / limit)
+
+
+def _knots(raw: Tensor, reach: float) -> Tensor:
+    least = 0.02 / raw.shape[-1]
+    steps = least + (1 - least * raw.shape[-1]) * torch.softmax(raw, -1)
+    inner = 2 * reach * torch.cumsum(steps, -1)[..., :-1] - reach
+    end = torch.full_like(raw[..., :1], reach)
+    return torch.cat([-end, inner, end], -1)
+
+
+class ConditionalFlow(ArrayModel):
+    """A noise model made of layers, the first one next to the data; the last one gives the standard normal latent.
+
+    Args:
+        layers: the maps, in the order in which they turn an observation into the latent.
+        mean_preserving: shift the noise so that E[observation | signal] = signal (before any digitisation). A joint fit
+            needs it: otherwise an offset of the signal cannot be told from a mean of the noise.
+        width: hidden units of the network that turns a signal into the parameters of the conditional layers.
+        neighbourhood: side, odd, of the window of clean signals around each pixel that moves and widens its noise. Off (1) by
+            default: a model that sees the scene around a pixel can learn the scene's structure in place of the noise's.
+            With it, signals are images (..., y, x).
+
+    Attributes:
+        tabulate: look likelihoods and samples of large inputs up in tables (interpolation error below 1e-3 nats and 1e-3
+            standard deviations in the mean); set it to False for the exact values at any size.
+    """
+
+    def __init__(
+        self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+    ) -> None:
+        super().__init__()
+        if neighbourhood < 1 or neighbourhood % 2 == 0:
+            raise ValueError(f"neighbourhood is {neighbourhood}; a window around a pixel has an odd side: 3, 5, …")
+        self.layers, self.neighbourhood = tuple(layers), neighbourhood
+        self.mean_preserving = mean_preserving
+        self.tabulate = True
+        self.width = width
+        self.standardisation = Standardisation()
+        self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
+        self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
+        self.conditioner = conditioning_network(self.num_conditional, width)
+        if neighbourhood > 1:
+            self.surroundings = conditioning_network(2, width, num_inputs=neighbourhood**2 - 1)
+
+    @property
+    def needs_image(self) -> bool:
+        """Whether the model looks beyond single pixels."""
+        return self.neighbourhood > 1
+
+    def forward(self, signal: Signal) -> FlowDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units.
+
+        Raises:
+            ValueError: a flat signal where the model looks at a neighbourhood.
+        """
+        if not self.needs_image:
+            return FlowDistribution(self, values_of(signal))
+        require_image(signal, f"this model looks at {self.neighbourhood} x {self.neighbourhood} pixels around each")
+        return FlowDistribution(self, values_of(signal), windows_of(signal, self.neighbourhood))
+
+    def standardise(self, signal: Signal, observation: Tensor, span: tuple[float, float] | None = None) -> None:
+        """Measure and store the scaling of the data; see `Standardisation.set_from`."""
+        self.standardisation.set_from(values_of(signal), observation, span)
+
+    def parameters_at(self, signal: Tensor, windows: Tensor | None = None) -> tuple[Tensor, Tensor, list[Transform]]:
+        """Location and log-scale of the noise, detector units, and the maps, at each signal, whatever surrounds it (..., k²)."""
+        with torch.autocast(signal.device.type, enabled=False):
+            coordinate = self.standardisation.coordinate(signal)
+            location, log_scale = self.standardisation(coordinate)
+            if windows is not None:
+                shift, widening = self._effect_of_surroundings(coordinate, windows)
+                log_scale = log_scale + widening
+                location = location + torch.exp(log_scale) * shift
+            if self.mean_preserving:
+                location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
+            return signal + location, log_scale, self.transforms(coordinate)
+
+    def _effect_of_surroundings(self, coordinate: Tensor, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """Shift, in standard deviations, and change of the log-scale of the noise."""
+        contrast = self.standardisation.coordinate(windows) - coordinate[..., None]
+        middle = self.neighbourhood**2 // 2
+        others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
+        raw = self.surroundings(4 * others.to(self.bias.dtype))
+        return _bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)
+
+    def transforms(self, coordinate: Tensor) -> list[Transform]:
+        """The maps at each signal coordinate: exact at 257 nodes, their parameters linear in between.
+
+        The network so runs on the nodes alone, however many pixels there are.
+        """
+        row, weight = between_nodes(coordinate, self.bias.dtype)
+        maps = zip(self.layers, self.transforms_of_network(signal_nodes(coordinate)), strict=True)
+        return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]
+
+    def transforms_of_network(self, coordinate: Tensor) -> list[Transform]:
+        """The maps that the network gives at each signal coordinate."""
+        conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
+        built, bias_at, conditional_at = [], 0, 0
+        for layer in self.layers:
+            size = len(layer.initial)
+            raw = self.bias[bias_at : bias_at + size]
+            if layer.conditional:
+                raw = raw + conditional[..., conditional_at : conditional_at + size]
+                conditional_at += size
+            built.append(layer.build(raw))
+            bias_at += size
+        return built
+
+    def _mean_of_standardised(self) -> Tensor:
+        """Mean of the standardised residual on a grid of signal coordinates, by quadrature."""
+        dtype, device = self.bias.dtype, self.bias.device
+        nodes, weights = normal_quadrature(dtype, device, limit=9.0, count=401)
+        count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
+        coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
+        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(count, -1))
+        return x @ weights
+
+    def extra_repr(self) -> str:
+        low, high = float(self.standardisation.signal_low), float(self.standardisation.signal_high)
+        return (
+            f"signals {low:g} … {high:g}, {len(self.layers)} layers, width={self.width}, "
+            f"mean_preserving={self.mean_preserving}"
+        )
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again."""
+        window = {"neighbourhood": self.neighbourhood} if self.needs_image else {}
+        return {"mean_preserving": self.mean_preserving, "width": self.width} | window
+
+
+def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
+    total = torch.zeros_like(latent)
+    for transform in reversed(transforms):
+        latent, ladj = transform.inverse(latent)
+        total = total + ladj
+    return latent, total
+
+
+class FlowDistribution(LatentDistribution):
+    """The distribution that a `ConditionalFlow` returns; its parameters are computed when first needed."""
+
+    def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
+        super().__init__(signal.shape)
+        self._flow, self._signal, self._windows = flow, signal, windows
+
+    @cached_property
+    def _parameters(self) -> tuple[Tensor, Tensor, list[Transform]]:
+        return self._flow.parameters_at(self._signal, self._windows)
+
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        location, log_scale, transforms = self._parameters
+        value = (value - location) * torch.exp(-log_scale)
+        total = -log_scale.expand_as(value)
+        for transform in transforms:
+            value, ladj = transform.forward(value)
+            total = total + ladj
+        return value, total
+
+    def from_latent(self, latent: Tensor) -> Tensor:
+        location, log_scale, transforms = self._parameters
+        return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        found = tabulated.automatic_log_prob(self._flow, self._signal, value)
+        return super().log_prob(value) if found is None else found
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        signal = self._signal.expand((*sample_shape, *self.batch_shape))
+        if self._flow.tabulate and self._windows is None and signal.numel() >= tabulated.LARGE:
+            found = tabulated.sample(self._flow, signal, generator)
+            if found is not None:
+                return found
+        return super().sample(sample_shape, generator)
+
+    def _like(self) -> Tensor:
+        return self._signal
+
+
+class RadialFlow(ConditionalFlow):
+    """The noise model of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018), with a normalised density.
+
+    A conditional affine layer, then radial layers of which those next to the data depend on the signal.
+
+    Args:
+        num_layers: number of radial layers.
+        num_conditional: how many of them depend on the signal, half of them by default; with none, all signals share the shape
+            of the noise and only its location and scale vary.
+        mean_preserving: see `ConditionalFlow`.
+        width: hidden units of the conditioning network.
+        neighbourhood: see `ConditionalFlow`.
+    """
+
+    def __init__(
+        self,
+        num_layers: int = 8,
+        *,
+        num_conditional: int | None = None,
+        mean_preserving: bool = False,
+        width: int = 32,
+        neighbourhood: int = 1,
+    ) -> None:
+        conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
+        centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
+        radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
+        layers = [affine_layer(), *radials]
+        super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
+        self.num_layers, self.num_layers_conditional = num_layers, conditional
+
+    def config(self) -> dict[str, Any]:
+        return super().config() | {"num_layers": self.num_layers, "num_conditional": self.num_layers_conditional}
+
+
+class SplineFlow(ConditionalFlow):
+    """The default noise model: conditional affine layer, conditional monotone spline, learnt tail weights.
+
+    Args:
+        num_bins: bins of the spline.
+        mean_preserving: see `ConditionalFlow`.
+        width: hidden units of the conditioning network.
+        neighbourhood: see `ConditionalFlow`.
+    """
+
+    def __init__(
+        self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+    ) -> None:
+        layers = [affine_layer(), spline_layer(num_bins), tail_layer()]
+        super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
+        self.num_bins = num_bins
+
+    def config(self) -> dict[str, Any]:
+        return super().config() | {"num_bins": self.num_bins}
+
+
+class SignalDependentGaussian(ConditionalFlow):
+    """Gaussian noise around the signal whose standard deviation is a smooth function of the signal.
+
+    Args:
+        width: hidden units of the network that gives the standard deviation.
+        neighbourhood: see `ConditionalFlow`.
+    """
+
+    def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
+        super().__init__([scale_layer()], mean_preserving=True, width=width, neighbourhood=neighbourhood)
+
+    def config(self) -> dict[str, Any]:
+        return {name: value for name, value in super().config().items() if name != "mean_preserving"}

@@ -1,0 +1,209 @@
+"""A mixture of Gaussians whose weights, means and widths, or whose width alone, are smooth functions of the signal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions import tabulated
+from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval
+from noiseflow.distributions.transforms import between_rows
+from noiseflow.models.base import ArrayModel
+from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
+from noiseflow.models.standardisation import Standardisation
+
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+_BISECTIONS = 60
+_SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
+
+
+class Mixture(ArrayModel):
+    """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
+
+    Args:
+        num_components: number of Gaussians.
+        shared_shape: give all signals the same shape of the noise; only its location and scale vary with the signal.
+        mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
+        width: hidden units of the network that turns a signal into the parameters.
+
+    Attributes:
+        tabulate: as that of `ConditionalFlow`.
+
+    Raises:
+        ValueError: fewer than one component.
+    """
+
+    def __init__(
+        self,
+        num_components: int = 3,
+        *,
+        shared_shape: bool = False,
+        mean_preserving: bool = False,
+        width: int = 32,
+    ) -> None:
+        super().__init__()
+        if num_components < 1:
+            raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
+        self.num_components, self.shared_shape = num_components, shared_shape
+        self.mean_preserving, self.width = mean_preserving, width
+        self.tabulate = True
+        self.standardisation = Standardisation()
+        # apart from the start, or all components would stay equal: means ±½, the outer ones wider
+        place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
+        start = torch.stack([-place.abs(), place, place.abs() - 0.2])
+        self.bias = nn.Parameter(start / _SHAPE_GAIN if shared_shape else start)
+        num_outputs = (1 if mean_preserving else 2) if shared_shape else 3 * num_components
+        self.conditioner = conditioning_network(num_outputs, width)
+
+    def forward(self, signal: Tensor) -> MixtureDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        return MixtureDistribution(signal, self.components_at, model=self)
+
+    def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``; means and scales in detector units."""
+        coordinate = self.standardisation.coordinate(signal)
+        location, log_scale = self.standardisation(coordinate)
+        with torch.autocast(coordinate.device.type, enabled=False):
+            nodes = signal_nodes(coordinate)
+            at_nodes = self.conditioner(conditioning_features(nodes).to(self.bias.dtype))
+            row, weight = between_nodes(coordinate, self.bias.dtype)
+            conditional = between_rows(at_nodes, row, weight)
+        if self.shared_shape:
+            raw = (_SHAPE_GAIN * self.bias).expand(*coordinate.shape, 3, self.num_components)
+            log_scale = log_scale + 5 * torch.tanh(conditional[..., 0] / 5)
+            if not self.mean_preserving:
+                location = location + torch.exp(log_scale) * conditional[..., 1]
+        else:
+            raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
+        log_weight = torch.log_softmax(raw[..., 0, :], -1)
+        centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
+        if self.mean_preserving:
+            centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)
+            location = torch.zeros_like(location)
+        means = (signal + location)[..., None] + torch.exp(log_scale)[..., None] * centre
+        return log_weight, means, log_width + log_scale[..., None]
+
+    def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
+        """Measure and store the scaling of the data; see `Standardisation.set_from`."""
+        self.standardisation.set_from(signal, observation, span)
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again."""
+        names = ("num_components", "shared_shape", "mean_preserving", "width")
+        return {name: getattr(self, name) for name in names}
+
+    def extra_repr(self) -> str:
+        shape = ", shared_shape=True" if self.shared_shape else ""
+        return f"{self.num_components} components{shape}, width={self.width}, mean_preserving={self.mean_preserving}"
+
+
+class MixtureDistribution(NoiseDistribution):
+    """A mixture of normal distributions; its components are computed when first needed.
+
+    Args:
+        signal: clean readings, any shape.
+        components_at: gives log-weights, means and log-scales at signals, (*signal.shape, K) each.
+        model: the noise model it comes from, for the tables of large inputs.
+    """
+
+    def __init__(
+        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: nn.Module
+    ) -> None:
+        super().__init__(signal.shape)
+        self.signal, self._components_at, self._model = signal, components_at, model
+
+    @cached_property
+    def _components(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._components_at(self.signal)
+
+    @property
+    def log_weight(self) -> Tensor:
+        """Log-weights of the components, (*signal.shape, K)."""
+        return self._components[0]
+
+    @property
+    def means(self) -> Tensor:
+        """Means of the components, (*signal.shape, K)."""
+        return self._components[1]
+
+    @property
+    def log_scale(self) -> Tensor:
+        """Logs of the components' standard deviations, (*signal.shape, K)."""
+        return self._components[2]
+
+    def _standard(self, value: Tensor) -> Tensor:
+        return (value[..., None] - self.means) * torch.exp(-self.log_scale)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        found = tabulated.automatic_log_prob(self._model, self.signal, value)
+        if found is not None:
+            return found
+        z = self._standard(value)
+        return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - _LOG_SQRT_2PI
+
+    def cdf(self, value: Tensor) -> Tensor:
+        probability: Tensor = (self.log_weight.exp() * torch.special.ndtr(self._standard(value))).sum(-1)
+        return probability
+
+    def _standard_bound(self, bound: Tensor) -> Tensor:
+        finite = torch.isfinite(bound)  # infinity times a derivative would be NaN
+        inside = self._standard(torch.where(finite, bound, torch.zeros_like(bound)))
+        return torch.where(finite[..., None], inside, bound[..., None])
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        masses = log_normal_interval(self._standard_bound(low), self._standard_bound(high))
+        return torch.logsumexp(self.log_weight + masses, -1)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        low, high = self._ends()
+        return bisect_quantile(self, value, low + 0 * value, high + 0 * value)
+
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        spread = 40 * self.log_scale.exp()
+        return (self.means - spread).amin(-1), (self.means + spread).amax(-1)
+
+    @torch.no_grad()
+    def from_latent(self, latent: Tensor) -> Tensor:
+        """The observation of a standard normal latent, by bisection of the tail that it lies in."""
+        upper, tail = latent > 0, torch.special.ndtr(-latent.double().abs())
+        low, high = (end.double() + 0 * tail for end in self._ends())
+        for _ in range(_BISECTIONS):
+            middle = low + (high - low) / 2
+            standard = self._standard(middle)
+            standard = torch.where(upper[..., None], -standard, standard)
+            mass = (self.log_weight.exp() * torch.special.ndtr(standard)).sum(-1)
+            above = torch.where(upper, mass <= tail, mass >= tail)
+            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+        found: Tensor = high.to(latent.dtype)
+        return found
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        if getattr(self._model, "tabulate", False) and self.signal.numel() * math.prod(sample_shape) >= tabulated.LARGE:
+            found = tabulated.sample(self._model, self.signal.expand((*sample_shape, *self.batch_shape)), generator)
+            if found is not None:
+                return found
+        with torch.no_grad():
+            shape = (*sample_shape, *self.batch_shape)
+            dtype, device = self.means.dtype, self.means.device
+            uniform = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+            chosen = (uniform[..., None] > self.log_weight.exp().cumsum(-1))[..., :-1].sum(-1, keepdim=True)
+            full = (*shape, self.means.shape[-1])
+            means, log_scale = (each.expand(full).gather(-1, chosen)[..., 0] for each in (self.means, self.log_scale))
+            normal = torch.randn(shape, generator=generator, dtype=dtype, device=device)
+            return means + log_scale.exp() * normal
+
+    @property
+    def mean(self) -> Tensor:
+        mean: Tensor = (self.log_weight.exp() * self.means).sum(-1)
+        return mean
+
+    @property
+    def variance(self) -> Tensor:
+        about = self.means - self.mean[..., None]
+        variance: Tensor = (self.log_weight.exp() * (torch.exp(2 * self.log_scale) + about**2)).sum(-1)
+        return variance

@@ -1,0 +1,102 @@
+"""Physics and a flow: shot and read noise exactly, and a smooth map of its latent for what they miss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.transforms import Affine, Transform
+from noiseflow.models.base import ArrayModel
+from noiseflow.models.flow import ConditionalFlow, affine_layer, spline_layer
+from noiseflow.models.latent_mean import LatentMean
+from noiseflow.models.physical import PoissonGaussian
+from noiseflow.models.physics_distribution import PhysicsFlowDistribution
+
+
+class PhysicsFlow(ArrayModel):
+    """Poisson–Gaussian noise, corrected by a flow of its latent.
+
+    The latent of an observation under the detector, z = Φ⁻¹(F(o | s)), is standard normal if the detector is the whole truth.
+    A conditional affine map and spline, which start at the identity, take it to z′, and z′ is the standard normal latent of this
+    model: log p = log p_detector + log φ(z′) + log dz′/dz − log φ(z). Peaks of single electrons stay where the physics puts them.
+
+    A fit finds the detector first, by maximum likelihood, and holds it while the flow learns; what the likelihood of a pixel
+    takes from the detector is then computed once.
+
+    Args:
+        num_bins: bins of the spline.
+        mean_preserving: shift the latent so that E[observation | signal] is the signal. Peaks stay in their places. To 1e-4
+            standard deviations where the read noise exceeds 0.4 electrons; where electrons are resolved better, a strong
+            correction leaves up to 1e-2, and 1e-1 near the offset.
+        width: hidden units of the conditioning network.
+        detector: the physical part; a default `PoissonGaussian` where none is given.
+
+    Attributes:
+        tabulate: as that of `ConditionalFlow`.
+    """
+
+    def __init__(
+        self,
+        num_bins: int = 16,
+        *,
+        mean_preserving: bool = False,
+        width: int = 32,
+        detector: PoissonGaussian | None = None,
+    ) -> None:
+        super().__init__()
+        self.num_bins, self.mean_preserving, self.width = num_bins, mean_preserving, width
+        self.tabulate = True
+        self.detector = (PoissonGaussian() if detector is None else detector).requires_grad_(False)
+        self.correction = ConditionalFlow([affine_layer(), spline_layer(num_bins)], width=width)
+        self._latent_mean = LatentMean()
+
+    def forward(self, signal: Tensor) -> PhysicsFlowDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        return PhysicsFlowDistribution(self.detector(signal), self._maps(signal), model=self)
+
+    def _maps(self, signal: Tensor) -> list[Transform]:
+        coordinate = self.correction.standardisation.coordinate(signal)
+        with torch.autocast(signal.device.type, enabled=False):
+            maps = self.correction.transforms(coordinate)
+            if not self.mean_preserving:
+                return maps
+            shift = self._latent_mean(signal, self.detector, self.correction)
+        return [Affine(shift, torch.zeros_like(shift)), *maps]
+
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Find the most likely detector for (N,) signals and observations."""
+        self.detector.standardise(signal, observation)
+        self.correction.standardise(signal, observation)
+
+    def settle(self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module]) -> None:
+        """Move the detector to its most likely parameters; see `PoissonGaussian.settle`."""
+        self.detector.settle(signal, observation, behind)
+
+    @torch.no_grad()
+    def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:
+        """What of the likelihood of (N,) pixels does not change while the flow learns, (N, 2); see `log_prob_from`."""
+        return torch.stack(self.forward(signal).detector_part(observation), -1)
+
+    def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
+        """Log-likelihood of pixels by their `fixed_part`."""
+        latent, log_density = fixed_part.unbind(-1)
+        return (log_density + self.forward(signal).correct(latent)[1]).to(signal.dtype)
+
+    @torch.no_grad()
+    def fixed_interval_part(self, signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """The same for the likelihood of intervals, (N, 3)."""
+        return torch.stack(self.forward(signal).interval_part(low, high), -1)
+
+    def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
+        """Log-likelihood of intervals by their `fixed_interval_part`."""
+        return self.forward(signal).corrected_interval(*fixed_part.unbind(-1)).to(signal.dtype)
+
+    def extra_repr(self) -> str:
+        return f"{self.num_bins} bins, width={self.width}, mean_preserving={self.mean_preserving}"
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again, besides the detector inside."""
+        return {"num_bins": self.num_bins, "mean_preserving": self.mean_preserving, "width": self.width}

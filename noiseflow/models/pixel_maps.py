@@ -1,0 +1,89 @@
+"""Detectors whose pixels have gains and offsets of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from noiseflow.arrays import floating
+from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
+from noiseflow.models.base import ArrayModel
+
+
+class WithMaps(ArrayModel):
+    """A noise model seen through a detector whose pixels have gains and offsets of their own.
+
+    observation = gain·o + offset, o drawn from the model at the clean signal: signals are those of an ideal pixel (gain 1,
+    offset 0), as after a flat-field correction; observations are raw. The maps are known and not fitted.
+
+    Args:
+        model: the noise model of an ideal pixel.
+        gain: (y, x) relative gains, positive; 1 by default.
+        offset: (y, x) offsets, detector units; 0 by default.
+        shape: (y, x) size of the maps where neither is given.
+
+    Raises:
+        ValueError: no map, maps of different sizes, not finite, or gains that are not positive.
+    """
+
+    needs_image = True
+    gain: Tensor
+    offset: Tensor
+
+    def __init__(
+        self,
+        model: nn.Module,
+        gain: Tensor | NDArray[Any] | None = None,
+        offset: Tensor | NDArray[Any] | None = None,
+        *,
+        shape: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        sizes = [tuple(each.shape) for each in (gain, offset) if each is not None] or [tuple(shape or ())]
+        if len(sizes[0]) != 2 or len(set(sizes)) != 1:
+            raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or two of one size")
+        self.model = model
+        self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
+        self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
+        if not bool((torch.isfinite(self.gain) & torch.isfinite(self.offset) & (self.gain > 0)).all()):
+            raise ValueError(
+                "some gains are not positive, or gains or offsets are NaN; mend or mask these pixels' maps"
+            )
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        """The distribution of raw readings.
+
+        Raises:
+            ValueError: a flat signal, or images of another size than the maps.
+        """
+        base: NoiseDistribution = self.model(given_to(self.model, signal))
+        return base.rescaled(*self._at(signal))
+
+    def _at(self, signal: Signal) -> tuple[Tensor, Tensor]:
+        dtype = values_of(signal).dtype
+        if isinstance(signal, PickedSignal):
+            return self.gain.reshape(-1)[signal.place].to(dtype), self.offset.reshape(-1)[signal.place].to(dtype)
+        require_image(signal, "every pixel has a gain and an offset of its own")
+        if signal.shape[-2:] != self.gain.shape:
+            raise ValueError(
+                f"images are {tuple(signal.shape[-2:])} pixels and the maps {tuple(self.gain.shape)}; crop them"
+            )
+        return self.gain.to(dtype), self.offset.to(dtype)
+
+    def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
+        """Standardise the model inside on the readings of ideal pixels."""
+        if hasattr(self.model, "standardise"):
+            gain, offset = self._at(signal)
+            self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)  # type: ignore[operator]
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again, besides the model inside and the maps."""
+        return {"shape": list(self.gain.shape)}
+
+    def extra_repr(self) -> str:
+        return f"maps of {self.gain.shape[0]} x {self.gain.shape[1]} pixels"

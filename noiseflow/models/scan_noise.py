@@ -1,0 +1,229 @@
+"""Noise that a whole row or column of an image shares: one random offset for each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, normal_quadrature
+from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
+from noiseflow.models.base import ArrayModel
+from noiseflow.models.digitisation import Digitisation
+from noiseflow.models.digitised import Digitised
+
+_REACH = 8.0  # standard deviations of the offset beyond which nothing is looked for
+_FINE, _COARSE = 0.1, 0.25
+
+
+class ScanNoise(ArrayModel):
+    """A noise model plus one Gaussian offset for every row (or column) of an image, as scanning adds it.
+
+    The readings of a row are no longer independent: given the offset b they are, so the likelihood of a row is
+    ∫ N(b; 0, scale²) ∏ p(oᵢ − b | sᵢ) db, one integral along each row, done by quadrature (to 1e-6 nats per row for smooth
+    noise, to 1e-3 nats per pixel for densities with kinks). ``log_prob`` of a pixel
+    is that of its reading given those before it in its row, so that the sum over a row is the row's log-likelihood; ``cdf``,
+    ``icdf``, ``mean`` and ``variance`` are of single readings.
+
+    Args:
+        model: the noise model of each pixel; a `Digitised` one rounds and clips after the offset is added.
+        scale: standard deviation of the offsets, detector units.
+        along: whether each ``"row"`` or each ``"column"`` has an offset.
+
+    Raises:
+        ValueError: scale not positive, or a model inside that holds offsets already.
+    """
+
+    needs_image = True
+
+    def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
+        super().__init__()
+        if not scale > 0:
+            raise ValueError(f"scale is {scale}; the standard deviation of the offsets must be positive")
+        if along not in ("row", "column"):
+            raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
+        if shared_axis(model) is not None:
+            raise ValueError(
+                "the model inside has offsets of rows or columns already; one such term is all there can be"
+            )
+        self.model, self.along = model, along
+        self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
+
+    @property
+    def axis(self) -> int:
+        """The axis of an image along which pixels share an offset."""
+        return -1 if self.along == "row" else -2
+
+    def forward(self, signal: Signal) -> ScanDistribution:
+        """The distribution of images; of picked pixels, those along the last axis share an offset.
+
+        Raises:
+            ValueError: a flat signal.
+        """
+        require_image(signal, f"every {self.along} of the image has an offset")
+        axis = -1 if isinstance(signal, PickedSignal) else self.axis
+        return ScanDistribution(self.model(given_to(self.model, signal)), torch.exp(self.log_scale), axis)
+
+    def behind(self, digitisation: Digitisation) -> ScanNoise:
+        """Put the model inside behind a converter: offsets are added before readings are rounded and clipped."""
+        self.model = Digitised(self.model, *digitisation)
+        return self
+
+    def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
+        """Measure the offsets' scale by the means of rows (R, X), and standardise the model inside on what is left."""
+        present = torch.isfinite(observation)
+        residual = torch.where(present, observation - values_of(signal), torch.zeros_like(observation)).double()
+        count = present.sum(-1).clamp(min=1)
+        mean = residual.sum(-1) / count
+        residual = residual - residual.sum() / present.sum()
+        centred = torch.where(present, residual - (residual.sum(-1) / count)[:, None], torch.zeros_like(residual))
+        within = (centred.square().sum(-1) / (count - 1).clamp(min=1)).mean()
+        chance = (within / count).mean()
+        variance = torch.maximum(mean.var(correction=0) - chance, 0.01 * chance)
+        share = variance / (variance + chance)
+        with torch.no_grad():
+            self.log_scale.copy_(variance.sqrt().log())
+        if hasattr(self.model, "standardise"):
+            left = observation - (share * (mean - mean.mean())).to(observation)[:, None]
+            self.model.standardise(given_to(self.model, signal[present]), left[present])  # type: ignore[operator]
+
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model again, besides the model inside."""
+        return {"along": self.along}
+
+    def extra_repr(self) -> str:
+        return f"scale={math.exp(self.log_scale.item()):.4g}, along={self.along}"
+
+
+def shared_axis(noise_model: nn.Module) -> int | None:
+    """The axis of an image along which pixels share an offset of a noise model; None where pixels are independent."""
+    found = [module.axis for module in noise_model.modules() if isinstance(module, ScanNoise)]
+    return found[0] if found else None
+
+
+class ScanDistribution(NoiseDistribution):
+    """Readings that share an offset along an axis.
+
+    Args:
+        base: distribution of the readings without offsets.
+        scale: standard deviation of the offsets.
+        axis: the axis along which they are shared, −1 or −2.
+    """
+
+    def __init__(self, base: NoiseDistribution, scale: Tensor, axis: int) -> None:
+        super().__init__(base.batch_shape)
+        self.base, self.scale, self.axis = base, scale, axis
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density of each reading given those before it along the axis; NaN readings are missing and count 0."""
+        offsets, log_weight = self._offsets(value, _FINE, whole=True)
+        cumulative = torch.cumsum(self._log_prob_at(value, offsets), self.axis)
+        total = torch.logsumexp(cumulative + log_weight, 0)
+        before = torch.logsumexp(log_weight, 0) + torch.zeros_like(total.narrow(self.axis, 0, 1))
+        return torch.diff(torch.cat([before, total], self.axis), dim=self.axis)
+
+    def line_log_prob(self, value: Tensor) -> Tensor:
+        """Log-likelihood of each row (or column) as a whole; the axis is left out. Quicker than the sum of `log_prob`."""
+        offsets, log_weight = self._offsets(value, _COARSE, whole=False)
+        total = self._log_prob_at(value, offsets).sum(self.axis, keepdim=True)
+        return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
+
+    def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """P(reading < value) and P(reading ≤ value) given the readings before each along the axis."""
+        offsets, log_weight = self._offsets(value, _FINE, whole=True)
+        log_prob = self._log_prob_at(value, offsets)
+        weight = torch.softmax(torch.cumsum(log_prob, self.axis) - log_prob + log_weight, 0)
+        at = [self._shifted(offset) for offset in offsets]
+        below = torch.stack([distribution.cdf_below(value) for distribution in at])
+        upto = torch.stack([distribution.cdf(value) for distribution in at])
+        return (weight * below).sum(0), (weight * upto).sum(0)
+
+    def _shifted(self, offset: Tensor) -> NoiseDistribution:
+        return self.base.rescaled(torch.ones_like(offset), offset)
+
+    def _log_prob_at(self, value: Tensor, offsets: Tensor) -> Tensor:
+        """(Q, ...) log-densities of the readings at each of the offsets (Q, ..., 1)."""
+        missing = torch.isnan(value)
+        safe = torch.where(missing, self.base.mean.detach(), value)
+        found = torch.stack([self._shifted(offset).log_prob(safe) for offset in offsets])
+        return torch.where(missing, torch.zeros_like(found), found)
+
+    def _offsets(self, value: Tensor, spacing: float, *, whole: bool) -> tuple[Tensor, Tensor]:
+        """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included.
+
+        They are densest where the offset of the whole line lies, and thin out like the sinh so as to serve its first pixels
+        too where `whole`, or to end where the line's likelihood does.
+        """
+        with torch.no_grad():
+            centre, width = self._posterior(value)
+            far = (_REACH * self.scale + centre.abs()) if whole else _REACH * width
+            steps = int(torch.asinh(far / width).max() / spacing) + 1 if width.numel() else 1
+            t = spacing * torch.arange(-steps, steps + 1, dtype=centre.dtype, device=centre.device)
+            t = t.reshape(-1, *(1 for _ in centre.shape))
+            offsets = centre + width * torch.sinh(t)
+            log_step = torch.log(spacing * width * torch.cosh(t))
+        scale = self.scale.to(centre.dtype)
+        log_prior = -0.5 * (offsets / scale) ** 2 - torch.log(scale) - 0.5 * math.log(2 * math.pi)
+        return offsets.to(value.dtype), (log_prior + log_step).to(value.dtype)
+
+    def _posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of each line's offset given all its readings."""
+        present = ~torch.isnan(value)
+        precision = torch.where(present, 1 / self.base.variance, 0.0)
+        residual = torch.where(present, value - self.base.mean, 0.0)
+        total = precision.sum(self.axis, keepdim=True) + 1 / self.scale**2
+        centre, width = (precision * residual).sum(self.axis, keepdim=True) / total, total**-0.5
+        t = torch.linspace(-2.5, 2.5, 13, dtype=centre.dtype, device=centre.device)
+        t = t.reshape(-1, *(1 for _ in centre.shape))
+        for _ in range(2):  # the estimate by moments is not the mode where the noise is not Gaussian
+            offsets = centre + width * torch.sinh(t)
+            found = self._log_prob_at(value, offsets.to(value.dtype)).sum(self.axis, keepdim=True)
+            weight = torch.softmax(found - 0.5 * (offsets / self.scale) ** 2 + torch.log(torch.cosh(t)), 0)
+            centre = (weight * offsets).sum(0)
+            spread = (weight * (offsets - centre) ** 2).sum(0).sqrt()
+            width = torch.maximum(spread, 0.2 * width)
+        return centre, width
+
+    def _average(self, function: Callable[[NoiseDistribution], Tensor]) -> Tensor:
+        """Mean over the offsets of something of single readings."""
+        nodes, weights = normal_quadrature(torch.float64, limit=7.0, count=57)
+        like = self.scale.detach()
+        parts = [
+            weight * function(self._shifted((node * self.scale).reshape(1)))
+            for node, weight in zip(nodes.to(like), weights.to(like), strict=True)
+        ]
+        return torch.stack(parts).sum(0)
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self._average(lambda distribution: distribution.cdf(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self._average(lambda distribution: distribution.cdf_below(value))
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return torch.log(self._average(lambda distribution: distribution.log_interval_prob(low, high).exp()))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        reach = 50 * self.variance.sqrt()
+        return bisect_quantile(self, value, self.mean - reach + 0 * value, self.mean + reach + 0 * value)
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        """Draw readings; every row (or column) of every image has an offset of its own."""
+        with torch.no_grad():
+            shape = [*sample_shape, *self.batch_shape]
+            shape[self.axis] = 1
+            like = self.scale
+            offset = self.scale * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
+            return self._shifted(offset).sample(generator=generator)
+
+    @property
+    def mean(self) -> Tensor:
+        return self._average(lambda distribution: distribution.mean)
+
+    @property
+    def variance(self) -> Tensor:
+        mean = self.mean
+        return self._average(lambda distribution: distribution.variance + (distribution.mean - mean) ** 2)

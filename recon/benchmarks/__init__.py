@@ -1,0 +1,1 @@
+"""Benchmarks of the reconstruction; `noiseflow benchmark` runs them."""

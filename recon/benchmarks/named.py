@@ -1,0 +1,148 @@
+"""The benchmarks that `noiseflow benchmark` knows by name. A benchmark is added by one function here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from noiseflow import io
+from noiseflow.commands.console import Output
+from recon.benchmarks import ablations as benchmark_ablations
+from recon.benchmarks import needle as benchmark_needle
+from recon.benchmarks import paper as benchmark_paper
+from recon.benchmarks import rivals as benchmark_rivals
+from recon.benchmarks.rivals import Effort
+from recon.benchmarks.scenes import Results, make_scene
+from recon.methods.classical import part_of
+from recon.methods.methods import reconstruct
+from recon.metrics.metrics import fourier_shell_correlation, resolution
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run and where to put it.
+
+    Attributes:
+        size: voxels along each edge.
+        scene: further arguments of `make_scene`.
+        effort: how much to spend.
+        again: cells whose name contains this are computed anew; none if empty.
+        out: folder of results and figures.
+        output: tells people what is going on.
+    """
+
+    size: int
+    scene: dict[str, Any]
+    effort: Effort
+    again: str
+    out: Path
+    output: Output
+
+    def results(self, name: str) -> Results:
+        """The kept results of a benchmark on this scene; another scene or effort has another file."""
+        return self._kept(name, str(self.size), *(str(value).replace(":", "_") for value in self.scene.values()))
+
+    @property
+    def quick(self) -> bool:
+        """Whether few settings and a small scene shall do."""
+        return self.effort is benchmark_rivals.QUICK
+
+    def _kept(self, name: str, *words: str) -> Results:
+        spent = "quick" if self.quick else "full"
+        results = Results(self.out / f"{'-'.join([name, *words, spent])}.json", name)
+        if self.again:
+            results.forget(self.again)
+        return results
+
+    def results_on_real_data(self, name: str) -> Results:
+        """The kept results of a benchmark that has data of its own."""
+        return self._kept(name, str(self.scene["seed"]))
+
+
+def rivals(options: Options) -> dict[str, Any]:
+    """Run time against error of every method that takes seconds or minutes."""
+    results = options.results("rivals")
+    benchmark_rivals.run(options.size, results, effort=options.effort, line=options.output.line, **options.scene)
+    return _shown(options, results)
+
+
+def slow_rivals(options: Options) -> dict[str, Any]:
+    """The rivals that take hours, as far as the budget goes."""
+    results = options.results("slow-rivals")
+    benchmark_rivals.run_slow(options.size, results, effort=options.effort, line=options.output.line, **options.scene)
+    return _shown(options, results)
+
+
+def _shown(options: Options, results: Results) -> dict[str, Any]:
+    found = benchmark_rivals.summary(results, options.size)
+    options.output.table(*benchmark_rivals.table(found))
+    picture = results.path.with_suffix(".png")
+    with io.atomic_path(picture) as partial:
+        benchmark_rivals.draw(found, make_scene(options.size, **options.scene).name).savefig(partial, dpi=120)
+    options.output.line(f"results: {results.path}\nfigure: {picture}")
+    return {"results": results.path, "figure": picture, "machines": results.content["machines"], "curves": found}
+
+
+def even_odd(options: Options) -> dict[str, Any]:
+    """Fourier shell correlation of volumes from even and from odd tilts, and of each method's volume with the truth."""
+    scene, results = make_scene(options.size, **options.scene), options.results("resolution")
+    steps = 60 if options.quick else None
+
+    def cell(method: str) -> dict[str, Any]:
+        whole, even, odd = (
+            reconstruct(part_of(scene.noisy, tilts), scene.grid, method=method, num_steps=steps).volume.attenuation
+            for tilts in (slice(None), slice(0, None, 2), slice(1, None, 2))
+        )
+        halves, truth = fourier_shell_correlation(even, odd), fourier_shell_correlation(whole, scene.truth)
+        return {"halves 0.143": resolution(*halves, 0.143), "truth 0.5": resolution(*truth, 0.5)}
+
+    rows = []
+    for method in ("wbp", "sirt", "tv", "l2", "joint"):
+        found = results.cell(method, lambda m=method: cell(m))  # type: ignore[misc]
+        rows.append((method, *(f"{value:.3f}" for value in list(found.values())[:2])))
+    options.output.line(f"{scene.name}: resolution in cycles per voxel")
+    options.output.table(("method", "even against odd tilts, 0.143", "against the truth, 0.5"), rows)
+    return {"results": results.path, "cells": results.cells}
+
+
+def paper_table(options: Options) -> dict[str, Any]:
+    """The main table of Kniesel et al. (CVPR 2022) beside the published figures."""
+    scene, results = make_scene(options.size, **options.scene), options.results("paper-table")
+    options.output.line(f"{scene.name}: rivals' settings are searched by looking at the truth")
+    benchmark_paper.run(scene, results, options.output.line)
+    return _told(options, results, benchmark_paper.table(results.cells))
+
+
+def ablations(options: Options) -> dict[str, Any]:
+    """What each part of the reconstruction is worth."""
+    scene, results = make_scene(options.size, **options.scene), options.results("ablations")
+    small = benchmark_ablations.small_scene(options.size, options.scene)
+    options.output.line(scene.name)
+    benchmark_ablations.run(scene, results, options.output.line, quick=options.quick, small=small)
+    return _told(options, results, benchmark_ablations.table(results.cells))
+
+
+def needle(options: Options) -> dict[str, Any]:
+    """Every method on a real tilt series, judged by tilts left out."""
+    results = options.results_on_real_data("needle")
+    benchmark_needle.run(results, options.output.line, quick=options.quick, seed=options.scene["seed"])
+    return _told(options, results, benchmark_needle.table(results.cells))
+
+
+def _told(options: Options, results: Results, table: tuple[tuple[str, ...], list[tuple[str, ...]]]) -> dict[str, Any]:
+    options.output.table(*table)
+    options.output.line(f"results: {results.path}")
+    return {"results": results.path, "machines": results.content["machines"], "cells": results.cells}
+
+
+BENCHMARKS: dict[str, Callable[[Options], dict[str, Any]]] = {
+    "rivals": rivals,
+    "slow-rivals": slow_rivals,
+    "resolution": even_odd,
+    "paper-table": paper_table,
+    "ablations": ablations,
+    "needle": needle,
+}
+"""Benchmarks by name."""

@@ -1,0 +1,85 @@
+"""The coordinate network of Kniesel et al. (CVPR 2022) evaluated once on the whole lattice and projected to all tilts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from noiseflow import Gaussian, fit
+from recon.fields.fields import Field
+from recon.joint.alternation import block_mask
+from recon.joint.joint import JointReconstructor
+from recon.joint.signal_model import TomographySignal
+from recon.methods.kniesel2022.network import CoordinateDensity
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+WIDTHS = (32, 64, 128, 256)
+_DENSITY_SCALE = 7.0
+_STEPS = 300
+_HIGHEST_RATE, _RATE_TIMES_WIDTH = 0.02, 1.28
+_EMPTY = -4.0
+
+
+class NetworkField(Field):
+    """A volume that a network of nine layers computes from coordinates.
+
+    Args:
+        shape: (depth, height, width) of the lattice.
+        layer_width: units of the hidden layers.
+    """
+
+    points: Tensor
+
+    def __init__(self, shape: Sequence[int], *, layer_width: int, scale: float = 1.0) -> None:
+        super().__init__(shape, scale=scale)
+        self.network = CoordinateDensity(width=layer_width)
+        nn.init.constant_(self.network.last.bias, _EMPTY)
+        axes = [(2 * torch.arange(size) + 1 - size) / self.width for size in (self.depth, self.width, self.height)]
+        z, x, y = torch.meshgrid(*axes, indexing="ij")
+        self.register_buffer("points", torch.stack([x, y, z], -1).reshape(-1, 3), persistent=False)
+
+    def forward(self) -> Tensor:
+        density: Tensor = self.network(self.points) * (2 * _DENSITY_SCALE / self.width)
+        return density.view(self.depth * self.width, self.height)
+
+
+def fit_network(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    *,
+    width: int,
+    noise_model: Callable[[], nn.Module] | None = None,
+    num_steps: int = _STEPS,
+    seed: int = 0,
+) -> NDArray[Any]:
+    """Fit the network by least squares, then with a noise model if there is one; held-out pixels choose the best step.
+
+    Args:
+        tilt_series: the data.
+        grid: the lattice.
+        width: of the hidden layers.
+        noise_model: makes a model to learn with the volume.
+        num_steps: of Adam, over all pixels; half of them by least squares where there is a noise model.
+        seed: of every random choice.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        start = JointReconstructor(noise_model=Gaussian, seed=seed).prepare(tilt_series, grid)
+        field = NetworkField(grid.shape, layer_width=width, scale=float(start.field.scale))
+        rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
+        model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)
+        images = torch.from_numpy(np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32))
+        generator = torch.Generator().manual_seed(seed)
+        held_out = block_mask(images.shape, generator=generator)
+        options: dict[str, Any] = {"held_out": held_out, "generator": generator, "digitise": False}
+        first = num_steps if noise_model is None else math.ceil(num_steps / 2)
+        fit(Gaussian(), model, images, num_steps=first, **options)
+        if noise_model is not None:
+            fit(noise_model(), model, images, num_steps=num_steps - first, learning_rate=0.03, **options)
+    return field.volume().numpy()

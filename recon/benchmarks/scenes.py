@@ -1,0 +1,199 @@
+"""What every benchmark shares: scenes of known truth, cells that are computed once and kept, timing in turn, and the machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from noiseflow import io
+from recon.metrics.comparison import project
+from recon.metrics.metrics import compare, compare_images
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range
+
+Array = NDArray[Any]
+Cell = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A known volume and its noisy tilt series.
+
+    Attributes:
+        truth: (z, y, x) attenuation.
+        clean, noisy: the series.
+        test_angles: degrees, none of them a tilt of the series.
+        noise_model: the true noise.
+        name: what it is.
+    """
+
+    truth: Array
+    clean: TiltSeries
+    noisy: TiltSeries
+    test_angles: Array
+    noise_model: nn.Module
+    name: str
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """One voxel per pixel."""
+        return VolumeGrid.of(self.noisy)
+
+    def errors(self, volume: Array) -> dict[str, float]:
+        """Errors of a volume in three dimensions, raw, affinely matched and min–max."""
+        found: dict[str, float] = {}
+        for scaling in ("raw", "affine", "min-max"):
+            errors = compare(volume, self.truth, scaling=scaling)
+            found |= {f"psnr {scaling}": errors.psnr, f"mse {scaling}": errors.mse}
+        return found
+
+    def projection_errors(self, volume: Array) -> dict[str, float]:
+        """Errors of the projections that a volume predicts at the test angles, one by one, as `errors` names them."""
+        predicted, true = (project(array, self.test_angles, mode=self.noisy.mode) for array in (volume, self.truth))
+        found: dict[str, float] = {}
+        for scaling in ("raw", "affine", "min-max"):
+            errors = compare_images(predicted, true, scaling=scaling)
+            found |= {f"2d psnr {scaling}": errors.psnr, f"2d mse {scaling}": errors.mse}
+            found |= {f"2d dssim {scaling}": errors.dssim}
+        return found
+
+
+@lru_cache(maxsize=4)
+def make_scene(
+    size: int, *, phantom: str = "shells", noise: str = "clipped", tilts: str = "-59.5:57.5:1.5", seed: int = 0
+) -> Scene:
+    """A scene by name; the same arguments give the same voxels and the same noise.
+
+    Args:
+        size: voxels along each edge.
+        phantom: one of `recon.simulate.phantoms.PHANTOMS`.
+        noise: one of `recon.simulate.simulation.ACQUISITIONS`, with noise.
+        tilts: START:STOP:STEP, degrees.
+        seed: of the phantom; the noise takes the next.
+    """
+    acquisition, angles = ACQUISITIONS[noise], tilt_range(tilts)
+    if acquisition.noise is None:
+        raise ValueError(f"{noise} has no noise; a benchmark needs some")
+    density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
+    clean, unit = clean_tilt_series(density, angles, acquisition=acquisition)
+    noise_model = acquisition.noise()
+    noisy = add_noise(clean, noise_model, seed=seed + 1)
+    test_angles = angles_between(angles, 20, share=2 / 3)
+    name = f"{phantom}, {noise} noise, {size}³, {len(angles)} tilts"
+    return Scene(density * np.float32(unit), clean, noisy, test_angles, noise_model, name)
+
+
+class Results:
+    """The cells of a benchmark in a JSON file: what is there is not computed again, and what is computed is kept at once.
+
+    Args:
+        path: the file; made with the first cell.
+        title: the benchmark's name.
+    """
+
+    def __init__(self, path: Path, title: str) -> None:
+        self.path = path
+        self.content: dict[str, Any] = {"benchmark": title, "machines": [], "cells": {}}
+        if path.exists():
+            try:
+                kept = json.loads(path.read_text(encoding="utf-8"))
+            except json.JSONDecodeError as error:
+                raise ValueError(f"{path} is not a results file ({error}); remove it to start again") from error
+            if kept.get("benchmark") != title or "cells" not in kept:
+                raise ValueError(
+                    f"{path} holds results of something else; remove it, or name another folder with --out"
+                )
+            self.content |= {name: kept[name] for name in ("machines", "cells") if name in kept}
+
+    @property
+    def cells(self) -> dict[str, Cell]:
+        """All cells so far."""
+        cells: dict[str, Cell] = self.content["cells"]
+        return cells
+
+    def forget(self, part: str) -> None:
+        """Leave out the cells whose name contains `part`: they are computed anew."""
+        for key in [key for key in self.cells if part in key]:
+            del self.cells[key]
+
+    def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
+        """The cell of a name, computed and saved if it is not there, with the machine's number and its load before."""
+        if key not in self.cells:
+            load, here = os.getloadavg()[0], machine()
+            found = compute()
+            if here not in self.content["machines"]:
+                self.content["machines"].append(here)
+            place = {"load": round(load, 1), "machine": self.content["machines"].index(here)}
+            self.cells[key] = plain(found | place)
+            with io.atomic_path(self.path) as partial:
+                partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+        return self.cells[key]
+
+
+def plain(value: Any) -> Any:
+    """Numbers that JSON knows, to five digits; what is not finite becomes None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if np.isfinite(value) else None
+    return value
+
+
+def in_turn(functions: Sequence[Callable[[], Any]], *, repeats: int) -> list[tuple[float, Any]]:
+    """Median seconds and last result of each function, all called in turn so that a busy machine slows none alone."""
+    seconds: list[list[float]] = [[] for _ in functions]
+    results: list[Any] = [None] * len(functions)
+    for _ in range(repeats):
+        for index, function in enumerate(functions):
+            started = time.perf_counter()
+            results[index] = function()
+            seconds[index].append(time.perf_counter() - started)
+    return [(statistics.median(times), result) for times, result in zip(seconds, results, strict=True)]
+
+
+def machine() -> dict[str, Any]:
+    """Processor, memory and versions, for whoever compares the figures."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    versions = {}
+    for package in ("noiseflow", "torch", "numpy", "scipy", "scikit-image", "astra-toolbox", "quantem", "bm3d"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": versions,
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

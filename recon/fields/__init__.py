@@ -1,0 +1,5 @@
+"""What holds the volume, where it is evaluated, and what it is expected to look like."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,157 @@
+"""What holds the volume: ``field()`` gives the attenuation of the whole lattice in the projector's native layout."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from noiseflow.models.base import Described
+from recon.fields.upsampling import upsample
+from recon.projection.projector import from_columns
+from recon.projection.tiles import Tiles
+
+_LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
+
+
+class Field(Described):
+    """A trainable volume of non-negative attenuation.
+
+    Args:
+        shape: (depth, height, width) of the lattice, voxels along (z, y, x).
+        scale: attenuation per voxel that counts as one unit; a guess within a factor of ten serves.
+    """
+
+    measured_in = "attenuation per voxel"
+    scale: Tensor
+    relative_rate = 1.0
+    """Learning rate that suits the field, relative to what suits a free number per voxel."""
+
+    def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
+        super().__init__()
+        if len(shape) != 3 or min(shape) < 1:
+            raise ValueError(
+                f"shape {tuple(shape)}: three sizes (depth, height, width) of at least one voxel are needed"
+            )
+        if not 0 < scale < math.inf:
+            raise ValueError(f"scale {scale} must be positive and finite")
+        self.depth, self.height, self.width = shape
+        self.register_buffer("scale", torch.tensor(float(scale)))
+
+    def units(self) -> Tensor:
+        """Attenuation in units of the scale, not negative, (depth, width, height)."""
+        raise NotImplementedError
+
+    def at(self, places: Tensor) -> Tensor:
+        """Attenuation, in units of the scale, at (N,) places of the flat lattice (z, x, y)."""
+        return self.units().reshape(-1).index_select(0, places)
+
+    def on(self, tiles: Tiles) -> Tensor:
+        """The same as the list of `tiles`, (N,), zero where nothing is occupied."""
+        values = self.at(tiles.voxels)
+        return values.new_zeros(tiles.filled.numel()).index_copy(0, tiles.occupied, values)
+
+    def start_from(self, volume: Tensor) -> None:
+        """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
+        raise NotImplementedError
+
+    def coarser(self) -> Field | None:
+        """This field on a lattice half as fine, by the same parameters: what it learns, this one has learnt. None where it has no
+        such lattice."""
+        return None
+
+    def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
+        """Unconstrained values of a volume (z, y, x) averaged or stretched to `shape`, (depth, width, height)."""
+        lattice = volume.transpose(1, 2)[None, None] / self.scale
+        pooled = functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
+        return torch.log(torch.expm1(pooled.clamp(_LEAST, 20)))
+
+    def forward(self) -> Tensor:
+        """Attenuation per voxel, (depth * width, height)."""
+        values = self.units() * self.scale
+        return values.reshape(self.depth * self.width, self.height)
+
+    def extra_repr(self) -> str:
+        """The lattice and the scale."""
+        return f"{self.depth} x {self.height} x {self.width} voxels (z, y, x), scale={float(self.scale):.4g}"
+
+    def volume(self) -> Tensor:
+        """The attenuation as (z, y, x), detached."""
+        with torch.no_grad():
+            return from_columns(self(), self.depth).contiguous()
+
+
+class VoxelField(Field):
+    """One free number per voxel."""
+
+    def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
+        super().__init__(shape, scale=scale)
+        empty = math.log(math.expm1(_LEAST))
+        self.values = nn.Parameter(torch.full((self.depth, self.width, self.height), empty))
+
+    def start_from(self, volume: Tensor) -> None:
+        with torch.no_grad():
+            self.values.copy_(self._raw_of(volume, self.values.shape))
+
+    def units(self) -> Tensor:
+        return functional.softplus(self.values)
+
+    def on(self, tiles: Tiles) -> Tensor:
+        return functional.softplus(tiles.gathered(self.values)) * tiles.filled
+
+
+class MultiresolutionField(Field):
+    """The sum of dense grids at doubling resolutions: the same volumes as `VoxelField`, far better conditioned.
+
+    The coarse grids act as a multigrid preconditioner: a step of Adam moves all wavelengths at once.
+
+    Args:
+        coarsest: voxels along the longest side of the coarsest grid, at least.
+    """
+
+    def __init__(self, shape: Sequence[int], *, scale: float = 1.0, coarsest: int = 3) -> None:
+        super().__init__(shape, scale=scale)
+        if coarsest < 1:
+            raise ValueError(f"coarsest {coarsest} must be at least one voxel")
+        sizes = [(self.depth, self.width, self.height)]
+        while max(sizes[0]) >= 2 * coarsest:
+            sizes.insert(0, tuple((size + 1) // 2 for size in sizes[0]))  # type: ignore[arg-type]
+        self.grids = nn.ParameterList(nn.Parameter(torch.zeros(size)) for size in sizes)
+        nn.init.constant_(self.grids[0], math.log(math.expm1(_LEAST)))
+
+    def start_from(self, volume: Tensor) -> None:
+        """The start lives in a grid four times coarser than the lattice: what is finer is noise."""
+        with torch.no_grad():
+            for grid in self.grids:
+                grid.zero_()
+            grid = self.grids[max(0, len(self.grids) - 3)]
+            grid.copy_(self._raw_of(volume, grid.shape))
+
+    def coarser(self) -> Field | None:
+        """The sum of all grids but the finest; a derived class may make its volume otherwise."""
+        if len(self.grids) < 2 or type(self) is not MultiresolutionField:
+            return None
+        depth, width, height = self.grids[-2].shape
+        field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)
+        field.grids = self.grids[:-1]
+        return field
+
+    def units(self) -> Tensor:
+        return functional.softplus(_sum(list(self.grids)))
+
+    def on(self, tiles: Tiles) -> Tensor:
+        *coarse, finest = self.grids
+        values = tiles.gathered(finest)
+        if coarse:
+            values = values + tiles.upsampled(_sum(coarse))
+        return functional.softplus(values) * tiles.filled
+
+
+def _sum(grids: Sequence[Tensor]) -> Tensor:
+    total, *finer = grids
+    for grid in finer:
+        total = upsample(total, grid.shape, plus=grid)
+    return total

@@ -1,0 +1,2 @@
+from .joint import JointReconstructor as JointReconstructor
+from .joint import Reconstruction as Reconstruction

@@ -1,0 +1,259 @@
+"""Checkpoints of a reconstruction: what every fit has reached, so that a stopped run goes on where it was.
+
+A journal is a folder of safetensors files with JSON metadata, each written beside its target and renamed; opening one runs no
+code from it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow import FitResult, fit
+from noiseflow.io import atomic_path
+from recon.joint.stages import Stage
+
+StepReport = Callable[[str, int, int, str], None]
+"""``report(title, done, total, note)`` after every step of every fit."""
+
+_FORMAT = "noiseflow checkpoint 1"
+_RUN, _CURRENT = "run.json", "current.safetensors"
+_RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
+
+
+class Journal:
+    """Runs the fits and other stages of one reconstruction in order, and keeps what each has reached.
+
+    All else in a reconstruction follows from its settings, its seed and the results of its stages, in order. So a run that
+    goes on repeats the rest, takes the finished stages from the journal, and continues the one that was stopped.
+
+    Args:
+        folder: of the journal; made when there is something to write.
+        settings: all that decides the result, by name, as JSON can hold it. Another run's journal is refused.
+        resume: go on with what the folder holds; otherwise the first thing written replaces it.
+        interval: seconds between checkpoints within a stage; one more is written when it ends, and when it is stopped.
+        report: told of every step. It may raise KeyboardInterrupt: the step is whole by then, and is saved.
+
+    Attributes:
+        in_fit: whether a fit or another stage is running.
+        stop_requested: set it to have KeyboardInterrupt raised after the running step, its state saved.
+        abandoned: set it to have nothing more written.
+
+    Raises:
+        ValueError: the folder belongs to a run with other settings, or is damaged.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        settings: dict[str, Any],
+        *,
+        resume: bool = False,
+        interval: float = 60.0,
+        report: StepReport | None = None,
+    ) -> None:
+        self.folder, self.interval, self.report = Path(folder), interval, report
+        self.settings = json.loads(json.dumps(settings))
+        self.stop_requested = self.abandoned = self.in_fit = False
+        self._num_fits = 0
+        self._fresh = not (resume and self.exists)
+        if not self._fresh:
+            self._check_settings()
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder holds a journal."""
+        return (self.folder / _RUN).is_file()
+
+    @property
+    def resumed(self) -> bool:
+        """Whether this run goes on with an earlier one."""
+        return not self._fresh
+
+    def fit(self, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any) -> FitResult:
+        """`noiseflow.fit` with ``digitise=False``, or what it reached earlier; other arguments and errors are the same."""
+        self._num_fits += 1
+        finished, generator = self._finished(self._num_fits), options.get("generator")
+        models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
+        if not self._fresh and finished.exists():
+            return _replay(read_state(finished), models, generator)
+        if options.get("progress") is None:
+            title = "choosing" if isinstance(signal, nn.Module) else "learning the noise"
+            options["progress"] = self.progress(f"{title}, fit {self._num_fits}", options.get("num_steps", 500))
+        options |= {
+            "resume": self._current(),
+            "digitise": False,
+            "checkpoint": self._write_current,
+            "checkpoint_interval": self.interval,
+        }
+        self.in_fit = True
+        result = fit(noise_model, signal, observation, **options)
+        self.in_fit = False
+        self._write(
+            finished,
+            {name: model.state_dict() for name, model in models.items()}
+            | {"result": {name: getattr(result, name) for name in _RESULT}, "rng": torch.get_rng_state()}
+            | ({"generator": generator.get_state()} if generator is not None else {}),
+        )
+        (self.folder / _CURRENT).unlink(missing_ok=True)
+        return result
+
+    def run_stage(self, title: str, stage: Stage) -> None:
+        """Take the steps of a stage that are left, told of and kept as those of a fit."""
+        self._num_fits += 1
+        finished, report = self._finished(self._num_fits), self.progress(title, stage.num_steps)
+        if not self._fresh and finished.exists():
+            stage.load_state(read_state(finished))
+            return
+        current = self._current()
+        if current is not None:
+            stage.load_state(current)
+        self.in_fit, saved = True, time.perf_counter()
+        try:
+            while stage.done < stage.num_steps:
+                note = stage.step()
+                if time.perf_counter() - saved >= self.interval:
+                    self._write_current(stage.state())
+                    saved = time.perf_counter()
+                report(stage.done, note)
+        except KeyboardInterrupt:
+            self._write_current(stage.state())
+            raise
+        self.in_fit = False
+        self._write(finished, stage.state())
+        (self.folder / _CURRENT).unlink(missing_ok=True)
+
+    def progress(self, title: str, total: int) -> Callable[[int, str], None]:
+        """Tells of the steps of one piece of work, and stops it where that is asked for."""
+
+        def progress(done: int, note: str) -> None:
+            if self.report is not None:
+                self.report(title, done, total, note)
+            if self.stop_requested:
+                raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
+
+        return progress
+
+    def discard(self) -> None:
+        """Remove the journal: its run is complete, or is not wanted any more."""
+        for file in (*self.folder.glob("*.safetensors"), *self.folder.glob("*run*.json")):  # half-written ones too
+            file.unlink(missing_ok=True)
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+    def _finished(self, number: int) -> Path:
+        return self.folder / f"fit-{number:03d}.safetensors"
+
+    def _current(self) -> dict[str, Any] | None:
+        if self._fresh or not (self.folder / _CURRENT).exists():
+            return None
+        kept = read_state(self.folder / _CURRENT)
+        if kept["number"] != self._num_fits:
+            return None
+        torch.set_rng_state(kept["rng"])
+        state: dict[str, Any] = kept["fit"]
+        return state
+
+    def _write_current(self, state: dict[str, Any]) -> None:
+        if not self.abandoned:
+            self._write(self.folder / _CURRENT, {"number": self._num_fits, "fit": state, "rng": torch.get_rng_state()})
+
+    def _write(self, path: Path, state: dict[str, Any]) -> None:
+        if self._fresh:
+            self._start()
+        write_state(path, state)
+
+    def _start(self) -> None:
+        self.discard()
+        self.folder.mkdir(exist_ok=True)
+        description = {"format": _FORMAT, "library_version": version("noiseflow"), "settings": self.settings}
+        with atomic_path(self.folder / _RUN) as partial:
+            partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
+        self._fresh = False
+
+    def _check_settings(self) -> None:
+        advice = f"give the same input and options, or leave out --resume to start over ({self.folder})"
+        try:
+            kept = json.loads((self.folder / _RUN).read_text(encoding="utf-8"))
+            format_, settings = kept["format"], dict(kept["settings"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"the checkpoint's {_RUN} is damaged; {advice}") from error
+        if format_ != _FORMAT or kept.get("library_version") != version("noiseflow"):
+            raise ValueError(f"the checkpoint was written by another version of noiseflow; {advice}")
+        names = [name for name in {**settings, **self.settings} if settings.get(name) != self.settings.get(name)]
+        if names:
+            changes = ", ".join(f"{name} was {settings.get(name)}, now {self.settings.get(name)}" for name in names)
+            raise ValueError(f"the checkpoint is of another run: {changes}; {advice}")
+
+
+def _replay(kept: dict[str, Any], models: dict[str, nn.Module], generator: torch.Generator | None) -> FitResult:
+    for name, model in models.items():
+        model.load_state_dict(kept[name])
+    if generator is not None:
+        generator.set_state(kept["generator"])
+    torch.set_rng_state(kept["rng"])
+    return FitResult(models["noise_model"], **kept["result"])
+
+
+def write_state(path: Path, state: dict[str, Any]) -> None:
+    """Write nested dicts and lists of tensors, numbers and strings, all at once or not at all."""
+    from safetensors.torch import save_file
+
+    tensors: dict[str, Tensor] = {}
+    description = json.dumps(_packed(state, tensors))
+    with atomic_path(path) as partial:
+        save_file(tensors, partial, metadata={"format": _FORMAT, "state": description})
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """Read what `write_state` wrote.
+
+    Raises:
+        ValueError: another file, or a damaged one.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            packed = json.loads((file.metadata() or {})["state"])
+            state: dict[str, Any] = _unpacked(packed, file)
+    except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"checkpoint {path} is damaged ({type(error).__name__}); leave out --resume to start over"
+        ) from error
+    return state
+
+
+def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        name = str(len(tensors))
+        kept = value.detach().cpu().contiguous()
+        whole = kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
+        shared = any(kept.data_ptr() == other.data_ptr() for other in tensors.values())
+        tensors[name] = kept if whole and not shared else kept.clone()
+        return {"tensor": name}
+    if isinstance(value, dict):
+        return {"dict": [[key, _packed(item, tensors)] for key, item in value.items()]}
+    if isinstance(value, (list, tuple)):
+        return {"list": [_packed(item, tensors) for item in value]}
+    if isinstance(value, (str, int, float, bool, type(None))):
+        return value
+    raise TypeError(f"a checkpoint cannot hold {type(value).__name__}")
+
+
+def _unpacked(value: Any, file: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    if "tensor" in value:
+        return file.get_tensor(value["tensor"])
+    if "dict" in value:
+        return {key: _unpacked(item, file) for key, item in value["dict"]}
+    return [_unpacked(item, file) for item in value["list"]]

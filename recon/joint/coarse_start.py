@@ -1,0 +1,106 @@
+"""A quick, coarse and converged reconstruction: where a fit starts, and how bright the beam is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from noiseflow import Gaussian, fit
+from recon.fields.fields import Field, MultiresolutionField
+from recon.joint.signal_model import TomographySignal
+from recon.projection.image_formation import Linear, Transmission
+from recon.projection.projector import SliceProjector
+from recon.series.first_guess import attenuation_scale, rough_volume
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+_COARSE = 24
+_LEAST_BINNING = 4
+_HIGHEST_RATE, _RATE = 0.4, 0.6
+
+
+def coarse_start(
+    tilt_series: TiltSeries,
+    response: Transmission | Linear,
+    grid: VolumeGrid,
+    *,
+    num_steps: int = 200,
+    generator: torch.Generator,
+) -> Tensor:
+    """Reconstruct binned images by least squares, and set the response to what suits them best.
+
+    Incident intensity and volume trade off against each other: a haze looks like a dimmer beam. A fit at full resolution never
+    gets far along that valley; here every step takes the best response for the volume as it is, and steps are cheap.
+
+    Args:
+        tilt_series: the data.
+        response: its first guess; set in place.
+        grid: the lattice at full resolution.
+        num_steps: of the fit.
+        generator: source of the choice of pixels that judge the fit.
+
+    Returns:
+        The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`.
+    """
+    binning = max(1, min(max(_LEAST_BINNING, round(grid.width / _COARSE)), *(size // 4 for size in grid.shape[1:])))
+    binned, mask, projector = _binned(tilt_series, grid, binning)
+    start = rough_volume(binned, response, projector)
+    depth, height, width = projector.depth, binned.images.shape[1], projector.width
+    field = MultiresolutionField((depth, height, width), scale=attenuation_scale(start), coarsest=2)
+    field.start_from(start)
+    images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (binned.images, mask))
+    rate = learning_rate(start, field)
+    response_now = _BestResponse(response, images, use)
+    signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
+    fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
+    return field.volume() / binning
+
+
+def learning_rate(volume: Tensor, field: Field) -> float:
+    """Learning rate that suits how much a beam has to cross: steps of all voxels along a ray add up in its line integral."""
+    thickness = float(volume.mean() / field.scale) * field.depth
+    return min(_HIGHEST_RATE, _RATE / math.sqrt(max(thickness, 1e-6)))
+
+
+class _BestResponse(nn.Module):
+    """A response that is matched to the images anew for all line integrals that it is shown."""
+
+    def __init__(self, response: Transmission | Linear, images: Tensor, use: Tensor) -> None:
+        super().__init__()
+        self.response, self.images, self.use = response, images, use
+
+    def forward(self, line_integrals: Tensor) -> Tensor:
+        self.response.match(line_integrals, self.images, self.use)
+        signal: Tensor = self.response(line_integrals)
+        return signal
+
+
+def _binned(
+    tilt_series: TiltSeries, grid: VolumeGrid, binning: int
+) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
+    """The series averaged over squares of pixels, with a mask, and the projector from a lattice of voxels as large."""
+    use = np.ones(tilt_series.images.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask
+    share = _means(use, binning)
+    images = _means(np.where(use, tilt_series.images, 0), binning) / share.clip(min=1e-6)
+    mask = share > 0
+    images[~mask] = images[mask].mean()
+    projector = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles,
+        depth=-(-grid.depth // binning),
+        width=-(-grid.width // binning),
+        detector_width=images.shape[2],
+        detector_offset=-(use.shape[2] % binning) / 2 / binning,
+    )
+    return TiltSeries(images, tilt_series.tilt_angles, None, tilt_series.mode), mask, projector
+
+
+def _means(images: NDArray[Any], size: int) -> NDArray[np.float32]:
+    """Means of squares of `size` pixels; what is left over at the far edges is left out."""
+    tensor = torch.from_numpy(np.asarray(images, dtype=np.float32))
+    means: NDArray[np.float32] = functional.avg_pool2d(tensor[:, None], size)[:, 0].numpy()
+    return means

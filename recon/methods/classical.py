@@ -1,0 +1,151 @@
+"""Back-projection and SIRT on a tilt series as it comes, their settings chosen by tilts left out of the reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.joint.stages import RunStage, run_stage
+from recon.projection.image_formation import Linear, Transmission
+from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
+from recon.projection.wbp import WINDOWS, wbp
+from recon.series.first_guess import contrast_slab, estimate_response
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+_CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
+_SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
+
+
+@dataclass(frozen=True)
+class LineIntegralProblem:
+    """Measured line integrals and the operator that predicts them.
+
+    Attributes:
+        line_integrals: (tilt, y, u).
+        projector: the operator.
+        response: from line integrals to the detector's readings.
+    """
+
+    line_integrals: Tensor
+    projector: SliceProjector
+    response: Transmission | Linear
+
+    @classmethod
+    def of(cls, tilt_series: TiltSeries, grid: VolumeGrid, device: torch.device | str = "cpu") -> LineIntegralProblem:
+        """The problem of reconstructing `tilt_series` on `grid`."""
+        response = estimate_response(tilt_series).to(device)
+        projector = SliceProjector(
+            tilt_angles=tilt_series.tilt_angles,
+            depth=grid.depth,
+            width=grid.width,
+            detector_width=tilt_series.images.shape[2],
+            device=device,
+        )
+        images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32)).to(device)
+        with torch.no_grad():
+            return cls(response.invert(images).contiguous(), projector, response)
+
+    def predict(self, volume: Tensor) -> NDArray[np.float32]:
+        """The images (tilt, y, u) that a volume (z, y, x) predicts, detector units."""
+        with torch.no_grad():
+            images = self.response(self.projector(volume).transpose(1, 2)).transpose(1, 2)
+            return np.asarray(images.contiguous().cpu().numpy())
+
+
+def best_window(
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
+) -> tuple[str, float]:
+    """Window and cutoff of the back-projection that best predicts tilts left out; with few tilts, the first and 1."""
+    if tilt_series.num_tilts < _FEWEST:
+        return next(iter(windows)), 1.0
+    rest, score = _left_out(tilt_series, grid)
+    tried = {
+        (window, cutoff): score(wbp(rest.line_integrals, rest.projector, window=window, cutoff=cutoff))
+        for window in windows
+        for cutoff in _CUTOFFS
+    }
+    return max(tried, key=lambda setting: tried[setting])
+
+
+def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
+    """The number of SIRT iterations after which tilts left out are predicted best; later ones fit the noise.
+
+    With few tilts, 32.
+    """
+    if tilt_series.num_tilts < _FEWEST:
+        return 32
+    choice = _IterationChoice(*_left_out(tilt_series, grid))
+    run_stage("choosing the number of iterations", choice)
+    return choice.best
+
+
+class _IterationChoice:
+    """A stage that tries more and more iterations, until the last few numbers were no better than the best."""
+
+    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float]) -> None:
+        self.rest, self.score = rest, score
+        self.volume: Tensor | None = None
+        self.tried: dict[int, float] = {}
+        self.done, self.num_steps = 0, len(_ITERATIONS)
+
+    @property
+    def best(self) -> int:
+        """The best number so far."""
+        return max(self.tried, key=lambda number: self.tried[number])
+
+    def step(self) -> str:
+        """Try the next number."""
+        count, before = _ITERATIONS[self.done], max(self.tried, default=0)
+        lines = self.rest.line_integrals
+        self.volume = sirt(lines, self.rest.projector, num_iterations=count - before, start=self.volume)
+        self.tried[count] = self.score(self.volume)
+        self.done += 1
+        if len([number for number in self.tried if number > self.best]) >= _PATIENCE:
+            self.num_steps = self.done
+        return f"best {self.best}"
+
+    def state(self) -> dict[str, Any]:
+        """Where it is."""
+        return {"volume": self.volume, "tried": self.tried, "done": self.done, "num_steps": self.num_steps}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.volume, self.tried = state["volume"], state["tried"]
+        self.done, self.num_steps = state["done"], state["num_steps"]
+
+
+def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
+    """A slab without every fifth tilt, and a judge: how well a volume's projections correlate with the tilts left out."""
+    rows = contrast_slab(tilt_series, _SLAB)
+    out = np.arange(tilt_series.num_tilts) % _LEAVE_OUT == _LEAVE_OUT // 2
+    slab = replace(grid, height=rows.stop - rows.start)
+    rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
+    judge = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles[out],
+        depth=grid.depth,
+        width=grid.width,
+        detector_width=tilt_series.images.shape[2],
+    )
+    left = part_of(tilt_series, out, rows)
+    measured = left.images.astype(np.float64).ravel()
+    unseen = replace(rest, projector=judge, response=estimate_response(left))
+
+    def score(volume: Tensor) -> float:
+        predicted = unseen.predict(volume).astype(np.float64).ravel()
+        return float(np.corrcoef(predicted, measured)[0, 1]) if np.ptp(predicted) > 0 else -1.0
+
+    return rest, score
+
+
+def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
+    """Some tilts and some rows of a series."""
+    mask = None if tilt_series.mask is None else tilt_series.mask[:, rows]
+    return replace(tilt_series, images=tilt_series.images[:, rows], mask=mask).select(tilts)

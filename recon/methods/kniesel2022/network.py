@@ -1,0 +1,132 @@
+"""The parts of Kniesel et al. (CVPR 2022): its coordinate networks, its noise model, and its sampling of rays."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from noiseflow.distributions.base import LatentDistribution
+from noiseflow.distributions.transforms import Radial
+from noiseflow.models.base import ArrayModel
+
+_PARAMETER_RANGE = 10.0
+
+
+class CoordinateDensity(nn.Module):
+    """Density in (0, 1) at points of the cube [-1, 1]³: fully connected layers on a positional encoding, sigmoid at the end.
+
+    Args:
+        frequencies: octaves of the encoding, sine and cosine each.
+        layers: hidden layers, ReLU between them.
+        width: of the hidden layers.
+        skip: hidden layers after which the encoding is handed in again; 0 for none.
+    """
+
+    def __init__(self, frequencies: int = 10, layers: int = 9, width: int = 256, skip: int = 5) -> None:
+        super().__init__()
+        self.frequencies, self.skip = frequencies, skip
+        encoded = 6 * frequencies
+        sizes = [encoded, *[width] * (layers - 1)]
+        if skip:
+            sizes[skip] += encoded
+        self.hidden = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+        self.last = nn.Linear(width, 1)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """(..., 3) to (...)."""
+        encoded = self.encode(points)
+        values = encoded
+        for index, layer in enumerate(self.hidden):
+            if self.skip and index == self.skip:
+                values = torch.cat([encoded, values], -1)
+            values = functional.relu(layer(values))
+        return torch.sigmoid(self.last(values)).squeeze(-1)
+
+    def encode(self, points: Tensor) -> Tensor:
+        """Sines and cosines of π·2ᵏ times each coordinate, (..., 6·frequencies)."""
+        octaves = math.pi * 2.0 ** torch.arange(self.frequencies, dtype=points.dtype, device=points.device)
+        phases = (points[..., None, :] * octaves[:, None]).flatten(-2)
+        return torch.cat([torch.sin(phases), torch.cos(phases)], -1)
+
+
+class PaperFlow(ArrayModel):
+    """Radial layers on the residual, of which the later ones take their parameters from the signal by a small network.
+
+    Args:
+        layers: not conditioned, and as many conditioned ones.
+        width: hidden units of each conditioning network.
+        normalised: True evaluates each layer's log-derivative at its input, so that the density integrates to one; False
+            evaluates it at its output, as the released code does.
+    """
+
+    def __init__(self, layers: int = 4, width: int = 16, *, normalised: bool = True) -> None:
+        super().__init__()
+        self.normalised = normalised
+        self.free = nn.Parameter(torch.empty(layers, 3).uniform_(-1, 1))
+        self.networks = nn.ModuleList(
+            nn.Sequential(nn.Linear(1, width), nn.ReLU(), nn.Linear(width, 3), nn.Tanh()) for _ in range(layers)
+        )
+
+    def forward(self, signal: Tensor) -> PaperFlowDistribution:
+        """The distribution of observations of pixels with the given signals, any shape, incident intensities."""
+        rows = [*self.free, *(_PARAMETER_RANGE * network(signal[..., None]) for network in self.networks)]
+        return PaperFlowDistribution(signal, [_radial(row) for row in rows], self.normalised)
+
+
+def _radial(raw: Tensor) -> Radial:
+    """Centre, log α and softplus⁻¹(α + β) to a radial map."""
+    return Radial(raw[..., 0], raw[..., 1], torch.log(functional.softplus(raw[..., 2]).clamp_min(1e-30)) - raw[..., 1])
+
+
+class PaperFlowDistribution(LatentDistribution):
+    """The flow's distribution; where it is not normalised, `log_prob` is what is published and no density."""
+
+    def __init__(self, signal: Tensor, maps: list[Radial], normalised: bool) -> None:
+        super().__init__(signal.shape)
+        self.signal, self.maps, self.normalised = signal, maps, normalised
+
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        latent = value - self.signal
+        total = torch.zeros_like(latent)
+        for radial in self.maps:
+            image, ladj = radial.forward(latent)
+            total = total + (ladj if self.normalised else radial.forward(image)[1])
+            latent = image
+        return latent, total
+
+    def from_latent(self, latent: Tensor) -> Tensor:
+        for radial in reversed(self.maps):
+            latent = radial.inverse(latent)[0]
+        return latent + self.signal
+
+    def _like(self) -> Tensor:
+        return self.signal
+
+
+def stratified(edges: Tensor, generator: torch.Generator) -> Tensor:
+    """One uniform sample in each of the intervals that begin at `edges`, (rays, samples), equally wide, sorted.
+
+    Args:
+        edges: (rays, samples), multiples of one width.
+        generator: source of the samples.
+    """
+    width = float(edges[0].diff().abs().max()) if edges.shape[1] > 1 else 1.0
+    noise = torch.rand(edges.shape, generator=generator).to(edges)
+    return (edges + width * noise).sort(-1).values
+
+
+def by_density(edges: Tensor, density: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Intervals drawn in proportion to the density found in them, beside one of each: (rays, count + samples).
+
+    Args:
+        edges: (rays, samples) where the intervals begin.
+        density: (rays, samples); rays without any get uniform draws.
+        count: draws for each ray.
+        generator: source of the draws.
+    """
+    weights = torch.where(density.sum(-1, keepdim=True) > 0, density, torch.ones_like(density)).cpu()
+    drawn = torch.multinomial(weights, count, replacement=True, generator=generator).to(edges.device)
+    return torch.cat([edges, edges.gather(-1, drawn)], -1)

@@ -1,0 +1,207 @@
+"""Published reconstructions with their own settings, to compare with. They take days where others take seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from recon.methods.kniesel2022.network import CoordinateDensity, PaperFlow, by_density, stratified
+from recon.projection.image_formation import Transmission
+from recon.series.first_guess import estimate_response
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+
+_POINTS_TOGETHER = 2**16
+
+
+@dataclass(frozen=True)
+class Kniesel2022:
+    """Kniesel et al., *Clean Implicit 3D Structure from Noisy 2D STEM Images*, CVPR 2022 (doi:10.1109/CVPR52688.2022.02018).
+
+    Two coordinate networks are trained ray by ray with Adam, the second on samples placed by the first, and the noise model with
+    them by stochastic gradient descent. Three things are not as in the released code: the noise model's gradients are cleared at
+    every step, images are divided by the incident intensity instead of being rescaled min–max, and the last state counts, for the
+    best one on clean validation images needs images that nobody has.
+
+    Attributes:
+        width: of the hidden layers (the paper's real data: 512).
+        num_steps: iterations.
+        normalised: False reproduces the published log-density, which does not integrate to one.
+        rays, accumulate: rays of a batch, and batches whose gradients make one step.
+        coarse_samples, fine_samples: along a ray, uniform and drawn by density.
+        field_rate, noise_rate: learning rates; constant up to `decay_start`, then falling in a line to a hundredth.
+        l2_steps: first steps, of the field alone by least squares.
+        density_scale: attenuation per unit length (half the image's width) of a density of one.
+        seed: of every random choice.
+        device: where to compute.
+    """
+
+    width: int = 256
+    num_steps: int = 400_000
+    normalised: bool = True
+    rays: int = 512
+    accumulate: int = 4
+    coarse_samples: int = 64
+    fine_samples: int = 128
+    field_rate: float = 5e-5
+    noise_rate: float = 5e-5
+    decay_start: int = 100_000
+    l2_steps: int = 100
+    density_scale: float = 7.0
+    seed: int = 0
+    device: torch.device | str = "cpu"
+
+    def start(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> PresetState:
+        """Networks as they are before the first step.
+
+        Args:
+            tilt_series: the data.
+            max_steps: stop there; the learning rates go by `num_steps` all the same.
+
+        Raises:
+            ValueError: a series that is not bright field.
+        """
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            return PresetState(self, tilt_series, min(self.num_steps, max_steps or self.num_steps))
+
+    def train(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> Iterator[PresetState]:
+        """Train step by step, as `start` says; each step yields the state as it is."""
+        state = self.start(tilt_series, max_steps=max_steps)
+        while state.done < state.num_steps:
+            state.step()
+            yield state
+
+    def __call__(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Volume:
+        """Train to the end and evaluate the field on the grid."""
+        *_, state = self.train(tilt_series)
+        return state.volume(grid)
+
+
+class PresetState:
+    """Networks, noise model and optimisers of a running preset: a `Stage` of a reconstruction."""
+
+    def __init__(self, preset: Kniesel2022, tilt_series: TiltSeries, num_steps: int) -> None:
+        self.preset, self.done, self.num_steps, self.loss = preset, 0, num_steps, math.nan
+        width = preset.width
+        self.coarse = CoordinateDensity(frequencies=5, layers=3, width=width, skip=0).to(preset.device)
+        self.fine = CoordinateDensity(frequencies=10, layers=9, width=width, skip=5).to(preset.device)
+        self.noise_model = PaperFlow(normalised=preset.normalised).to(preset.device)
+        fields = [*self.coarse.parameters(), *self.fine.parameters()]
+        self.field_optimiser = torch.optim.Adam(fields, lr=preset.field_rate)
+        self.noise_optimiser = torch.optim.SGD(
+            self.noise_model.parameters(), lr=preset.noise_rate, momentum=0.9, weight_decay=1e-3
+        )
+        self.generator = torch.Generator().manual_seed(preset.seed)
+        response = estimate_response(tilt_series)
+        if not isinstance(response, Transmission):
+            raise ValueError(
+                "the preset kniesel2022 knows bright-field images only; a linear series needs another method"
+            )
+        images = np.asarray(tilt_series.images, dtype=np.float32) / response.intensity.numpy()[:, None, None]
+        self.images = torch.from_numpy(images).to(preset.device)
+        self.theta = torch.from_numpy(np.deg2rad(tilt_series.tilt_angles)).float().to(preset.device)
+
+    @property
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "coarse": self.coarse,
+            "fine": self.fine,
+            "noise model": self.noise_model,
+            "field optimiser": self.field_optimiser,
+            "noise optimiser": self.noise_optimiser,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """All that the steps to come depend on."""
+        kept = {name: part.state_dict() for name, part in self._parts.items()}
+        return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave."""
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        self.generator.set_state(state["generator"])
+        self.done, self.loss = state["done"], state["loss"]
+
+    def step(self) -> str:
+        """One iteration: the coarse network, then the fine one, then all optimisers."""
+        preset, step = self.preset, self.done + 1
+        likelihood = step > preset.l2_steps
+        for optimiser, rate in ((self.field_optimiser, preset.field_rate), (self.noise_optimiser, preset.noise_rate)):
+            optimiser.param_groups[0]["lr"] = rate * self._decay(step)
+            optimiser.zero_grad(set_to_none=True)
+        self.loss = 0.0
+        for fine in (False, True):
+            for _ in range(preset.accumulate):
+                loss = self._loss(fine, likelihood) / preset.accumulate
+                loss.backward()  # type: ignore[no-untyped-call]
+                self.loss += float(loss.detach()) if fine else 0.0
+        self.field_optimiser.step()
+        if likelihood:
+            nn.utils.clip_grad_norm_(self.noise_model.parameters(), 100.0)
+            self.noise_optimiser.step()
+        self.done = step
+        return f"loss {self.loss:.4f}"
+
+    def _decay(self, step: int) -> float:
+        start, stop = self.preset.decay_start, self.preset.num_steps
+        done = (step - start) / max(stop - start, 1)
+        return 1.0 if step <= start else 1 + done * (0.01 - 1)
+
+    def _loss(self, fine: bool, likelihood: bool) -> Tensor:
+        origin, direction, observed = self._rays()
+        edges = torch.arange(self.preset.coarse_samples, device=origin.device) / self.preset.coarse_samples
+        edges = (edges * 2 * math.sqrt(2) - math.sqrt(2)).expand(len(origin), -1)
+        if fine:
+            with torch.no_grad():
+                points = origin[:, None] + stratified(edges, self.generator)[..., None] * direction[:, None]
+                density = self.coarse(points)
+            edges = by_density(edges, density, self.preset.fine_samples, self.generator)
+        predicted = self._signal(self.fine if fine else self.coarse, origin, direction, edges)
+        nll: Tensor = -self.noise_model(predicted).log_prob(observed).mean()
+        return nll if likelihood else ((predicted - observed) ** 2).mean()
+
+    def _rays(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Origins and directions (x, y, z) and readings of randomly drawn rays; the cube is as wide as the image."""
+        tilts, height, width = self.images.shape
+        tilt, row, column = (
+            torch.randint(size, (self.preset.rays,), generator=self.generator).to(self.images.device)
+            for size in (tilts, height, width)
+        )
+        u, y = (2 * column + 1) / width - 1, (2 * row + 1 - height) / width
+        cosine, sine = torch.cos(self.theta[tilt]), torch.sin(self.theta[tilt])
+        origin = torch.stack([u * cosine, y, u * sine], -1)
+        direction = torch.stack([-sine, torch.zeros_like(sine), cosine], -1)
+        return origin, direction, self.images[tilt, row, column]
+
+    def _signal(self, network: nn.Module, origin: Tensor, direction: Tensor, edges: Tensor) -> Tensor:
+        width = 2 * math.sqrt(2) / self.preset.coarse_samples
+        noise = torch.rand(edges.shape, generator=self.generator).to(edges)
+        along = (edges + width * noise).sort(-1).values
+        points = origin[:, None] + along[..., None] * direction[:, None]
+        inside = (points.abs() <= 1).all(-1)
+        steps = torch.diff(along, dim=-1, prepend=along[:, :1])
+        line_integral: Tensor = (network(points) * inside * steps).sum(-1) * self.preset.density_scale
+        return torch.exp(-line_integral)
+
+    @torch.no_grad()
+    def volume(self, grid: VolumeGrid) -> Volume:
+        """The fine network on the lattice, attenuation per voxel."""
+        axes = [((2 * torch.arange(size) + 1 - size) / grid.width) for size in grid.shape]
+        z, y, x = torch.meshgrid(*axes, indexing="ij")
+        points = torch.stack([x, y, z], -1).reshape(-1, 3)
+        device = self.images.device
+        density = torch.cat([self.fine(part.to(device)).cpu() for part in torch.split(points, _POINTS_TOGETHER)])
+        values: NDArray[Any] = (density * (2 * self.preset.density_scale / grid.width)).reshape(grid.shape).numpy()
+        return Volume(values, grid.voxel_size)
+
+
+PRESETS = {"kniesel2022": Kniesel2022(), "kniesel2022-as-published": Kniesel2022(normalised=False)}
+"""Presets by name."""

@@ -1,0 +1,170 @@
+"""A volume beside its reference: errors in three dimensions and in projections, shell correlation, and the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from noiseflow.commands.console import Progress
+from noiseflow.report import Report, new_figure, show_image
+from recon.metrics.metrics import (
+    SCALINGS,
+    Errors,
+    compare,
+    compare_images,
+    fourier_shell_correlation,
+    match,
+    resolution,
+)
+from recon.projection.projector import SliceProjector
+from recon.series.tilt_series import Mode, Volume
+
+Array = NDArray[Any]
+THRESHOLDS = (0.5, 0.143)
+NUM_STEPS = len(SCALINGS) + 2
+_TOGETHER = 16
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What there is to say of a volume and its reference.
+
+    Attributes:
+        volume: errors in three dimensions by scaling (``raw``, ``affine``, ``min-max``).
+        projections: the same of projections, image by image; empty where no angles were given.
+        frequency, correlation: (N,) Fourier shell correlation, cycles per voxel.
+        crossings: threshold → frequency, cycles per voxel.
+    """
+
+    volume: dict[str, Errors]
+    projections: dict[str, Errors]
+    frequency: Array
+    correlation: Array
+    crossings: dict[float, float]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, for programs."""
+        both = {"volume": self.volume, "projections": self.projections}
+        errors = {name: {scaling: asdict(e) for scaling, e in part.items()} for name, part in both.items()}
+        crossings = {f"fsc_{threshold:g}": value for threshold, value in self.crossings.items()}
+        return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation}
+
+
+def compare_volumes(
+    volume: Volume,
+    reference: Volume,
+    *,
+    tilt_angles: Array | None = None,
+    mode: Mode = "linear",
+    progress: Progress = lambda done, note: None,
+) -> Comparison:
+    """Compare a volume with its reference.
+
+    Args:
+        volume: to be judged.
+        reference: the truth, on the same lattice.
+        tilt_angles: degrees; projections at these angles are compared too.
+        mode: what a projection is: line integrals (``linear``), or exp(−line integral).
+        progress: called with the steps done, of `NUM_STEPS`, and a note.
+
+    Raises:
+        ValueError: sizes or voxel sizes differ, voxels are not finite, or the reference is flat.
+    """
+    _check_lattices(volume, reference)
+    first, second = volume.attenuation, reference.attenuation
+    errors: dict[str, Errors] = {}
+    for done, scaling in enumerate(SCALINGS):
+        progress(done + 1, f"volumes, {scaling}")
+        errors[scaling] = compare(first, second, scaling=scaling)
+    projections: dict[str, Errors] = {}
+    if tilt_angles is not None:
+        progress(len(SCALINGS) + 1, "projections")
+        images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
+        projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
+    progress(NUM_STEPS, "shell correlation")
+    frequency, correlation = fourier_shell_correlation(first, second)
+    crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
+    return Comparison(errors, projections, frequency, correlation, crossings)
+
+
+def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
+    """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmissions of an incident intensity of one."""
+    depth, _, width = volume.shape
+    lattice = torch.from_numpy(np.asarray(volume, dtype=np.float32))
+    parts = []
+    for start in range(0, len(tilt_angles), _TOGETHER):
+        part = tilt_angles[start : start + _TOGETHER]
+        parts.append(SliceProjector(tilt_angles=part, depth=depth, width=width)(lattice).numpy())
+    images = np.concatenate(parts)
+    return np.asarray(images if mode == "linear" else np.exp(-images))
+
+
+def _check_lattices(volume: Volume, reference: Volume) -> None:
+    first, second = volume.attenuation, reference.attenuation
+    for name, array in (("volume", first), ("reference", second)):
+        if array.ndim != 3:
+            raise ValueError(f"the {name} has shape {array.shape}; a volume (z, y, x) is needed")
+    if first.shape != second.shape:
+        sizes = [" x ".join(map(str, array.shape)) for array in (first, second)]
+        raise ValueError(
+            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one of them to the other's lattice"
+        )
+    if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
+        raise ValueError(
+            f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "
+            "resample one of them, or mend its header"
+        )
+
+
+def comparison_report(volume: Array, reference: Array, comparison: Comparison, *, names: tuple[str, str]) -> Report:
+    """A page with slices of both volumes and their difference, the shell correlation and the table of errors.
+
+    Args:
+        volume, reference: (z, y, x).
+        comparison: of the two.
+        names: of the two, for the titles.
+    """
+    report = Report(f"{names[0]} compared with {names[1]}")
+    header, rows = error_table(comparison)
+    report.table(header, rows, caption="MSE in squared ranges of the reference; projections are compared one by one.")
+    matched = match(np.asarray(volume, dtype=np.float64), np.asarray(reference, dtype=np.float64), scaling="affine")
+    limits = tuple(float(value) for value in np.percentile(reference, (0.5, 99.8)))
+    span = float(np.percentile(np.abs(matched - reference), 99.5))
+    figure, axes = new_figure(3, 3)
+    for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
+        middle = [size // 2 for size in reference.shape][axis]
+        images = [np.take(array, middle, axis=axis) for array in (reference, matched, matched - reference)]
+        show_image(row[0], images[0], f"reference, {letter} = {middle}", limits=limits)  # type: ignore[arg-type]
+        show_image(row[1], images[1], "volume, affinely matched", limits=limits)  # type: ignore[arg-type]
+        show_image(row[2], images[2], "difference", limits=(-span, span))
+    report.heading("Slices")
+    report.figure(figure, caption="Three orthogonal slices through the centre.")
+    figure, axes = new_figure(1)
+    _draw_correlation(axes[0][0], comparison)
+    report.heading("Fourier shell correlation")
+    report.figure(figure, caption="Correlation of the two volumes by shells of spatial frequency.")
+    return report
+
+
+def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and rows of the errors, for people."""
+    header = ("compared", "MSE", "PSNR (dB)", "DSSIM")
+    parts = {"volume": comparison.volume, "projections": comparison.projections}
+    rows: list[tuple[str, ...]] = [
+        (f"{part}, {scaling}", f"{errors.mse:.3e}", f"{errors.psnr:.2f}", f"{errors.dssim:.4f}")
+        for part, by_scaling in parts.items()
+        for scaling, errors in by_scaling.items()
+    ]
+    return header, rows
+
+
+def _draw_correlation(axis: Any, comparison: Comparison) -> None:
+    axis.plot(comparison.frequency[1:], comparison.correlation[1:])
+    for threshold, crossing in comparison.crossings.items():
+        axis.axhline(threshold, color="grey", linestyle=":", linewidth=1)
+        axis.text(0.005, threshold + 0.01, f"{threshold:g}: {crossing:.3f} cycles per voxel", fontsize=9)
+    axis.set(xlabel="spatial frequency (cycles per voxel)", ylabel="correlation", xlim=(0, 0.5), ylim=(-0.1, 1.05))

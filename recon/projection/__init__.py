@@ -1,0 +1,1 @@
+"""From volumes to images: the slice operator, tiles, defocus, rays and the detector response."""

@@ -1,0 +1,137 @@
+"""Blur that grows with the distance from the focal plane, along the beam: exactly, layer by layer, or by jittered rays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.projection.projector import SliceProjector, from_columns, from_rays, to_columns, to_rays
+from recon.projection.rays import march, view_matrices, view_rays
+
+_SUBPIXEL = 0.25
+_MOST_LAYERS = 12
+_REACH = 6  # standard deviations at which a kernel ends
+
+
+def with_defocus(projector: SliceProjector, convergence: float) -> SliceProjector | DefocusedProjector:
+    """The projector with blur where there is any to see, or else the one in focus itself. Raises as `DefocusedProjector`."""
+    blurred = DefocusedProjector(projector, convergence)
+    return blurred if len(blurred.blurs) > 1 else projector
+
+
+class DefocusedProjector:
+    """Line integrals through a converging beam that is in focus on the tilt axis; takes the place of a `SliceProjector`.
+
+    What lies at distance w from the focal plane, along the beam, is blurred by a Gaussian of standard deviation
+    ``convergence``·\\|w\\| pixels along u and y. The slab is split into layers of nearly equal blur; each is projected by its
+    part of the matrix and blurred by its own separable kernel. Where the blur is below a quarter of a pixel it is left out, and
+    where that holds everywhere this is the `SliceProjector` itself. Adjoint and gradients are exact.
+
+    Args:
+        projector: the geometry, in focus.
+        convergence: standard deviation of the beam's slopes, pixels of blur per voxel of distance; about half the semi-angle of
+            convergence, in radians.
+        most_layers: layers with a blur of their own, at most.
+
+    Attributes:
+        blurs: standard deviation in each layer, pixels; the first is zero.
+
+    Raises:
+        ValueError: a convergence that is negative or not finite.
+    """
+
+    def __init__(self, projector: SliceProjector, convergence: float, *, most_layers: int = _MOST_LAYERS) -> None:
+        if not 0 <= convergence < math.inf:
+            raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
+        self.tilt_angles, self.num_tilts = projector.tilt_angles, projector.num_tilts
+        self.dtype, self.device = projector.dtype, projector.device
+        self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
+        farthest = convergence * math.hypot(self.depth - 1, self.width - 1) / 2
+        count = min(most_layers, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))
+        edges = np.linspace(_SUBPIXEL, max(farthest, _SUBPIXEL), count + 1)
+        self.convergence, self.blurs = convergence, [0.0, *((edges[1:] + edges[:-1]) / 2).tolist()]
+        self._layers = [projector]
+        if count:
+            self._layers = projector.layers(lambda distance: np.searchsorted(edges[:-1], convergence * abs(distance)))
+
+    def __repr__(self) -> str:
+        return f"DefocusedProjector({self._layers[0]!r}, convergence {self.convergence:g}, {len(self.blurs)} layers)"
+
+    @property
+    def reach(self) -> int:
+        """How many slices away the blur is felt."""
+        return _reach(max(self.blurs))
+
+    def project(self, columns: Tensor) -> Tensor:
+        """Native layout: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
+        layers = [layer.project(columns) for layer in self._layers]
+        return sum(
+            (self._blurred(rays, blur) for rays, blur in zip(layers[1:], self.blurs[1:], strict=False)), layers[0]
+        )
+
+    def backproject(self, rays: Tensor) -> Tensor:
+        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
+        pairs = zip(self._layers[1:], self.blurs[1:], strict=False)
+        first = self._layers[0].backproject(rays)
+        return sum((layer.backproject(self._blurred(rays, blur)) for layer, blur in pairs), first)
+
+    def __call__(self, attenuation: Tensor) -> Tensor:
+        """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
+        return from_rays(self.project(to_columns(attenuation)), self.num_tilts)
+
+    def T(self, line_integrals: Tensor) -> Tensor:
+        """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
+        return from_columns(self.backproject(to_rays(line_integrals)), self.depth)
+
+    def _blurred(self, rays: Tensor, blur: float) -> Tensor:
+        images = rays.view(self.num_tilts, self.detector_width, -1)
+        along_u, along_y = (_gaussian_matrix(size, blur, like=rays) for size in images.shape[1:])
+        return (along_u @ images @ along_y).reshape(rays.shape)
+
+
+def jittered_projection(
+    volume: Tensor,
+    tilt_angles: Sequence[float] | NDArray[np.floating],
+    convergence: float,
+    *,
+    num_rays: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """The same images by chance: the mean over rays of random slope through each pixel's place in the focal plane.
+
+    Its standard error falls with the root of the number of rays; one ray per pixel and step will do for stochastic gradients.
+
+    Args:
+        volume: (z, y, x) attenuation per voxel.
+        tilt_angles: (tilts,) degrees.
+        convergence: as of `DefocusedProjector`.
+        num_rays: through every pixel.
+        generator: source of the slopes.
+
+    Returns:
+        (tilt, y, u) line integrals.
+    """
+    views = view_matrices(tilt_angles)
+    _, height, width = volume.shape
+    total = volume.new_zeros(len(views), height, width)
+    for _ in range(num_rays):
+        slopes = convergence * torch.randn(*total.shape, 2, generator=generator, dtype=torch.float64)
+        total = total + march(volume, *view_rays(views, height=height, width=width, spread=slopes))
+    return total / num_rays
+
+
+def _reach(deviation: float) -> int:
+    return math.ceil(_REACH * deviation) + 1
+
+
+def _gaussian_matrix(size: int, deviation: float, *, like: Tensor) -> Tensor:
+    """Symmetric (size, size): a sampled Gaussian of unit sum; what it carries over the edges is lost."""
+    reach = torch.arange(-_reach(deviation), _reach(deviation) + 1, dtype=torch.float64)
+    position = torch.arange(size, dtype=torch.float64)
+    weights = torch.exp(-((position[:, None] - position) ** 2) / (2 * deviation**2))
+    return (weights / torch.exp(-(reach**2) / (2 * deviation**2)).sum()).to(like)

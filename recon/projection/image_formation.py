@@ -1,0 +1,152 @@
+"""From line integrals to the signal that the detector would read without noise."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.models.base import Described
+
+
+class Transmission(Described):
+    """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 per tilt or for all.
+
+    Args:
+        intensity: incident intensity, detector units; a number, or one for each tilt.
+        offset: detector units; kept fixed.
+        estimate: whether the intensity is learnt.
+
+    Raises:
+        ValueError: an intensity that is not positive.
+    """
+
+    offset: Tensor
+
+    def __init__(self, intensity: float | Tensor = 1.0, *, offset: float = 0.0, estimate: bool = True) -> None:
+        super().__init__()
+        start = torch.as_tensor(intensity, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
+        if not bool((start > 0).all()):
+            raise ValueError(
+                "the incident intensity must be positive; is the contrast inverted or the offset too high?"
+            )
+        self.log_intensity = nn.Parameter(start.log(), requires_grad=estimate)
+        self.register_buffer("offset", torch.tensor(float(offset)))
+
+    def forward(self, line_integrals: Tensor) -> Tensor:
+        """Line integrals (tilt, u, y) to signals of the same shape."""
+        return torch.exp(self.log_intensity - line_integrals) + self.offset
+
+    def invert(self, signal: Tensor) -> Tensor:
+        """Line integrals of signals; readings below a thousandth of the incident intensity count as that much."""
+        share = (signal - self.offset) / self.log_intensity.detach().exp()
+        return -torch.log(share.clamp_min(1e-3))
+
+    @torch.no_grad()
+    def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
+        """Set the intensity, one or each, to the least-squares match of images (tilt, u, y), where `use`, by line integrals."""
+        share = torch.exp(-line_integrals) * use
+        dims = (0, 1, 2) if self.log_intensity.numel() == 1 else (1, 2)
+        intensity = ((images - self.offset) * share).sum(dims, keepdim=True) / (share**2).sum(dims, keepdim=True)
+        self.log_intensity.copy_(torch.where(intensity > 0, intensity.log(), self.log_intensity))
+
+    def extra_repr(self) -> str:
+        learnt = ", learnt" if self.log_intensity.requires_grad else ""
+        return f"intensity={_range(self.intensity)}{learnt}, offset={float(self.offset):.4g}"
+
+    @property
+    def intensity(self) -> Tensor:
+        """Incident intensity, (1,) or (tilts,)."""
+        return self.log_intensity.detach().exp().reshape(-1)
+
+    def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
+        """Incident intensity and offset of every tilt, detector units."""
+        return {"intensity": _each(self.intensity, num_tilts), "offset": _each(self.offset, num_tilts)}
+
+
+class Linear(Described):
+    """HAADF or EDX: signal = gain·beam·line integral + offset.
+
+    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is
+    learnt for each tilt or for all, and so are the beam's changes from tilt to tilt, where there are any.
+
+    Args:
+        gain: detector units per unit of line integral.
+        offset: detector units; a number, or one for each tilt.
+        beam: (tilts,) incident intensities; only their ratios count. None where they are all the same.
+        offset_unit: line integral in units of which the offset is learnt: one of those in the data.
+        estimate: whether offset and beam are learnt.
+
+    Raises:
+        ValueError: a gain or unit of zero, or one that is not finite.
+    """
+
+    gain: Tensor
+    offset_unit: Tensor
+    log_beam: nn.Parameter | None
+
+    def __init__(
+        self,
+        gain: float = 1.0,
+        *,
+        offset: float | Tensor = 0.0,
+        beam: Tensor | None = None,
+        offset_unit: float = 1.0,
+        estimate: bool = True,
+    ) -> None:
+        super().__init__()
+        for name, unit in (("gain", gain), ("offset_unit", offset_unit)):
+            if not math.isfinite(unit) or unit == 0:
+                raise ValueError(f"{name.replace('_', ' ')} {unit} must be finite and not zero")
+            self.register_buffer(name, torch.tensor(float(unit)))
+        start = torch.as_tensor(offset, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
+        self.scaled_offset = nn.Parameter(start / (gain * offset_unit), requires_grad=estimate)
+        log_beam = None if beam is None else nn.Parameter(beam.reshape(-1, 1, 1).log(), requires_grad=estimate)
+        self.register_parameter("log_beam", log_beam)
+
+    def forward(self, line_integrals: Tensor) -> Tensor:
+        """Line integrals (tilt, u, y) to signals of the same shape."""
+        if self.log_beam is not None:
+            line_integrals = line_integrals * _relative(self.log_beam)
+        return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
+
+    def invert(self, signal: Tensor) -> Tensor:
+        """Line integrals of signals."""
+        scaled = signal / self.gain - self.offset_unit * self.scaled_offset.detach()
+        return scaled if self.log_beam is None else scaled / _relative(self.log_beam.detach())
+
+    @torch.no_grad()
+    def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
+        """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
+        scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
+        self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean() / self.offset_unit))
+
+    def extra_repr(self) -> str:
+        learnt = ", learnt" if self.scaled_offset.requires_grad else ""
+        beam = "" if self.log_beam is None else f", beam={_range(_relative(self.log_beam.detach()))}"
+        return f"gain={float(self.gain):.4g}, offset={_range(self.offset)}{learnt}{beam}"
+
+    @property
+    def offset(self) -> Tensor:
+        """Detector units, (1,) or (tilts,)."""
+        return (self.gain * self.offset_unit * self.scaled_offset.detach()).reshape(-1)
+
+    def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
+        """Relative intensity (geometric mean one) and offset, detector units, of every tilt."""
+        beam = torch.ones(1) if self.log_beam is None else _relative(self.log_beam.detach()).reshape(-1)
+        return {"relative intensity": _each(beam, num_tilts), "offset": _each(self.offset, num_tilts)}
+
+
+def _each(values: Tensor, num_tilts: int) -> list[float]:
+    return [float(value) for value in values.reshape(-1).expand(num_tilts)]
+
+
+def _range(values: Tensor) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.4g}" if values.numel() == 1 else f"{low:.4g} … {high:.4g} ({values.numel()} tilts)"
+
+
+def _relative(log_beam: Tensor) -> Tensor:
+    """The beam with a geometric mean of one: a brighter beam could not be told from a denser volume."""
+    return torch.exp(log_beam - log_beam.mean())

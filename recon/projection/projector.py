@@ -1,0 +1,206 @@
+"""The shared slice operator: around one tilt axis, every y-slice is projected by the same small sparse matrix."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from noiseflow.arrays import Given, alike, as_tensor
+from recon.projection.sparse import PanelledMatrix
+
+_PANEL = 32  # layers along z, or tilts
+
+
+class SliceProjector:
+    """Line integrals of a volume along all rays of a single-axis tilt series.
+
+    A point (x, z) relative to the volume's centre lands on the detector at u = x cos θ + z sin θ; y does not change.
+    The matrix holds Joseph's interpolation (two voxels per ray and row; doi:10.1109/TMI.1982.4307572), once for all
+    slices. The tilt axis passes through the volume's centre and, but for ``detector_offset``, the detector's middle.
+
+    Args:
+        tilt_angles: (tilts,) degrees.
+        depth: voxels along z, the beam's direction at zero tilt.
+        width: voxels along x.
+        detector_width: detector pixels along u; `width` if None.
+        detector_offset: pixels; where the detector's middle lies on the u axis, one number or one for each tilt.
+        dtype: number type of the matrix and of what it is applied to.
+        device: where the matrix lives.
+
+    Raises:
+        ValueError: no angles, angles that are not finite, sizes below one, or offsets that match no tilt.
+    """
+
+    def __init__(
+        self,
+        *,
+        tilt_angles: Sequence[float] | NDArray[np.floating[Any]],
+        depth: int,
+        width: int,
+        detector_width: int | None = None,
+        detector_offset: float | Sequence[float] | NDArray[np.floating[Any]] = 0.0,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        angles = np.atleast_1d(np.asarray(tilt_angles, dtype=np.float64))
+        detector_width = width if detector_width is None else detector_width
+        if angles.ndim != 1 or angles.size == 0 or not np.isfinite(angles).all():
+            raise ValueError("tilt_angles must be a list of finite degrees, one for each tilt")
+        if min(depth, width, detector_width) < 1:
+            raise ValueError(
+                f"depth {depth}, width {width} and detector_width {detector_width} must be at least one voxel"
+            )
+        offsets = np.asarray(detector_offset, dtype=np.float64)
+        if offsets.size not in (1, angles.size):
+            raise ValueError(
+                f"detector_offset has {offsets.size} values for {angles.size} tilts; give one, or one per tilt"
+            )
+        self.tilt_angles = angles
+        self.depth, self.width, self.detector_width = depth, width, detector_width
+        self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
+        rays, voxels, weights = _joseph(angles, self.detector_offset, depth, width, detector_width)
+        self._set_entries(rays, voxels, weights, device=device, dtype=dtype)
+
+    def __repr__(self) -> str:
+        low, high = self.tilt_angles.min(), self.tilt_angles.max()
+        kind = str(self.dtype).removeprefix("torch.")
+        return (
+            f"SliceProjector({self.num_tilts} tilts {low:g}° to {high:g}°, {self.depth} x {self.width} voxels (z, x) to "
+            f"{self.detector_width} pixels, {kind} on {self.device})"
+        )
+
+    def _set_entries(
+        self, rays: NDArray[np.int64], voxels: NDArray[np.int64], weights: NDArray[np.float64], **kind: Any
+    ) -> None:
+        shape = (self.num_tilts * self.detector_width, self.depth * self.width)
+        whole = torch.device(kind["device"]).type != "cpu"
+        panels = shape[::-1] if whole else (_PANEL * self.width, _PANEL * self.detector_width)
+        self.matrix = PanelledMatrix.of(rays, voxels, weights, shape, panel=panels[0]).to(**kind)
+        self.transposed = PanelledMatrix.of(voxels, rays, weights, shape[::-1], panel=panels[1]).to(**kind)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the matrix lives."""
+        return self.matrix.panels[0].device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number type of the matrix."""
+        return self.matrix.panels[0].dtype
+
+    @property
+    def num_tilts(self) -> int:
+        """How many tilts the series has."""
+        return int(self.tilt_angles.size)
+
+    def project(self, columns: Tensor) -> Tensor:
+        """Native layout, no copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
+        result: Tensor = _Product.apply(columns, self.matrix, self.transposed)  # type: ignore[no-untyped-call]
+        return result
+
+    def backproject(self, rays: Tensor) -> Tensor:
+        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
+        result: Tensor = _Product.apply(rays, self.transposed, self.matrix)  # type: ignore[no-untyped-call]
+        return result
+
+    def __call__(self, attenuation: Given) -> Given:
+        """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
+        volume = as_tensor(attenuation, like=self)
+        _require(volume, "attenuation (z, y, x)", self.depth, self.width)
+        return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
+
+    def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
+        """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
+        images = as_tensor(line_integrals, like=self)
+        _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
+        return alike(from_columns(self.backproject(to_rays(images)), self.depth), line_integrals)
+
+    def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
+        """Operators of layers across the beam, which add up to this one.
+
+        Args:
+            layer_of: from distances along the beam beyond the tilt axis, voxels, to the numbers of layers, 0 and up.
+        """
+        rays, voxels, weights = self.matrix.entries()
+        theta = np.deg2rad(self.tilt_angles)[rays // self.detector_width]
+        z, x = voxels // self.width - (self.depth - 1) / 2, voxels % self.width - (self.width - 1) / 2
+        layer = layer_of(z * np.cos(theta) - x * np.sin(theta))
+        parts = []
+        for number in range(int(layer.max(initial=0)) + 1):
+            here, part = layer == number, copy.copy(self)
+            part._set_entries(rays[here], voxels[here], weights[here], device=self.device, dtype=self.dtype)
+            parts.append(part)
+        return parts
+
+    def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """The matrix of some columns of the lattice, (n,) indices z·width + x, and its transpose."""
+        transposed, matrix = self.transposed.some_rows(columns)
+        return matrix, transposed
+
+
+def to_columns(volume: Tensor) -> Tensor:
+    """(z, y, x) -> (z * x, y): each slice becomes one column."""
+    return volume.transpose(1, 2).reshape(volume.shape[0] * volume.shape[2], volume.shape[1])
+
+
+def from_columns(columns: Tensor, depth: int) -> Tensor:
+    """(z * x, y) -> (z, y, x), a view."""
+    return columns.reshape(depth, -1, columns.shape[1]).transpose(1, 2)
+
+
+to_rays = to_columns
+"""(tilt, y, u) -> (tilt * u, y)."""
+from_rays = from_columns
+"""(tilt * u, y) -> (tilt, y, u), a view."""
+
+
+class _Product(torch.autograd.Function):
+    """Sparse times dense; its gradient is the transposed product, and the gradient's gradient the product again."""
+
+    @staticmethod
+    def forward(ctx: Any, dense: Tensor, matrix: PanelledMatrix, transposed: PanelledMatrix) -> Tensor:
+        ctx.matrices = matrix, transposed
+        return matrix @ dense
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        matrix, transposed = ctx.matrices
+        return _Product.apply(gradient, transposed, matrix), None, None  # type: ignore[no-untyped-call]
+
+
+def _joseph(
+    angles: NDArray[np.float64], offsets: NDArray[np.float64], depth: int, width: int, detector_width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Row (ray), column (voxel) and weight of every non-zero of the matrix."""
+    rays, voxels, weights = [], [], []
+    x, z = np.arange(width) - (width - 1) / 2, np.arange(depth) - (depth - 1) / 2
+    for tilt, (angle, offset) in enumerate(zip(np.deg2rad(angles), offsets, strict=True)):
+        u = np.arange(detector_width) - (detector_width - 1) / 2 + offset
+        cosine, sine = np.cos(angle), np.sin(angle)
+        along_z = abs(cosine) >= abs(sine)
+        if along_z:  # one step per z row: where does the ray cross it along x?
+            crossing = (u[:, None] - z * sine) / cosine + (width - 1) / 2
+            step, size = 1 / abs(cosine), width
+        else:
+            crossing = (u[:, None] - x * cosine) / sine + (depth - 1) / 2
+            step, size = 1 / abs(sine), depth
+        low = np.floor(crossing)
+        for neighbour, share in ((low, 1 - (crossing - low)), (low + 1, crossing - low)):
+            inside = (neighbour >= 0) & (neighbour < size) & (share > 0)
+            ray, row = np.nonzero(inside)
+            across = neighbour[inside].astype(np.int64)
+            rays.append(tilt * detector_width + ray)
+            voxels.append(row * width + across if along_z else across * width + row)
+            weights.append(share[inside] * step)
+    return np.concatenate(rays), np.concatenate(voxels), np.concatenate(weights)
+
+
+def _require(tensor: Tensor, what: str, first: int, last: int) -> None:
+    if tensor.ndim != 3 or tensor.shape[0] != first or tensor.shape[2] != last:
+        raise ValueError(f"{what} must have shape ({first}, any, {last}), not {tuple(tensor.shape)}")

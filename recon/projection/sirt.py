@@ -1,0 +1,47 @@
+"""Simultaneous iterative reconstruction technique (doi:10.1016/0022-5193(72)90180-4), in its weighted modern form."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from noiseflow.arrays import Given, alike, as_tensor
+from recon.projection.projector import SliceProjector
+
+
+def sirt(
+    line_integrals: Given,
+    projector: SliceProjector,
+    *,
+    num_iterations: int = 100,
+    start: Given | None = None,
+    minimum: float | None = 0.0,
+) -> Given:
+    """Reconstruct by x ← x + C Aᵀ R (y − A x), with R and C the inverse row and column sums of A.
+
+    Args:
+        line_integrals: (tilt, y, u) measured line integrals, a tensor or an array.
+        projector: the operator A.
+        num_iterations: iterations; noise grows with them.
+        start: (z, y, x) volume to go on from; zero if None. Thirty iterations are ten and twenty.
+        minimum: lower bound applied after every iteration, or None.
+
+    Returns:
+        (z, y, x) attenuation per voxel, of the kind given.
+    """
+    A = projector
+    y = as_tensor(line_integrals, like=A)
+    ones = torch.ones((A.depth, 1, A.width), dtype=y.dtype, device=y.device)
+    R = _inverse(A(ones))
+    C = _inverse(A.T(torch.ones_like(R)))
+    empty = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device)
+    x = empty if start is None else as_tensor(start, like=A)
+    for _ in range(num_iterations):
+        x = x + C * A.T(R * (y - A(x)))
+        if minimum is not None:
+            x = x.clamp_min(minimum)
+    return alike(x, line_integrals)
+
+
+def _inverse(sums: Tensor) -> Tensor:
+    return torch.where(sums > 0, 1 / sums, torch.zeros_like(sums))

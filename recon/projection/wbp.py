@@ -1,0 +1,79 @@
+"""Weighted back-projection: a ramp filter and one back-projection (Kak & Slaney 1988, doi:10.1137/1.9780898719277)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from noiseflow.arrays import Given, alike, as_tensor
+from recon.projection.projector import SliceProjector
+
+WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
+    "ramp": torch.ones_like,
+    "shepp-logan": lambda share: torch.sinc(share / 2),
+    "cosine": lambda share: torch.cos(math.pi / 2 * share),
+    "hamming": lambda share: 0.54 + 0.46 * torch.cos(math.pi * share),
+    "hann": lambda share: 0.5 + 0.5 * torch.cos(math.pi * share),
+}
+"""What multiplies the ramp, by name: functions of frequency over cutoff, in [0, 1]."""
+
+
+def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Given:
+    """Reconstruct by filtered back-projection.
+
+    The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are
+    kept; each tilt weighs as much as the angle it stands for.
+
+    Args:
+        line_integrals: (tilt, y, u), a tensor or an array.
+        projector: the operator whose adjoint back-projects.
+        window: one of `WINDOWS`; it tames the ramp's gain of fine noise.
+        cutoff: fraction of the Nyquist frequency at which the window ends and beyond which nothing passes.
+
+    Returns:
+        (z, y, x) attenuation per voxel, not clamped; of the kind given.
+
+    Raises:
+        ValueError: an unknown window, or a cutoff outside (0, 1].
+    """
+    if window not in WINDOWS:
+        raise ValueError(f"window '{window}': choose one of {', '.join(WINDOWS)}")
+    if not 0 < cutoff <= 1:
+        raise ValueError(f"cutoff {cutoff} must be above 0 and at most 1, a fraction of the Nyquist frequency")
+    images = as_tensor(line_integrals, like=projector)
+    count = images.shape[-1]
+    padded = 2 ** math.ceil(math.log2(2 * count))
+    response = _filter(padded, window, cutoff, like=images)
+    filtered = torch.fft.irfft(torch.fft.rfft(images, n=padded) * response, n=padded)[..., :count]
+    shares = torch.as_tensor(angular_shares(projector.tilt_angles), dtype=filtered.dtype, device=filtered.device)
+    return alike(projector.T((filtered * shares[:, None, None]).contiguous()), line_integrals)
+
+
+def angular_shares(
+    tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]],
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """The angle (radians) that each tilt stands for: half the way to each neighbour, at the ends as much as inside."""
+    theta = np.deg2rad(np.asarray(tilt_angles, dtype=np.float64))
+    values, back, counts = np.unique(theta, return_inverse=True, return_counts=True)
+    steps = np.diff(values)
+    if steps.size == 0:
+        return np.full(theta.shape, math.pi / theta.size)
+    left, right = np.r_[steps[0], steps], np.r_[steps, steps[-1]]
+    shares = (left + right) / 2
+    shares *= min(1.0, math.pi / shares.sum())
+    return np.asarray((shares / counts)[back])
+
+
+def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:
+    index = torch.arange(padded, dtype=torch.float64)
+    distance = torch.minimum(index, padded - index)
+    kernel = torch.where(distance % 2 == 1, -1 / (math.pi * distance.clamp_min(1)) ** 2, torch.zeros(()).double())
+    kernel[0] = 0.25
+    ramp: Tensor = torch.fft.rfft(kernel).real
+    share = torch.linspace(0, 1, len(ramp), dtype=torch.float64) / cutoff
+    response = ramp * torch.where(share <= 1, WINDOWS[window](share.clamp_max(1)), 0.0)
+    return response.to(dtype=like.dtype, device=like.device)

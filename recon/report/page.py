@@ -1,0 +1,267 @@
+"""The report of a reconstruction: a page to look at, that also says why it may be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from noiseflow import io
+from noiseflow.commands.console import invocation
+from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
+from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
+from recon.methods.methods import Outcome
+from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
+from recon.report.noise import noise_charts
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+
+_MATTERS = 0.05  # correlation
+_VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
+_NOT_SETTINGS = frozenset(
+    {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
+)
+_NAMES = {
+    "transmission": "bright field, I₀·exp(−line integral)",
+    "linear": "linear (HAADF, EDX), line integral + offset",
+}
+_UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per voxel"}
+
+
+def reconstruction_report(
+    tilt_series: TiltSeries,
+    outcome: Outcome,
+    figures: Sequence[tuple[str, str]],
+    *,
+    inputs: Sequence[str | Path] = (),
+    seed: int | None = None,
+    halves: tuple[Volume, Volume] | None = None,
+    reference: Volume | None = None,
+) -> Report:
+    """A page with slices, the tilt series against its prediction, the noise, the fit's course, settings and provenance.
+
+    Args:
+        tilt_series: the data.
+        outcome: what was reconstructed from it.
+        figures: rows of the table, (name, value).
+        inputs: files that were read, for their checksums.
+        seed: of the random choices.
+        halves: reconstructions of the even and of the odd tilts, for the Fourier shell correlation.
+        reference: a volume to correlate with instead.
+    """
+    name = Path(inputs[0]).name if inputs else "tilt series"
+    report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
+    report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
+    _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
+    _add_tilts(report, tilt_series, outcome)
+    _add_response(report, tilt_series, outcome)
+    _add_noise(report, tilt_series, outcome)
+    _add_course(report, outcome)
+    _add_resolution(report, outcome.volume, halves, reference)
+    report.heading("Settings and choices")
+    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    report.heading("Provenance")
+    report.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
+    return report
+
+
+def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
+    """The series of every other tilt, in the order of the stack, then of those between.
+
+    Raises:
+        ValueError: fewer than four tilts.
+    """
+    if tilt_series.num_tilts < 4:
+        raise ValueError(f"{tilt_series.num_tilts} tilts cannot be halved for --fsc; leave it out")
+    yield from (tilt_series.select(slice(first, None, 2)) for first in (0, 1))
+
+
+def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
+    """A volume to correlate with.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, or is no volume on this grid.
+    """
+    image = io.read(path)
+    if image.data.shape != grid.shape:
+        raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
+    io.require_finite(image.data, path)
+    return Volume(image.data.astype(np.float32), None if image.voxel_size is None else image.voxel_size[0])
+
+
+def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, str]]:
+    """Rows (setting, value, evidence): what the user gave, what was left at its default, what the data decided."""
+    called = invocation()
+    rows = [
+        (name.replace("_", " "), _text(value), "given" if given else "default")
+        for name, (value, given) in (called.options if called else {}).items()
+        if name not in _NOT_SETTINGS and (given or value is not None) and name not in outcome.choices
+    ]
+    if "denoised" not in outcome.method:
+        rows = [row for row in rows if row[0] != "denoiser"]
+    depth = outcome.volume.attenuation.shape[0]
+    if not any(name == "thickness" for name, _, _ in rows):
+        rows.append(("thickness", f"{depth} voxels", "as deep as the images are wide, where nothing else is asked for"))
+    return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
+
+
+def _evidence(name: str, outcome: Outcome) -> str:
+    tried = outcome.weights_tried
+    called = invocation()
+    if called is not None and called.options.get(name, (None, False))[1]:
+        return "given"
+    if name == "weight" and tried:
+        return f"highest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
+    if name == "noise model" and outcome.method == "joint":
+        return (
+            "rails and rounding as the readings show them; of the candidates the one that predicts held-out pixels best"
+        )
+    if name in ("intensity", "offset"):
+        return "estimated from the images, then learnt in the fit"
+    if name in ("tilts left out", "beam drift"):
+        return "each tilt against a coarse volume of the others"
+    if name in ("tilt axis (°)", "axis offset (pixels)", "largest shift (pixels)"):
+        return "where volumes explain tilts left out of them best"
+    return "set by the method" if outcome.method != "joint" else "found from the data"
+
+
+def _text(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _add_volume(report: Report, volume: Volume, unit: str) -> None:
+    values = volume.attenuation
+    sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
+    low, high = float(np.percentile(values, 0.5)), float(np.percentile(values, 99.8))
+    high = max(high, low + 0.05 * (float(values.max()) - low))
+    size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
+    report.heading("Volume")
+    options = {
+        "original": list(values.shape),
+        "limits": [low, high],
+        "voxelSize": size,
+        "unit": unit,
+    }
+    caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
+    report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
+
+
+def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+    images, predicted = tilt_series.images.astype(np.float32), outcome.projections
+    ends = np.percentile(images, (0.1, 99.9))
+    limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
+    sprites = make_sprites(
+        np.concatenate([images, predicted]), most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True
+    )
+    size = tilt_series.pixel_size
+    data = {
+        "sprites": sprites.as_json(),
+        "angles": tilt_series.tilt_angles.tolist(),
+        "start": int(np.argmin(np.abs(tilt_series.tilt_angles))),
+        "limits": [float(end) for end in np.percentile(images, (0.5, 99.5))],
+        "names": ["data", "clean projection"],
+        "unit": "detector units",
+        "pixelSize": None if size is None else size * images.shape[2] / sprites.shape[2],
+    }
+    report.heading("Tilt series")
+    words = sprites.in_words().replace(f"{sprites.original[0]} × ", "").replace(f"{sprites.shape[0]} × ", "")
+    caption = (
+        f"A good fit leaves noise without structure in the residuals; waves along the tilts mean misalignment. {words}"
+    )
+    report.widget("tilts", data, caption=caption)
+
+
+def _add_response(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+    """Charts of what differs from tilt to tilt; what is one for all stands among the choices."""
+    order, charts = np.argsort(tilt_series.tilt_angles), []
+    for name, values in outcome.response.items():
+        if len(set(values)) > 1:
+            unit = "" if name == "relative intensity" else ", detector units"
+            figure, axis = new_chart(f"{name.capitalize()} of each tilt", x="tilt, degrees", y=name + unit)
+            axis.plot(
+                tilt_series.tilt_angles[order],
+                np.array(values)[order],
+                color=COLOURS["accent"],
+                marker="o",
+                markersize=3,
+            )
+            charts.append(figure)
+    if charts:
+        report.heading("Beam and detector")
+        report.charts(charts, caption="Estimated from the images, then learnt in the fit.")
+
+
+def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+    if outcome.noise_model is None:
+        return
+    images = tilt_series.images.astype(np.float32)
+    use = slice(None) if tilt_series.mask is None else tilt_series.mask
+    report.heading("Noise")
+    caption = (
+        "The data are all pixels of the tilt series, against the clean projections of the volume; the model is exact."
+    )
+    report.charts(
+        noise_charts(outcome.noise_model, outcome.projections[use].ravel(), images[use].ravel()), caption=caption
+    )
+    device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
+    pair = (torch.from_numpy(np.ascontiguousarray(stack)).to(device) for stack in (outcome.projections, images))
+    report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")
+
+
+def _in_words(structure: SpatialStructure) -> str:
+    """What the residuals share; of so many pixels every trace of the volume's own smoothness stands out from chance."""
+    correlations = np.abs([structure.horizontal, structure.vertical, structure.pattern])
+    words = structure.in_words()
+    if (
+        structure.suffices
+        or correlations.max() > _MATTERS
+        or max(structure.rows, structure.columns) > 1 + 10 * _MATTERS
+    ):
+        return words
+    return words.partition("; a per-pixel")[0] + "; that is more than chance, and too little to matter"
+
+
+def _add_course(report: Report, outcome: Outcome) -> None:
+    charts = []
+    if outcome.fit_result is not None and outcome.fit_result.history:
+        history = outcome.fit_result.history
+        figure, axis = new_chart("Course of the fit", x="step", y="held-out NLL, nats per pixel")
+        axis.plot(list(history), list(history.values()), color=COLOURS["accent"], marker="o", markersize=2.5)
+        charts.append(figure)
+    if outcome.weights_tried:
+        tried = sorted(outcome.weights_tried.items())
+        figure, axis = new_chart("Choice of the weight", x="weight of the total variation", y="held-out NLL")
+        axis.semilogx(*zip(*tried, strict=True), color=COLOURS["accent"], marker="o", markersize=4)
+        axis.set_xticks([weight for weight, _ in tried], [f"{weight:.2g}" for weight, _ in tried])
+        axis.set_xticks([], minor=True)
+        axis.axvline(float(outcome.choices["weight"]), color=COLOURS["warm"], linewidth=1.5)
+        charts.append(figure)
+    if charts:
+        report.heading("Convergence")
+        report.charts(charts, caption="Negative log-likelihood of pixels that the fit never saw: lower is better.")
+
+
+def _add_resolution(
+    report: Report, volume: Volume, halves: tuple[Volume, Volume] | None, reference: Volume | None
+) -> None:
+    pairs = [] if halves is None else [(*halves, 0.143, "even and odd tilts")]
+    pairs += [] if reference is None else [(volume, reference, 0.5, "volume and reference")]
+    if not pairs:
+        return
+    figure, axis = new_chart("Fourier shell correlation", x="cycles per voxel", y="correlation")
+    words, least = [], 0.0
+    for (first, second, level, what), colour in zip(pairs, (COLOURS["accent"], COLOURS["warm"]), strict=False):
+        frequency, correlation = fourier_shell_correlation(first.attenuation, second.attenuation)
+        axis.plot(frequency, correlation, color=colour, label=what)
+        axis.axhline(level, color=colour, linewidth=1, linestyle="--")
+        least = min(least, float(correlation.min()))
+        reach = reach_in_words(resolution(frequency, correlation, level), level, volume.voxel_size)
+        words.append(f"Between {what} it {reach}.")
+    axis.set_ylim(least, 1.05)
+    add_legend(axis)
+    report.heading("Resolution")
+    report.charts([figure], caption=" ".join(words))

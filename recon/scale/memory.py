@@ -1,0 +1,87 @@
+"""How much memory a reconstruction needs, and how much there is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+_PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 64, 65, 32
+_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
+_BASE = 400 * 2**20
+
+
+def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
+    """Bytes that a reconstruction takes at its peak, within some 20 % (measured on 48³ to 160³ voxels).
+
+    Args:
+        tilt_series: the images.
+        grid: the lattice.
+        fitted: whether a field is fitted, with its optimiser's moments and best state; else SIRT or back-projection.
+    """
+    depth, height, width = grid.shape
+    ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
+    per_voxel, per_pixel = (_PER_VOXEL, _PER_PIXEL) if fitted else (_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL)
+    volume = depth * height * width
+    needed: int = _BASE + per_voxel * volume + per_pixel * tilt_series.images.size + _PER_RAY_STEP * ray_steps
+    return needed
+
+
+def available_memory(device: Any = "cpu") -> int | None:
+    """Bytes free for this process on a device; None where the system does not say."""
+    import torch
+
+    if torch.device(device).type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return int(free)
+    limits = [limit for limit in (_linux_available(), _group_available(), _physical()) if limit is not None]
+    return min(limits, default=None)
+
+
+def require_memory(needed: int, device: Any = "cpu") -> str:
+    """One line about memory needed and available.
+
+    Raises:
+        MemoryError: it does not fit.
+    """
+    available = available_memory(device)
+    if available is None:
+        return f"memory: about {_human(needed)} needed"
+    if needed > available:
+        raise MemoryError(
+            f"this reconstruction needs about {_human(needed)} of memory and {_human(available)} are available; "
+            "give --slices-at-once 32 (or fewer), a smaller --thickness, or bin or crop the images"
+        )
+    return f"memory: about {_human(needed)} needed, {_human(available)} available"
+
+
+def _linux_available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _group_available() -> int | None:
+    """What a control group, such as a container's, leaves."""
+    folder = Path("/sys/fs/cgroup")
+    try:
+        limit = (folder / "memory.max").read_text(encoding="ascii").strip()
+        used = int((folder / "memory.current").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+    return None if limit == "max" else int(limit) - used
+
+
+def _physical() -> int | None:
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _human(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"

@@ -1,0 +1,1 @@
+"""Tilt series: read, aligned, screened and checked."""

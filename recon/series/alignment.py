@@ -1,0 +1,111 @@
+"""Where the tilt axis lies in raw images and how far each image is shifted; images moved so that the axis runs along y."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.series.tilt_series import TiltSeries, filled
+
+_OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The way from aligned to raw images: a rotation about the middle, then a shift.
+
+    Attributes:
+        tilt_axis: degrees from y towards −x, anticlockwise where y points up (IMOD's rotation angle).
+        shifts: (tilt, 2) pixels of the raw images, in the order (y, x): where the aligned middle lies from the raw one.
+        tilt_angles: (tilt,) degrees.
+        residual: share of the variance of tilts left out that a volume of the others does not explain; None where none was made.
+    """
+
+    tilt_axis: float
+    shifts: NDArray[np.float64]
+    tilt_angles: NDArray[np.float64]
+    residual: float | None = None
+
+    def apply(self, tilt_series: TiltSeries) -> TiltSeries:
+        """The series with the axis along y through the middle; what is not in the raw images is masked.
+
+        Cubic splines interpolate, once, which correlates the noise of neighbouring pixels. Within 45° of x, height and width
+        are swapped. Without rotation and fraction of a pixel, readings stay what they are.
+
+        Raises:
+            ValueError: another number of shifts than of tilts, or nothing of an image is left in view.
+        """
+        if self.shifts.shape != (tilt_series.num_tilts, 2):
+            raise ValueError(f"{len(self.shifts)} shifts do not belong to {tilt_series.num_tilts} tilts")
+        moved = [
+            self._moved(image, use, shift)
+            for image, use, shift in zip(tilt_series.images, tilt_series.used, self.shifts, strict=True)
+        ]
+        images, mask = (np.stack(parts) for parts in zip(*moved, strict=True))
+        if not mask.any((1, 2)).all():
+            raise ValueError(
+                "an image was moved out of view entirely; give --tilt-axis, or leave out --refine-alignment"
+            )
+        if not np.issubdtype(tilt_series.images.dtype, np.floating) and np.array_equal(images, np.round(images)):
+            images = images.astype(tilt_series.images.dtype)
+        if mask.mean() < 0.98:
+            warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
+        return replace(tilt_series, images=images, mask=None if mask.all() else mask)
+
+    def _moved(
+        self, image: NDArray[Any], use: NDArray[np.bool_], shift: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        from scipy.ndimage import affine_transform
+
+        height, width = image.shape
+        theta = np.deg2rad(self.tilt_axis)
+        shape = (height, width) if abs(np.cos(theta)) >= abs(np.sin(theta)) else (width, height)
+        back = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
+        if self.tilt_axis % 90 == 0:
+            back = np.round(back)
+        start = (np.array(image.shape) - 1) / 2 + shift - back @ ((np.array(shape) - 1) / 2)
+        seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
+        mask = seen > 0.99
+        moved = affine_transform(
+            image.astype(np.float64), back, start, output_shape=shape, order=3, mode="nearest", output=np.float32
+        )
+        return filled(moved, mask), mask
+
+    @property
+    def axis_offset(self) -> float:
+        """Pixels from the raw middle to the tilt axis: the shift across it that no place of the object accounts for."""
+        theta, axis = np.deg2rad(self.tilt_angles), np.deg2rad(self.tilt_axis)
+        across = self.shifts @ np.array([np.sin(axis), np.cos(axis)])
+        design = np.stack([np.ones_like(theta), np.cos(theta), np.sin(theta)], 1)
+        return float(np.linalg.lstsq(design, across, rcond=None)[0][0])
+
+    def in_words(self) -> str:
+        """One line."""
+        largest, rms = np.abs(self.shifts).max(), np.sqrt(np.mean((self.shifts - self.shifts.mean(0)) ** 2))
+        words = (
+            f"aligned: tilt axis {self.tilt_axis:.2f}°, {self.axis_offset:.2f} pixels off the middle; shifts up to "
+            f"{largest:.1f} pixels, {rms:.2f} rms"
+        )
+        return words if self.residual is None else f"{words}; tilts left out are explained to {1 - self.residual:.1%}"
+
+    def choices(self) -> dict[str, float | str]:
+        """What a table of results shows of it."""
+        found: dict[str, float | str] = {"tilt axis (°)": f"{self.tilt_axis:.2f}"}
+        if self.residual is not None:
+            found["axis offset (pixels)"] = f"{self.axis_offset:.2f}"
+            found["largest shift (pixels)"] = f"{np.abs(self.shifts).max():.2f}"
+        return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "tilt_axis_degrees": self.tilt_axis,
+            "axis_offset_pixels": self.axis_offset,
+            "tilt_angles_degrees": self.tilt_angles.tolist(),
+            "shifts_yx_pixels": self.shifts.tolist(),
+            "unexplained_variance": self.residual,
+        }

@@ -1,0 +1,82 @@
+"""Whether bright and dark are what the mode of a tilt series says."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon.projection.image_formation import Transmission
+from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
+from recon.series.first_guess import estimate_response
+from recon.series.tilt_series import TiltSeries, block_means
+
+_COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
+_MARGIN = 0.05  # right and inverted phantoms differ by 0.12 or more in what a coarse volume explains
+_BRIGHTER = 1.5
+
+
+def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
+    """Swap bright and dark: every reading becomes largest + smallest − reading, in the same number type."""
+    images = tilt_series.images
+    if np.issubdtype(images.dtype, np.integer):  # largest − reading fits the type, and adding smallest keeps it there
+        return replace(tilt_series, images=(images.max() - images) + images.min())
+    return replace(tilt_series, images=images.max() + images.min() - images)
+
+
+def check_contrast(tilt_series: TiltSeries) -> None:
+    """Warn where a coarse non-negative volume explains the images better with bright and dark swapped, or where bright-field
+    images are far brighter than the vacuum that they show."""
+    images = _coarse(tilt_series.images)
+    series = replace(tilt_series, images=images, mask=None)
+    as_given, swapped = explained(series), explained(invert_contrast(series))
+    if swapped > as_given + _MARGIN:
+        given, other = ("bright field", "--mode linear if these are HAADF or EDX images")
+        if tilt_series.mode == "linear":
+            given, other = ("HAADF or EDX", "--mode transmission if these are bright-field images")
+        warnings.warn(
+            f"the contrast looks inverted for {given}: a coarse volume explains {max(as_given, 0):.0%} of the images, and "
+            f"{swapped:.0%} with bright and dark swapped; give {other}, otherwise --invert-contrast",
+            stacklevel=2,
+        )
+    elif tilt_series.mode == "transmission":
+        _check_intensity(series)
+
+
+def explained(tilt_series: TiltSeries) -> float:
+    """Share of the images' variance that a non-negative volume explains after a few iterations of SIRT."""
+    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    try:
+        response = estimate_response(tilt_series)
+    except ValueError:  # no positive incident intensity, so no such volume
+        return 0.0
+    width = images.shape[2]
+    projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=width, width=width)
+    with torch.no_grad():
+        volume = sirt(response.invert(images).contiguous(), projector, num_iterations=30)
+        predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
+    return 1 - float((predicted - images).square().mean() / images.var())
+
+
+def _check_intensity(tilt_series: TiltSeries) -> None:
+    response = estimate_response(tilt_series)
+    if not isinstance(response, Transmission):
+        return
+    intensity = float(response.intensity.max())
+    brightest = float(np.quantile(tilt_series.images, 0.999))
+    if brightest > _BRIGHTER * intensity:
+        warnings.warn(
+            f"parts of the images reach {brightest:.4g}, and the incident intensity is about {intensity:.4g}: no object is "
+            "brighter than vacuum in bright field; give --mode linear if these are HAADF or EDX images, or mask those parts",
+            stacklevel=3,
+        )
+
+
+def _coarse(images: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Block averages, at most so many pixels wide and high."""
+    _, height, width = images.shape
+    return block_means(images, -(-height // _COARSE_HEIGHT), -(-width // _COARSE_WIDTH))

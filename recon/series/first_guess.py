@@ -1,0 +1,69 @@
+"""What a look at a tilt series tells before any fit: the detector's response, its rails and steps, the scale of attenuation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from recon.projection.image_formation import Linear, Transmission
+from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
+from recon.series.tilt_series import TiltSeries, block_means
+
+
+def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
+    """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF.
+
+    Args:
+        tilt_series: the data.
+        estimate: whether a fit shall refine the guess.
+
+    Raises:
+        ValueError: bright-field images that are nowhere positive.
+    """
+    images = tilt_series.images
+    beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
+    block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
+    means: NDArray[np.floating[Any]] = block_means(images, block, block)
+    if tilt_series.mode == "linear":
+        dark, bright = (float(level) for level in np.quantile(means, (0.02, 0.98)))
+        span = bright - dark if bright > dark else 1.0
+        return Linear(offset=dark, beam=beam, offset_unit=span, estimate=estimate)
+    if tilt_series.beam is not None:
+        means = means / tilt_series.beam[:, None, None]
+    intensity = float(np.quantile(means, 0.95))
+    if intensity <= 0:
+        raise ValueError(
+            "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
+        )
+    return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
+
+
+def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
+    """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
+    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.device)
+    with torch.no_grad():
+        return sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
+
+
+def attenuation_scale(volume: Tensor) -> float:
+    """Attenuation per voxel of what is not vacuum: the mean that weighs each voxel by its square."""
+    power = (volume**2).sum()
+    return float((volume**3).sum() / power) if power > 0 else 1.0
+
+
+def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
+    """The run of `num_slices` neighbouring slices in which the images vary most."""
+    height = tilt_series.images.shape[1]
+    if num_slices >= height:
+        return slice(0, height)
+    energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
+    total = np.convolve(energy, np.ones(num_slices), mode="valid")
+    start = int(total.argmax())
+    return slice(start, start + num_slices)

@@ -1,0 +1,163 @@
+"""A look at every tilt against the others before a reconstruction: drift of the beam, and tilts that do not belong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from torch import Tensor
+
+from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
+from recon.series.first_guess import estimate_response
+from recon.series.tilt_series import TiltSeries, block_means
+
+_WIDTH, _HEIGHT = 48, 24
+_ROUNDS, _ITERATIONS = 5, 15
+_NEIGHBOURS = 9
+_DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
+_LEAST_DRIFT = 0.04  # steady beams seem to drift by 0.004 to 0.035, by noise and by what lies outside the volume
+_FEWEST = 8
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What a coarse reconstruction says of every tilt.
+
+    Attributes:
+        beam: (tilts,) incident intensity relative to the median tilt's.
+        excess: (tilts,) negative log-likelihood of the coarse image above that of its neighbours in angle, nats per pixel.
+        bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
+    """
+
+    beam: NDArray[np.float64]
+    excess: NDArray[np.float64]
+    bad: NDArray[np.bool_]
+
+    @property
+    def drift(self) -> float:
+        """Standard deviation of the beam over the good tilts, as a fraction."""
+        return float(np.std(np.log(self.beam[~self.bad])))
+
+    @property
+    def beam_drifts(self) -> bool:
+        """Whether the drift is more than a coarse volume mistakes for one."""
+        return self.drift > _LEAST_DRIFT
+
+    def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
+        """The tilts that belong, or all; with their beam, where it drifts."""
+        series = replace(tilt_series, beam=self.beam) if self.beam_drifts else tilt_series
+        return series.select(~self.bad) if self.bad.any() and not keep else series
+
+    def choices(self) -> dict[str, float | str]:
+        """What a table of results shows of it."""
+        found: dict[str, float | str] = {}
+        if self.bad.any():
+            found["tilts left out"] = str(int(self.bad.sum()))
+        if self.beam_drifts:
+            found["beam drift"] = f"{self.drift:.1%}"
+        return found
+
+    def as_dict(self) -> dict[str, list[Any]]:
+        """All of it, tilt by tilt, for programs."""
+        return {"beam": self.beam.tolist(), "excess_nll": self.excess.tolist(), "bad": self.bad.tolist()}
+
+
+def screen(tilt_series: TiltSeries) -> Screening:
+    """Judge every tilt by a coarse volume of the others; with few tilts, all are good.
+
+    A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. The tilts whose residual
+    likelihood stands out most from their neighbours' are taken out and the rest is done again, until none stands out.
+    """
+    if tilt_series.num_tilts < _FEWEST:
+        count = tilt_series.num_tilts
+        return Screening(np.ones(count), np.zeros(count), np.zeros(count, dtype=np.bool_))
+    coarse = replace(tilt_series, images=coarse_images(tilt_series, _WIDTH, _HEIGHT), mask=None, beam=None)
+    bad = np.zeros(tilt_series.num_tilts, dtype=np.bool_)
+    while True:
+        beam, residual, predicted = _fit_beam(coarse, bad)
+        nll = _negative_log_likelihood(residual, predicted, ~bad)
+        excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
+        spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
+        worst = float(excess[~bad].max())
+        if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
+            return Screening(beam, excess, bad)
+        bad = bad | (excess > _OF_WORST * worst)
+        if bad.sum() > tilt_series.num_tilts // 4:  # so many cannot all be exceptions
+            return Screening(beam, excess, np.zeros_like(bad))
+
+
+def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
+    """Block averages, at most so many pixels wide and high."""
+    _, rows, columns = tilt_series.images.shape
+    return block_means(tilt_series.images, -(-rows // height), -(-columns // width))
+
+
+def _fit_beam(
+    series: TiltSeries, bad: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+    """Relative intensities of all tilts, residuals of their images at equal intensity, and what a volume of the good predicts."""
+    images, good = torch.from_numpy(series.images), torch.from_numpy(~bad)
+    width = images.shape[2]
+    every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
+    some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
+    beam, volume = _first_beam(series), None
+    for _ in range(_ROUNDS):
+        even = _even(images, beam, pedestal := _pedestal(series))
+        response = estimate_response(replace(series, images=even.numpy(), beam=None))
+        with torch.no_grad():
+            volume = sirt(response.invert(even[good]).contiguous(), some, num_iterations=_ITERATIONS, start=volume)
+            predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
+        above = images - pedestal
+        beam = (above * predicted).sum((1, 2)) / (predicted**2).sum((1, 2)).clamp_min(1e-30)
+        beam = (beam / beam[good].median()).clamp(0.1, 10)
+    residual = above / beam[:, None, None] - predicted
+    return beam.double().numpy(), residual.numpy(), predicted.numpy()
+
+
+def _even(images: Tensor, beam: Tensor, pedestal: float) -> Tensor:
+    return (images - pedestal) / beam[:, None, None] + pedestal
+
+
+def _pedestal(series: TiltSeries) -> float:
+    """The reading without any beam: in HAADF the darkest areas stand for it."""
+    return float(np.quantile(series.images, 0.02)) if series.mode == "linear" else 0.0
+
+
+def _first_beam(series: TiltSeries) -> Tensor:
+    """From the vacuum of bright-field images, or from the total signal of HAADF images, which a tilt does not change."""
+    flat = series.images.reshape(series.num_tilts, -1)
+    level = np.quantile(flat, 0.95, axis=1) if series.mode == "transmission" else flat.mean(1) - _pedestal(series)
+    middle = float(np.median(level))
+    start = np.clip(level / middle, 0.3, 3) if middle > 0 else np.ones_like(level)
+    return torch.from_numpy(start.astype(np.float32))
+
+
+def _negative_log_likelihood(
+    residual: NDArray[np.float32], predicted: NDArray[np.float32], good: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Of each tilt under Gaussian noise whose variance depends on the signal as it does in the good tilts, nats per pixel."""
+    edges = np.quantile(predicted[good], np.linspace(0, 1, 9)[1:-1])
+    group = np.searchsorted(edges, predicted)
+    squares = residual.astype(np.float64) ** 2
+    variance = np.array(
+        [np.mean(squares[good][group[good] == k]) if (group[good] == k).any() else np.nan for k in range(8)]
+    )
+    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[good].mean()), 1e-30))
+    terms = 0.5 * (squares / variance[group] + np.log(2 * math.pi * variance[group]))
+    return np.asarray(terms.mean((1, 2)))
+
+
+def _running_median(
+    values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The median of each tilt's neighbours in angle, the bad ones left out."""
+    order = np.argsort(angles)
+    good = order[~bad[order]]
+    smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")
+    return np.asarray(np.interp(angles, angles[good], smooth))

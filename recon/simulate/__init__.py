@@ -1,0 +1,1 @@
+"""Volumes of known truth, known noise, and tilt series made of them."""

@@ -1,0 +1,223 @@
+"""Volumes whose truth is known. Shapes do not depend on the size, and edges are covered in proportion.
+
+Every phantom can be drawn whole or a few y-slices at a time, with the same voxels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.simulate.virion import zika_in_box
+
+Array = NDArray[np.float32]
+_VIRION_VOXELS = 32  # across; the atoms' density is known to 15 Å, and a coarser voxel would not show it
+
+
+class Canvas:
+    """The y-slices `rows` of a cube [-1, 1]³ of `size` voxels along each edge.
+
+    Args:
+        size: voxels along each edge.
+        rows: y-slices to draw, all by default.
+    """
+
+    def __init__(self, size: int, rows: slice | None = None) -> None:
+        self.size = size
+        self.rows = range(size)[slice(None) if rows is None else rows]
+        self.volume = np.zeros((size, len(self.rows), size), np.float32)
+
+    def window(self, centre: NDArray[Any], reach: float) -> tuple[tuple[slice, ...], tuple[NDArray[Any], ...]]:
+        """Where in `volume` lies all within `reach` of a centre, and the coordinates (z, y, x) relative to it there."""
+        low = np.maximum(0, ((centre - reach + 1) / 2 * self.size).astype(int))
+        high = np.clip(np.ceil((centre + reach + 1) / 2 * self.size).astype(int), low, self.size)
+        first, last = (int(np.clip(end, self.rows.start, self.rows.stop)) for end in (low[1], high[1]))
+        low[1], high[1] = first, last
+        places = [
+            ((np.arange(*span) + 0.5) * 2 / self.size - 1) - c
+            for span, c in zip(zip(low, high, strict=True), centre, strict=True)
+        ]
+        z, y, x = (slice(start, stop) for start, stop in zip(low, high, strict=True))
+        y = slice(first - self.rows.start, last - self.rows.start)
+        return (z, y, x), (places[0][:, None, None], places[1][:, None], places[2])
+
+    def covered(self, places: tuple[NDArray[Any], ...], axes: NDArray[Any], rotation: NDArray[Any]) -> Array:
+        """The share of each voxel that lies in the ellipsoid around the origin of `places`."""
+        z, y, x = places
+        squared, slope = (np.zeros(np.broadcast_shapes(z.shape, y.shape, x.shape), np.float32) for _ in range(2))
+        for column, length in zip((rotation / axes).astype(np.float32).T, axes, strict=True):
+            along = (z * column[0] + y * column[1] + x * column[2]).astype(np.float32)
+            squared += along**2
+            slope += (along / np.float32(length)) ** 2
+        radius, slope = np.sqrt(squared), np.sqrt(slope)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.where(slope > 0, (radius - 1) * radius / slope, -1)  # (ρ − 1) / |∇ρ|, to first order
+        return np.clip(0.5 - distance * (self.size / 2), 0, 1).astype(np.float32)
+
+    def put(
+        self,
+        density: float,
+        centre: NDArray[Any],
+        axes: NDArray[Any],
+        rotation: NDArray[Any],
+        *,
+        hollow: NDArray[Any] | None = None,
+    ) -> None:
+        """Draw an ellipsoid where it is denser than what is there; `hollow` are the half-axes of the space inside it."""
+        box, places = self.window(centre, axes.max() + 2 / self.size)
+        shape = self.covered(places, axes, rotation)
+        if hollow is not None:
+            shape = shape - self.covered(places, hollow, rotation)
+        self.volume[box] = np.maximum(self.volume[box], np.float32(density) * shape)
+
+    def ball(self, density: float, centre: NDArray[Any], radius: float, *, hollow: float | None = None) -> None:
+        """Draw a ball, or a spherical shell around a hollow of that radius."""
+        inside = None if hollow is None else np.full(3, hollow)
+        self.put(density, centre, np.full(3, radius), np.eye(3), hollow=inside)
+
+
+def shells(size: int, *, generator: np.random.Generator, count: int = 22, rows: slice | None = None) -> Array:
+    """Randomly placed ellipsoidal shells of random density, about 93 % vacuum, as in Kniesel et al. (CVPR 2022).
+
+    Args:
+        size: voxels along each edge.
+        generator: source of places, shapes and densities.
+        count: how many shells.
+        rows: y-slices to draw, all by default.
+
+    Returns:
+        (z, y, x) density of order one, zero outside the sphere that touches the faces.
+    """
+    canvas = Canvas(size, rows)
+    _put_shells(canvas, generator, count)
+    return canvas.volume
+
+
+def _put_shells(canvas: Canvas, generator: np.random.Generator, count: int) -> None:
+    for _ in range(count):
+        axes = generator.uniform(0.1, 0.34, 3)
+        centre, rotation = _place(generator, axes.max()), _rotation(generator)
+        thickness, density = generator.uniform(0.03, 0.07), generator.uniform(0.3, 1.0)
+        canvas.put(density, centre, axes, rotation, hollow=axes - thickness)
+
+
+def virions(size: int, *, generator: np.random.Generator, count: int = 5, rows: slice | None = None) -> Array:
+    """Zika virions; where a voxel is coarser than 15 Å, spheres of a coat with spikes, a membrane and a core. As `shells`."""
+    canvas = Canvas(size, rows)
+    for _ in range(count):
+        radius = generator.uniform(0.18, 0.27)
+        _put_virion(canvas, _place(generator, radius + 0.04), radius, _rotation(generator))
+    return canvas.volume
+
+
+def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any]) -> None:
+    if radius * canvas.size >= _VIRION_VOXELS:
+        box, places = canvas.window(centre, 1.05 * radius)
+        canvas.volume[box] = np.maximum(canvas.volume[box], zika_in_box(places, radius, rotation))
+        return
+    canvas.ball(0.8, centre, radius, hollow=0.88 * radius)
+    canvas.ball(0.5, centre, 0.78 * radius, hollow=0.69 * radius)
+    canvas.ball(0.2, centre, 0.6 * radius)
+    for direction in (rotation @ _fibonacci_sphere(32)).T:
+        canvas.ball(1.0, centre + direction * radius * 1.04, min(0.028, 0.155 * radius))
+
+
+def cell(size: int, *, generator: np.random.Generator, count: int = 18, rows: slice | None = None) -> Array:
+    """Shells with small virions among them, as the synthetic set of Kniesel et al. (CVPR 2022). As `shells`."""
+    canvas = Canvas(size, rows)
+    _put_shells(canvas, generator, count)
+    for _ in range(count // 2):
+        radius = generator.uniform(0.07, 0.11)
+        _put_virion(canvas, _place(generator, radius), radius, _rotation(generator))
+    return canvas.volume
+
+
+def filaments(size: int, *, generator: np.random.Generator, count: int = 10, rows: slice | None = None) -> Array:
+    """Long curved tubes of different thickness. Arguments and result as `shells`."""
+    canvas = Canvas(size, rows)
+    for _ in range(count):
+        point, heading = _place(generator, 0.1), _direction(generator)
+        radius, density = generator.uniform(0.025, 0.05), generator.uniform(0.4, 1.0)
+        for _ in range(int(1.6 / radius)):
+            if np.linalg.norm(point) > 0.95 - radius:
+                heading = -point / np.linalg.norm(point) + 0.5 * _direction(generator)
+            heading = heading + 0.12 * _direction(generator)
+            heading /= np.linalg.norm(heading)
+            point = point + 0.7 * radius * heading
+            canvas.ball(density, point, radius)
+    return canvas.volume
+
+
+def particles(size: int, *, generator: np.random.Generator, count: int = 60, rows: slice | None = None) -> Array:
+    """Compact dense particles of many sizes. Arguments and result as `shells`."""
+    canvas = Canvas(size, rows)
+    for _ in range(count):
+        axes = generator.uniform(0.03, 0.13) * generator.uniform(0.7, 1.3, 3)
+        centre, rotation = _place(generator, axes.max()), _rotation(generator)
+        canvas.put(generator.uniform(0.4, 1.0), centre, axes, rotation)
+    return canvas.volume
+
+
+def slab(size: int, *, generator: np.random.Generator, count: int = 120, rows: slice | None = None) -> Array:
+    """A dense section without vacuum, 40 % of the depth: a matrix with pores, vesicles and grains. As `shells`."""
+    canvas = Canvas(size, rows)
+    depth = np.abs((np.arange(size) + 0.5) * 2 / size - 1)
+    inside = np.clip(0.5 + (0.4 - depth) * size / 2, 0, 1).astype(np.float32)[:, None, None]
+    canvas.volume += np.float32(0.4)
+    for _ in range(count):
+        axes = generator.uniform(0.05, 0.2) * generator.uniform(0.7, 1.3, 3)
+        centre = generator.uniform(-1, 1, 3) * (0.4, 1, 1)
+        rotation, density = _rotation(generator), np.float32(generator.choice([0.1, 0.7, 1.0]))
+        box, places = canvas.window(centre, axes.max() + 2 / size)
+        canvas.volume[box] += canvas.covered(places, axes, rotation) * (density - canvas.volume[box])
+    return np.asarray(canvas.volume * inside)
+
+
+PHANTOMS: dict[str, Callable[..., Array]] = {
+    "shells": shells,
+    "virions": virions,
+    "cell": cell,
+    "filaments": filaments,
+    "particles": particles,
+    "slab": slab,
+}
+
+
+def make_phantom(name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None) -> Array:
+    """The phantom of a name, (z, y, x); with `rows`, only these y-slices of it.
+
+    Raises:
+        ValueError: unknown name, or a size that is too small to draw anything.
+    """
+    if name not in PHANTOMS:
+        raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")
+    if size < 8:
+        raise ValueError(f"size {size} is too small for a phantom; use at least 8 voxels")
+    return PHANTOMS[name](size, generator=generator, rows=rows)
+
+
+def _direction(generator: np.random.Generator) -> NDArray[Any]:
+    vector = generator.normal(size=3)
+    unit: NDArray[Any] = vector / np.linalg.norm(vector)
+    return unit
+
+
+def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:
+    """A centre at which a ball of this radius stays inside the sphere that touches the faces."""
+    place: NDArray[Any] = _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
+    return place
+
+
+def _rotation(generator: np.random.Generator) -> NDArray[Any]:
+    return np.asarray(np.linalg.qr(generator.normal(size=(3, 3)))[0])
+
+
+def _fibonacci_sphere(count: int) -> NDArray[Any]:
+    """(3, count) nearly even directions."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (1 + 5**0.5) * np.arange(count)
+    across = np.sqrt(1 - height**2)
+    return np.stack([height, across * np.cos(turn), across * np.sin(turn)])

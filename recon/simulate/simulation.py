@@ -1,0 +1,145 @@
+"""Tilt series of known volumes, with known noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from noiseflow import Digitised, io
+from recon.projection.projector import SliceProjector
+from recon.series.tilt_series import Mode, TiltSeries
+from recon.simulate.noises import CountingNoise, OutlierNoise, SkewedNoise
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """How a simulated series is taken.
+
+    Attributes:
+        noise: makes the true noise model, or None for clean images.
+        mode: how the images are formed.
+        peak: the largest line integral, which sets the unit of attenuation.
+        intensity: incident intensity (transmission) or gain (linear), detector units.
+    """
+
+    noise: Callable[[], nn.Module] | None
+    mode: Mode = "transmission"
+    peak: float = 1.5
+    intensity: float = 1.0
+
+    def signal(self, line_integrals: Tensor) -> Tensor:
+        """What the detector reads without noise."""
+        return self.intensity * (line_integrals if self.mode == "linear" else torch.exp(-line_integrals))
+
+    def unit(self, highest: float) -> float:
+        """From density, of largest line integral `highest`, to attenuation (times the gain, in linear mode): the factor."""
+        return self.peak / highest * (self.intensity if self.mode == "linear" else 1.0)
+
+    @property
+    def brightest(self) -> float:
+        """The largest signal there can be."""
+        return self.intensity * (self.peak if self.mode == "linear" else 1.0)
+
+
+ACQUISITIONS = {
+    "none": Acquisition(None),
+    "clipped": Acquisition(lambda: Digitised(SkewedNoise(0.05, 0.2), step=0.0, low=0.0, high=1.0)),
+    "gaussian": Acquisition(lambda: SkewedNoise(0.1, 0.0)),
+    "skewed": Acquisition(lambda: SkewedNoise(0.05, 0.15, skewness=0.7)),
+    "outliers": Acquisition(lambda: OutlierNoise(0.05, 0.1, share=0.05, factor=8.0)),
+    "low-dose": Acquisition(lambda: CountingNoise(read_noise=0.5), mode="linear", peak=8.0),
+    "8-bit": Acquisition(
+        lambda: Digitised(SkewedNoise(10.0, 0.15, skewness=0.3), step=1.0, low=0.0, high=255.0), intensity=200.0
+    ),
+}
+"""Acquisitions by name; ``clipped`` is like the synthetic data of Kniesel et al. (CVPR 2022)."""
+
+
+def clean_tilt_series(
+    volume: NDArray[np.floating[Any]] | torch.Tensor,
+    tilt_angles: Sequence[float] | NDArray[np.floating[Any]],
+    *,
+    acquisition: Acquisition = ACQUISITIONS["none"],
+    pixel_size: float | None = None,
+) -> tuple[TiltSeries, float]:
+    """Project a known volume without noise.
+
+    Args:
+        volume: (z, y, x) density, any unit, an array or a tensor.
+        tilt_angles: degrees.
+        acquisition: how the images are formed.
+        pixel_size: Å.
+
+    Returns:
+        The series, and the factor from density to attenuation per voxel (times the gain, in linear mode).
+
+    Raises:
+        ValueError: an empty volume.
+    """
+    projector = SliceProjector(tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2])
+    line_integrals = projector(torch.from_numpy(np.asarray(io.as_array(volume), dtype=np.float32)))
+    highest = float(line_integrals.max())
+    if not highest > 0:
+        raise ValueError("the volume is empty: there is nothing to project")
+    line_integrals = line_integrals * (acquisition.peak / highest)
+    signal = acquisition.signal(line_integrals)
+    unit = acquisition.unit(highest)
+    return TiltSeries(signal.contiguous().numpy(), np.asarray(tilt_angles), pixel_size, acquisition.mode), unit
+
+
+def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
+    """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers."""
+    noisy = np.stack(list(draw_noise(tilt_series.images, noise_model, seed=seed))).astype(stored_type(noise_model))
+    return TiltSeries(noisy, tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
+
+
+def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> Iterator[NDArray[Any]]:
+    """One noisy reading of each clean image (y, x) after the other."""
+    generator = torch.Generator().manual_seed(seed)
+    for image in images:
+        with torch.no_grad():
+            yield noise_model(torch.from_numpy(np.array(image))).sample(generator=generator).numpy()
+
+
+def stored_type(noise_model: nn.Module | None) -> type[np.generic]:
+    """The number type of a detector's readings: integers where it rounds to whole numbers."""
+    if not isinstance(noise_model, Digitised) or noise_model.step != 1:
+        return np.float32
+    return np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32
+
+
+def tilt_range(text: str) -> NDArray[np.float64]:
+    """Angles of ``START:STOP:STEP`` in degrees, both ends included.
+
+    Raises:
+        ValueError: not three numbers, or no angle in the range.
+    """
+    try:
+        start, stop, step = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(f"tilts '{text}': give START:STOP:STEP in degrees, such as -60:60:2") from None
+    if not (step and np.isfinite([start, stop, step]).all() and (stop - start) / step >= 0):
+        raise ValueError(f"tilts '{text}': the step does not lead from start to stop")
+    if (stop - start) / step > 10_000:
+        raise ValueError(f"tilts '{text}': more than 10000 tilts; give a larger step")
+    return np.round(start + step * np.arange(int((stop - start) / step + 1e-6) + 1), 6)
+
+
+def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share: float) -> NDArray[np.float64]:
+    """Angles spread evenly over a tilt range that are none of its own: `share` of the way from one tilt to the next.
+
+    Args:
+        tilt_angles: degrees.
+        count: how many; fewer where there are fewer gaps.
+        share: between 0 and 1; different shares give different angles.
+    """
+    ordered = np.unique(tilt_angles)
+    between = ordered[:-1] + share * np.diff(ordered)
+    chosen = np.unique(np.round(np.linspace(0, len(between) - 1, min(count, len(between)))).astype(int))
+    return np.asarray(np.round(between[chosen], 6))

@@ -1,0 +1,163 @@
+"""Simulated tilt series of any size, straight to files: blocks of slices and a few tilts at a time are all that memory holds."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mrcfile
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from noiseflow.io.partials import clear_leftovers, partial_prefix
+from recon.projection.defocused_projector import DefocusedProjector, with_defocus
+from recon.projection.projector import SliceProjector
+from recon.series.tilt_series import write_angles
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import Acquisition, draw_noise, stored_type
+
+Array = NDArray[Any]
+Progress = Callable[[int, str], None]
+_BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What to simulate.
+
+    Attributes:
+        phantom: one of `recon.simulate.phantoms.PHANTOMS`.
+        size: voxels along each edge.
+        angles: degrees by name of the stack: ``clean`` and, where wanted, ``validation`` and ``test``.
+        acquisition: how images are formed.
+        noise_model: the noise on the ``clean`` stack, or None.
+        seed: of the phantom and of the noise.
+        defocus: blur of the ``clean`` stack by depth, see
+            `recon.projection.defocused_projector.DefocusedProjector`; the others stay sharp.
+    """
+
+    phantom: str
+    size: int
+    angles: dict[str, NDArray[np.float64]]
+    acquisition: Acquisition
+    noise_model: nn.Module | None = None
+    seed: int = 0
+    defocus: float = 0.0
+
+    @property
+    def num_steps(self) -> int:
+        """Steps that `write` reports: blocks drawn, blocks projected and images read out."""
+        blocks = len(list(self._blocks()))
+        tilts = sum(len(angles) for angles in self.angles.values())
+        return blocks * (1 + sum(-(-len(angles) // self._together) for angles in self.angles.values())) + tilts
+
+    @property
+    def _together(self) -> int:
+        return max(1, _MATRIX_ENTRIES // (2 * self.size**2))
+
+    def _blocks(self) -> Iterator[slice]:
+        step = max(1, _BLOCK_VOXELS // self.size**2)
+        yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
+
+    def write(self, folder: Path, progress: Progress = lambda done, note: None) -> float:
+        """Write ``truth.mrc``, the clean stacks by name and the noisy ``tilts.mrc``, with their angles, into a folder.
+
+        The files appear when all are whole; a run that fails leaves none behind.
+
+        Returns:
+            The factor from the phantom's density to the truth's attenuation.
+
+        Raises:
+            ValueError: an unknown phantom, or an empty one.
+        """
+        is_new = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        clear_leftovers(folder / "simulate")
+        partial = Path(tempfile.mkdtemp(dir=folder, prefix=partial_prefix("simulate")))
+        try:
+            unit = _Writer(self, partial, progress).run()
+            for path in sorted(partial.iterdir()):
+                path.replace(folder / path.name)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+            if is_new and not any(folder.iterdir()):
+                folder.rmdir()
+        return unit
+
+
+class _Writer:
+    def __init__(self, simulation: Simulation, folder: Path, progress: Progress) -> None:
+        self.simulation, self.folder, self.progress, self.done = simulation, folder, progress, 0
+
+    def run(self) -> float:
+        plan = self.simulation
+        with self._new("truth", (plan.size,) * 3, np.float32) as truth:
+            for rows in plan._blocks():
+                drawn = make_phantom(plan.phantom, plan.size, generator=np.random.default_rng(plan.seed), rows=rows)
+                truth.data[:, rows] = drawn
+                self._step("drawing")
+            highest = max(self._project(name, truth.data) for name in plan.angles)
+            if not highest > 0:
+                raise ValueError("the volume is empty: there is nothing to project")
+            unit = plan.acquisition.unit(highest)
+            for rows in plan._blocks():
+                truth.data[:, rows] *= np.float32(unit)
+        for name in plan.angles:
+            self._read_out(name, plan.acquisition.peak / highest)
+        return unit
+
+    def _project(self, name: str, truth: Array) -> float:
+        """Line integrals of one stack, and the largest of them in focus; only the first stack's sets the unit."""
+        plan, angles, highest = self.simulation, self.simulation.angles[name], 0.0
+        with self._new(name, (len(angles), plan.size, plan.size), np.float32) as stack:
+            for start in range(0, len(angles), plan._together):
+                part = angles[start : start + plan._together]
+                projector = SliceProjector(tilt_angles=part, depth=plan.size, width=plan.size)
+                blurred = with_defocus(projector, plan.defocus if name == "clean" else 0.0)
+                for rows in plan._blocks():
+                    images = sharp = projector(torch.from_numpy(np.array(truth[:, rows])))
+                    if isinstance(blurred, DefocusedProjector):
+                        images = _with_rim(blurred, truth, rows)
+                    stack.data[start : start + len(part), rows] = images.numpy()
+                    highest = max(highest, float(sharp.max()))
+                    self._step("projecting")
+        write_angles(self.folder / f"{name}.rawtlt", angles)
+        return highest if name == "clean" else 0.0
+
+    def _read_out(self, name: str, factor: float) -> None:
+        plan = self.simulation
+        with mrcfile.mmap(self.folder / f"{name}.mrc", "r+") as clean:
+            for image in clean.data:
+                image[:] = plan.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
+                self._step("reading out")
+            if name == "clean":
+                self._add_noise(clean.data)
+
+    def _add_noise(self, clean: Array) -> None:
+        plan = self.simulation
+        with self._new("tilts", clean.shape, stored_type(plan.noise_model)) as noisy:
+            drawn = clean if plan.noise_model is None else draw_noise(clean, plan.noise_model, seed=plan.seed)
+            for target, image in zip(noisy.data, drawn, strict=True):
+                target[:] = image
+        write_angles(self.folder / "tilts.rawtlt", plan.angles["clean"])
+
+    def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
+        return mrcfile.new_mmap(self.folder / f"{name}.mrc", shape, mrc_mode=6 if dtype is np.uint8 else 2, fill=None)
+
+    def _step(self, note: str) -> None:
+        self.done += 1
+        self.progress(self.done, note)
+
+
+def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:
+    """Images (tilt, y, u) of some slices, into which their neighbours are blurred."""
+    rim = projector.reach
+    start, stop = max(0, rows.start - rim), min(volume.shape[1], rows.stop + rim)
+    images = projector(torch.from_numpy(np.array(volume[:, start:stop])))
+    return images[:, rows.start - start : rows.stop - start]

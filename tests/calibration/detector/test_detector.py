@@ -1,0 +1,260 @@
+"""The detector's likelihood is exact, its posterior honest, and what cannot be measured is refused."""
+
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+
+from calibration.detector.cells import collect_cells, true_moments
+from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
+from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
+from calibration.detector.measure import dark_offset, measure_detector, misfit
+from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
+from calibration.detector.posterior import (
+    NUM_WALKERS,
+    _local_moves,
+    _sampler,
+    potential_scale_reduction,
+    sample_posterior,
+)
+from calibration.exposures.frames import Burst, ExposurePair
+from calibration.registration.align import Registration
+from calibration.registration.aligned import align_with
+
+from ..conftest import expose, rigid, textured_scene
+
+GAIN, OFFSET, READ_NOISE = 2.0, 100.0, 1.5
+
+
+def readings(generator, electrons, *, share=0.0, step=0.0, gain=GAIN, read_noise=READ_NOISE):
+    """Readings of known electrons beside an estimate of their signal with a given share of their noise."""
+    rate = np.asarray(electrons, float)
+
+    def draw(times: float):
+        counts = generator.poisson(rate * times) / times
+        return OFFSET + gain * (counts + read_noise / times**0.5 * generator.standard_normal(rate.shape))
+
+    observation, signal = draw(1.0), OFFSET + gain * rate if share == 0 else draw(1 / share)
+    observation = np.round(observation / step) * step if step else observation
+    return Readings(observation, signal, rate, share, share, step=step)
+
+
+def single_level(rate: float, *, share: float = 0.0, step: float = 0.0):
+    return collect_levels(
+        [readings(np.random.default_rng(0), np.full(2000, rate), share=share, step=step)], num_levels=1
+    )
+
+
+@pytest.mark.parametrize("rate", [0.3, 4.0, 60.0, 3000.0])
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_bin_masses_sum_to_one(rate, share):
+    likelihood = LevelMasses(single_level(rate, share=share, step=1.0))
+    mass = likelihood.masses(np.array([GAIN]), np.array([OFFSET]), np.array([READ_NOISE]))
+    assert mass.sum() == pytest.approx(1, abs=1e-12)
+    assert mass.min() > -1e-9
+
+
+def test_bin_masses_match_the_poisson_mixture():
+    levels = single_level(3.0)
+    mass = LevelMasses(levels).masses(np.array([GAIN]), np.array([OFFSET]), np.array([READ_NOISE]))[0, 0]
+    edges = (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * levels.width[0]
+    counts = np.arange(60)
+    centres = GAIN * (counts - (levels.signal[0] - OFFSET) / GAIN)
+    below = stats.norm.cdf((edges[:, None] - centres) / (GAIN * READ_NOISE)) @ stats.poisson.pmf(counts, 3.0)
+    np.testing.assert_allclose(mass, np.diff(below), atol=2e-9)
+
+
+def test_likelihood_of_a_parameter_set_does_not_depend_on_its_neighbours():
+    levels = collect_levels([readings(np.random.default_rng(1), np.random.default_rng(2).gamma(2.0, 5.0, 20_000))])
+    likelihood = DetectorLikelihood([levels])
+    sets = np.array([[2.0, 100.0, 1.5], [0.5, 90.0, 8.0], [9.0, 101.0, 0.2]])
+    together = likelihood(*sets.T)
+    alone = [float(likelihood(*one[:, None])[0]) for one in sets]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+
+
+def test_photon_transfer_line_gives_the_gain_despite_a_noisy_signal():
+    electrons = np.random.default_rng(2).gamma(2.0, 20.0, 200_000)
+    line = fit_photon_transfer([collect_levels([readings(np.random.default_rng(3), electrons, share=0.1, step=1.0)])])
+    assert line.gain == pytest.approx(GAIN, rel=0.02)
+    assert line.intercept == pytest.approx((GAIN * READ_NOISE) ** 2 - GAIN * OFFSET, abs=4)
+
+
+def test_noise_that_does_not_grow_with_the_signal_has_no_gain():
+    generator = np.random.default_rng(0)
+    signal = generator.uniform(100, 1000, 50_000)
+    falling = Readings(signal + generator.standard_normal(signal.shape) * (20 - signal / 100), signal, signal)
+    with pytest.raises(NotMeasurable, match="does not grow"):
+        fit_photon_transfer([collect_levels([falling])])
+
+
+def test_posterior_covers_the_truth_and_the_fit_is_good():
+    electrons = np.random.default_rng(5).gamma(1.2, 12.0, 60_000)
+    levels = collect_levels([readings(np.random.default_rng(6), electrons, share=1 / 16, step=1.0)])
+    found = sample_posterior([levels], offset=(OFFSET, 0.05))
+    for interval, truth in ((found.gain, GAIN), (found.offset, OFFSET), (found.read_noise, READ_NOISE)):
+        width = interval.q95 - interval.q05
+        assert interval.q05 - 0.5 * width < truth < interval.q95 + 0.5 * width
+    assert found.gain.q95 / found.gain.q05 < 1.1
+    assert found.num_steps >= 50 * found.autocorrelation_time
+    assert found.rhat < 1.05
+    assert misfit([levels], found.most_likely) == pytest.approx(1, abs=0.25)
+
+
+def test_unconverged_chain_is_an_error_that_says_how_many_more_steps():
+    electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
+    levels = collect_levels([readings(np.random.default_rng(6), electrons)])
+    with pytest.raises(ValueError, match=r"needs about \d+ more"):
+        sample_posterior([levels], num_steps=60, largest_num_steps=60)
+
+
+def test_scale_reduction_tells_chains_that_disagree():
+    chain = np.random.default_rng(0).standard_normal((400, 8, 3))
+    assert potential_scale_reduction(chain) < 1.01
+    chain[:, :4, 1] += 1.0
+    assert potential_scale_reduction(chain) > 1.1
+
+
+def test_dark_frames_fix_offset_and_read_noise():
+    generator = np.random.default_rng(9)
+    scene = textured_scene(generator, 128)
+    pair = expose(scene, rigid(0, (0, 0), 128), 128, generator, electrons=200.0, read_noise=3.0)
+    dark = Burst(np.round(100 + 2 * 3.0 * generator.standard_normal((6, 128, 128))))
+    assert dark_offset(dark)[0] == pytest.approx(100, abs=4 * dark_offset(dark)[1])
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    found = measure_detector([align_with(ExposurePair(pair.short, pair.long), still)], dark=dark).posterior
+    assert found.read_noise.median == pytest.approx(3.0, rel=0.05)
+    assert found.gain.median == pytest.approx(2.0, rel=0.05)
+    assert found.read_noise.q95 / found.read_noise.q05 < 1.15
+
+
+def cells(generator, rate, *, read_noise, offset=OFFSET, gain=GAIN, ratio=16, low=-np.inf, high=np.inf):
+    """Rounded and clipped readings beside signals from a longer exposure of the same detector."""
+
+    def draw(times):
+        electrons = generator.poisson(rate * times) + read_noise * generator.standard_normal(rate.shape)
+        return np.round(offset + gain * electrons)
+
+    scale = Scale(0, 1 / ratio, offset * (1 - 1 / ratio), offset + gain * float(rate.mean()), common_offset=True)
+    signal = offset + (draw(ratio) - offset) / ratio
+    shares = (1 / ratio, 1 / ratio**2)
+    return Readings(draw(1).clip(low, high), signal, signal, *shares, rails=(low, high), scale=scale)
+
+
+@pytest.mark.parametrize(("gain", "read_noise", "low"), [(0.6, 0.3, 0.0), (2.0, 0.25, 95.0), (5.0, 4.0, 100.0)])
+def test_cells_of_rounded_and_clipped_readings_have_the_masses_of_the_mixture(gain, read_noise, low):
+    generator = np.random.default_rng(0)
+    rate = generator.gamma(4.0, 1.5, 40_000)
+    one = cells(generator, rate, read_noise=read_noise, gain=gain, low=low)
+    levels = collect_cells([one], guess=(gain, OFFSET, read_noise))
+    mass = LevelMasses(levels).masses(np.array([gain]), np.array([OFFSET]), np.array([read_noise]))[0]
+    counts = np.arange(200)
+    own = gain * (levels.signal - OFFSET) / 16 + (gain * read_noise / 16) ** 2
+    for level in (0, 3):
+        mean = (levels.signal + levels.shift * own / levels.own - OFFSET)[level] / gain
+        variance = (levels.spread + levels.excess * own)[level] / gain**2
+        electrons = stats.nbinom.pmf(counts, mean**2 / variance, 1 / (1 + variance / mean))
+        edges = levels.origin[level] + levels.width[level] * np.arange(mass.shape[1] + 1)
+        edges = np.where(edges < low, -np.inf, edges)
+        below = stats.norm.cdf((edges[:, None] - OFFSET - gain * counts) / (gain * read_noise)) @ electrons
+        np.testing.assert_allclose(mass[level], np.diff(below), atol=3e-8)
+
+
+def test_true_moments_behind_noisy_estimates_match_those_counted():
+    generator = np.random.default_rng(1)
+    truth = generator.gamma(3.0, 2.0, 4_000_000)
+    estimate = generator.poisson(16 * truth) / 16 + 0.1 * generator.standard_normal(truth.shape)
+    edges = np.linspace(-1, 40, 41 * 32 + 1)
+    grid = 0.5 * (edges[1:] + edges[:-1])
+    density = np.histogram(estimate, edges)[0] / 1.0
+    _, first, second = true_moments(grid, ndimage.gaussian_filter1d(density, 1.0), 1 / 16, 0.1**2)
+    for low, high in ((1.0, 2.0), (5.0, 6.0), (11.0, 13.0)):
+        inside, place = (estimate >= low) & (estimate < high), (grid >= low) & (grid < high)
+        assert first[place].sum() / density[place].sum() == pytest.approx(truth[inside].mean(), rel=4e-3)
+        assert second[place].sum() / density[place].sum() == pytest.approx((truth[inside] ** 2).mean(), rel=8e-3)
+
+
+@pytest.mark.parametrize(
+    ("gain", "read_noise", "offset", "electrons"),
+    [(0.65, 0.36, 100.0, 2.5), (2.4, 7.5, 0.0, 5.5), (14.0, 0.26, 0.0, 4.0)],
+)
+def test_rounding_clipping_and_single_electrons_leave_no_bias(gain, read_noise, offset, electrons):
+    generator = np.random.default_rng(6)
+    rate = electrons * np.exp(0.7 * generator.standard_normal(60_000) - 0.25)
+    one = cells(generator, rate, read_noise=read_noise, gain=gain, offset=offset, low=0.0)
+    levels = [collect_cells([one], guess=(gain, offset, read_noise))]
+    found = sample_posterior(levels)
+    for interval, truth in ((found.gain, gain), (found.offset, offset), (found.read_noise, read_noise)):
+        deviation = (interval.q95 - interval.q05) / 3.29
+        assert abs(interval.median - truth) < 3 * deviation
+    assert misfit(found.levels, found.most_likely) == pytest.approx(1, abs=0.3)
+
+
+def test_clipped_readings_count_as_clipped():
+    generator = np.random.default_rng(4)
+    scene = textured_scene(generator, 160)
+    pair = expose(scene, rigid(0, (0, 0), 160), 160, generator, electrons=20.0, read_noise=8.0, offset=0.0)
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    short = pair.short.clip(0)
+    assert np.mean(short == 0) > 0.02
+    found = measure_detector([align_with(ExposurePair(short, pair.long, 16.0), still)]).posterior
+    for interval, truth in ((found.gain, 2.0), (found.offset, 0.0), (found.read_noise, 8.0)):
+        deviation = (interval.q95 - interval.q05) / 3.29
+        assert abs(interval.median - truth) < 3 * deviation
+
+
+def test_a_mean_of_frames_as_the_long_exposure_tells_no_offset_but_the_gain():
+    generator = np.random.default_rng(8)
+    dose = 40 * np.exp(0.6 * ndimage.gaussian_filter(generator.standard_normal((160, 160)), 3) * 10)
+    read = [
+        np.round(100 + 2.0 * (generator.poisson(dose) + 3 * generator.standard_normal(dose.shape))) for _ in range(17)
+    ]
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    pair = align_with(ExposurePair(read[0], np.mean(read[1:], axis=0), 16.0), still)
+    assert not pair.one_setting
+    assert measure_detector([pair]).posterior.gain.median == pytest.approx(2.0, rel=0.06)
+
+
+def test_a_signal_known_without_noise_is_no_special_case():
+    generator = np.random.default_rng(9)
+    rate = 10 * np.exp(0.6 * generator.standard_normal(40_000))
+    observation = np.round(
+        OFFSET + GAIN * (generator.poisson(rate) + READ_NOISE * generator.standard_normal(rate.shape))
+    )
+    signal = OFFSET + GAIN * rate
+    known = Readings(observation, signal, signal, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
+    found = sample_posterior([collect_cells([known], guess=(GAIN, OFFSET, READ_NOISE))])
+    assert found.gain.median == pytest.approx(GAIN, rel=0.05)
+
+
+def test_pairs_some_of_few_and_some_of_many_electrons_are_measured_together():
+    pairs = []
+    for number, electrons in enumerate((2.0, 4000.0)):
+        generator = np.random.default_rng(number)
+        scene = textured_scene(generator, 128)
+        pair = expose(scene, rigid(0, (0, 0), 128), 128, generator, electrons=electrons)
+        still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+        pairs.append(align_with(ExposurePair(pair.short, pair.long, 16.0), still))
+    assert measure_detector(pairs).posterior.gain.median == pytest.approx(GAIN, rel=0.06)
+
+
+def test_a_gain_that_cannot_be_told_from_none_is_refused():
+    generator = np.random.default_rng(1)
+    dose = 2.4 * np.exp(
+        0.8 * (lambda x: x / x.std())(ndimage.gaussian_filter(generator.standard_normal((192, 192)), 4))
+    )
+    short = 100 + generator.normal(3.3 * dose, 25.0)  # the noise does not depend on the signal at all
+    long = 100 + generator.normal(16 * 3.3 * dose, 25.0)
+    pair = ExposurePair(np.round(short), np.round(long))
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
+    with pytest.raises(NotMeasurable, match="gain"):
+        measure_detector([align_with(pair, still)])
+
+
+def test_ctrl_c_in_the_chain_prints_no_traceback(capsys):
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    sampler = _sampler(stopped, _local_moves(1.0), 0)
+    with pytest.raises(KeyboardInterrupt):
+        sampler.run_mcmc(np.random.default_rng(0).normal(size=(NUM_WALKERS, 3)), 1)
+    assert capsys.readouterr() == ("", "")

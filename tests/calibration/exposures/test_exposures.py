@@ -1,0 +1,81 @@
+"""Frames are checked once, and every mistake gets one clear line."""
+
+import numpy as np
+import pytest
+
+from calibration.exposures.frames import Burst, ExposurePair, read_burst, read_pairs, saturation_level
+from noiseflow.io import write
+
+RANDOM = np.random.default_rng(0)
+GOOD, OTHER = RANDOM.poisson(50, (2, 40, 40)).astype(np.float64)
+
+
+def broken(**change):
+    frame = GOOD.copy()
+    if "nan" in change:
+        frame[3, 4] = np.nan
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("short", "long", "message"),
+    [
+        (GOOD, np.zeros((40, 41)) + np.arange(41), "one size"),
+        (broken(nan=True), OTHER, "NaN"),
+        (np.full((40, 40), 7.0), OTHER, "flat"),
+        (np.full((40, 40), 65535, np.uint16), OTHER, "saturated"),
+        (np.where(RANDOM.random((40, 40)) < 0.7, 4095, GOOD), OTHER, "saturated"),
+        (np.stack([GOOD] * 3, -1), OTHER, "colour"),
+        (np.stack([GOOD] * 3), OTHER, "colour"),
+        (np.stack([GOOD] * 7), OTHER, "one 2D frame"),
+        (GOOD[:16, :16], OTHER[:16, :16], "at least 32"),
+        (GOOD, GOOD, "identical"),
+    ],
+)
+def test_unusable_frames_are_refused(short, long, message):
+    with pytest.raises(ValueError, match=message):
+        ExposurePair(short, long)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.5, -2.0, np.inf, np.nan])
+def test_exposure_ratio_must_exceed_one(ratio):
+    with pytest.raises(ValueError, match="above 1"):
+        ExposurePair(GOOD, OTHER, ratio)
+
+
+def test_saturation_level_is_the_rail_only_where_one_shows():
+    frame = RANDOM.poisson(200, (200, 200))
+    assert saturation_level(frame) == np.inf
+    assert saturation_level(np.minimum(frame, 215)) == 215
+    assert saturation_level(np.array([3, 255, 7], np.uint8)) == 255
+
+
+def test_burst_needs_two_different_frames():
+    with pytest.raises(ValueError, match="one frame only"):
+        Burst(GOOD[None])
+    with pytest.raises(ValueError, match="frames 0 and 1"):
+        Burst(np.stack([GOOD, GOOD]))
+    assert Burst(np.stack([GOOD, OTHER])).frames.shape == (2, 40, 40)
+
+
+def test_pairs_are_read_in_the_order_given(tmp_path):
+    for name, frame in (("a.tif", GOOD), ("b.tif", OTHER), ("long.mrc", GOOD + OTHER)):
+        write(tmp_path / name, frame.astype(np.float32))
+    pairs = read_pairs([tmp_path / "b.tif", tmp_path / "a.tif"], [tmp_path / "long.mrc"], exposure_ratio=2)
+    np.testing.assert_array_equal(pairs[0].short, OTHER)
+    np.testing.assert_array_equal(pairs[1].short, GOOD)
+    assert pairs[0].exposure_ratio == 2
+    with pytest.raises(ValueError, match="1 short and 2 long"):
+        read_pairs([tmp_path / "a.tif"], [tmp_path / "b.tif", tmp_path / "long.mrc"])
+    with pytest.raises(ValueError, match="short and as long"):
+        read_pairs([tmp_path / "a.tif"], [tmp_path / "a.tif"])
+
+
+def test_burst_is_read_from_a_stack_or_from_files(tmp_path):
+    write(tmp_path / "stack.tif", np.stack([GOOD, OTHER]).astype(np.float32))
+    write(tmp_path / "a.npy", GOOD)
+    write(tmp_path / "b.npy", OTHER)
+    stack, files = read_burst([tmp_path / "stack.tif"]), read_burst([tmp_path / "a.npy", tmp_path / "b.npy"])
+    np.testing.assert_array_equal(stack.frames, files.frames)
+    with pytest.raises(ValueError, match="one frame only"):
+        read_burst([tmp_path / "a.npy"])

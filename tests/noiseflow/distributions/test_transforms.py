@@ -1,0 +1,98 @@
+"""Laws of the scalar maps: inverse, log-derivative, monotone, over extremes of their parameters."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from noiseflow.distributions.transforms import Affine, Radial, StudentTail
+from noiseflow.models.flow import Layer, affine_layer, radial_layer, spline_layer, tail_layer
+from tests.contracts import check_transform
+
+POINTS = torch.linspace(-30, 30, 2003, dtype=torch.float64)
+raw_numbers = st.floats(-50, 50, allow_nan=False)
+
+
+def parameters(count: int) -> st.SearchStrategy[torch.Tensor]:
+    return st.lists(raw_numbers, min_size=count, max_size=count).map(lambda v: torch.tensor(v, dtype=torch.float64))
+
+
+@given(st.floats(-10, 10), st.floats(-5, 5))
+def test_affine_is_a_transform(loc: float, log_scale: float) -> None:
+    check_transform(Affine(torch.tensor(loc).double(), torch.tensor(log_scale).double()), POINTS)
+
+
+@settings(max_examples=60, deadline=None)
+@given(parameters(3))
+def test_radial_is_a_transform(raw: torch.Tensor) -> None:
+    check_transform(radial_layer().build(raw), POINTS)
+
+
+@settings(max_examples=40, deadline=None)
+@given(parameters(49))
+def test_spline_is_a_transform(raw: torch.Tensor) -> None:
+    check_transform(spline_layer(16).build(raw), POINTS, tolerance=1e-8, slope_tolerance=1e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(parameters(2))
+def test_tail_is_a_transform(raw: torch.Tensor) -> None:
+    check_transform(tail_layer().build(raw), POINTS)
+
+
+@given(st.floats(0.05, 20), st.floats(-3, 3), st.floats(-1e4, 1e4))
+def test_radial_agrees_with_its_formula(width: float, log_slope: float, at: float) -> None:
+    alpha, z0 = torch.tensor(width).double(), torch.tensor(0.3).double()
+    beta = alpha * torch.expm1(torch.tensor(log_slope).double())
+    x = torch.tensor(at).double()
+    d = x - z0
+    y, ladj = Radial(z0, torch.log(alpha), torch.tensor(log_slope).double()).forward(x)
+    assert torch.allclose(y, x + beta * d / (alpha + d.abs()), rtol=1e-12)
+    assert torch.allclose(ladj, torch.log1p(alpha * beta / (alpha + d.abs()) ** 2), rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(parameters(3), st.floats(-1e6, 1e6))
+def test_radial_inverse_keeps_its_digits_in_float32(raw: torch.Tensor, at: float) -> None:
+    reference = radial_layer().build(raw)
+    x64 = torch.tensor([at], dtype=torch.float64)
+    y32 = reference.forward(x64)[0].float()
+    x32 = radial_layer().build(raw.float()).inverse(y32)[0]
+    exact = reference.inverse(y32.double())[0]
+    assert float((x32 - exact).abs()) <= 1e-4 * (1 + float(exact.abs()))
+
+
+@pytest.mark.parametrize("point", [-5.0, -1.25, 0.0, 5.0])
+def test_spline_is_continuous_at_its_knots(point: float) -> None:
+    spline = spline_layer(16).build(torch.randn(49, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))
+    knot = spline.x[..., int((point + 5) / 10 * 16)]
+    near = knot + torch.tensor([-1e-9, 0.0, 1e-9], dtype=torch.float64)
+    y, ladj = spline.forward(near)
+    assert float((y[2] - y[0]).abs()) < 1e-6
+    assert float((ladj[2] - ladj[0]).abs()) < 1e-5
+
+
+def test_student_tail_turns_student_noise_nearly_normal() -> None:
+    probability = [1e-6, 1e-3, 0.2]
+    weight = torch.tensor(0.2, dtype=torch.float64)
+    latent = StudentTail(weight, weight).forward(torch.from_numpy(stats.t(5).ppf(probability)))[0]
+    assert torch.allclose(latent, torch.from_numpy(stats.norm.ppf(probability)), rtol=0.06)
+
+
+@pytest.mark.parametrize("layer", [affine_layer(), radial_layer(0.3), spline_layer(8)])
+def test_maps_between_rows_have_parameters_in_between(layer: Layer) -> None:
+    raw = torch.randn(5, len(layer.initial), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows, x = layer.build(raw), torch.linspace(-7, 7, 60, dtype=torch.float64).reshape(3, 20)
+    row, weight = torch.tensor([[0], [2], [3]]), torch.tensor([[0.0], [0.3], [1.0]], dtype=torch.float64)
+    found = rows.between_rows(row, weight)
+    for i, (at, share) in enumerate(zip(row.flatten(), weight.flatten(), strict=True)):
+        parts = (getattr(rows, each.name) for each in fields(rows) if each.name not in ("row", "weight"))
+        expected = type(rows)(*(torch.lerp(part[at], part[at + 1], share) for part in parts))
+        for direction in ("forward", "inverse"):
+            y, ladj = getattr(found, direction)(x)
+            y_expected, ladj_expected = getattr(expected, direction)(x[i])
+            assert torch.allclose(y[i], y_expected, rtol=1e-12, atol=1e-12)
+            assert torch.allclose(ladj[i], ladj_expected, rtol=1e-10, atol=1e-10)

@@ -1,0 +1,94 @@
+"""Noise-model files: the same model comes back, and nothing else is let in."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import noiseflow
+from noiseflow.io.model_files import kinds, read_metadata
+
+SIGNAL = torch.linspace(0, 1, 7)[None]
+WRAPPERS = {
+    "Digitised": lambda: noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0),
+    "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow(), 0.3),
+    "WithMaps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.full((1, 7), 1.5)),
+}
+
+
+def make(kind: str) -> torch.nn.Module:
+    model = WRAPPERS[kind]() if kind in WRAPPERS else kinds()[kind]()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+@pytest.mark.parametrize("kind", sorted(kinds()))
+def test_same_model_comes_back(tmp_path: Path, kind: str) -> None:
+    model = make(kind)
+    path = noiseflow.save(model, tmp_path / "model.safetensors", units="counts", provenance={"from": "a test"})
+    again = noiseflow.load(path)
+    assert type(again) is type(model)
+    observation = torch.linspace(-0.2, 1.5, 7)[None]
+    assert torch.equal(again(SIGNAL).log_prob(observation), model(SIGNAL).log_prob(observation))
+    metadata = read_metadata(path)
+    assert metadata["kind"] == kind
+    assert metadata["units"] == "counts"
+    assert metadata["provenance"] == {"from": "a test"}
+
+
+def rewrite(path: Path, **changes: str | None) -> Path:
+    """The file of a default Gaussian with some metadata changed or removed."""
+    noiseflow.save(noiseflow.Gaussian(), path)
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        metadata = {**file.metadata(), **changes}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(tensors, path, metadata={key: value for key, value in metadata.items() if value is not None})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "something else"}, "not a noiseflow noise model"),
+        ({"format_version": "99"}, "update noiseflow"),
+        ({"model": json.dumps({"kind": "os.system", "arguments": {}})}, "unknown kind"),
+        ({"model": json.dumps({"kind": "Gaussian", "arguments": {"scale": "x"}})}, "damaged"),
+        ({"model": json.dumps({"kind": "RadialFlow", "arguments": {}})}, "do not fit a RadialFlow"),
+        ({"model": "{"}, "damaged"),
+        ({"model": None}, "damaged"),
+    ],
+)
+def test_foreign_future_and_damaged_files_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
+    path = rewrite(tmp_path / "model.safetensors", **changes)
+    with pytest.raises(ValueError, match=message):
+        noiseflow.load(path)
+
+
+def test_non_finite_parameters_are_refused(tmp_path: Path) -> None:
+    path = noiseflow.save(noiseflow.Gaussian(float("nan")), tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        noiseflow.load(path)
+
+
+def test_truncated_and_missing_files_are_refused(tmp_path: Path) -> None:
+    path = noiseflow.save(noiseflow.Gaussian(), tmp_path / "model.safetensors")
+    whole = path.read_bytes()
+    for size in (0, 4, 8, 50, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="damaged"):
+            noiseflow.load(path)
+    with pytest.raises(FileNotFoundError, match="noiseflow calibrate"):
+        noiseflow.load(tmp_path / "none.safetensors")
+
+
+def test_unknown_models_cannot_be_saved(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not a known kind"):
+        noiseflow.save(torch.nn.Linear(1, 1), tmp_path / "model.safetensors")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,186 @@
+"""The first steps of a fit at half the resolution: the same scene, seen by fewer pixels."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from noiseflow import Gaussian, SplineFlow
+from noiseflow.fitting.loop import FitResult
+from recon.benchmarks.scenes import make_scene
+from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.fields.occupancy import Occupancy
+from recon.joint.alternation import Alternation
+from recon.joint.checkpoint import Journal
+from recon.joint.half_resolution import HalfResolution
+from recon.joint.joint import JointReconstructor, half_resolution
+from recon.joint.signal_model import TomographySignal
+from recon.metrics.metrics import compare
+from recon.projection.defocused_projector import with_defocus
+from recon.projection.image_formation import Transmission
+from recon.projection.projector import SliceProjector
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def _small_lattices_too(monkeypatch):
+    monkeypatch.setattr(half_resolution, "_LEAST", 48)
+
+
+_ANGLES = np.arange(-60, 61, 8.0)
+_SHAPES = [(48, 40, 64), (50, 39, 63), (49, 42, 61)]  # (depth, height, width)
+
+
+def smooth_model(shape, *, detector_width=None, occupancy=False, offset=0.0):
+    """A soft ball well inside the lattice, which half the resolution holds nearly as well."""
+    depth, _, width = shape
+    projector = SliceProjector(
+        tilt_angles=_ANGLES, depth=depth, width=width, detector_width=detector_width, detector_offset=offset
+    )
+    field = MultiresolutionField(shape, scale=0.05)
+    places = [torch.linspace(-1, 1, 12) - shift for shift in (0.1, -0.2, 0.15)]
+    distance = sum(place.view([-1 if axis == k else 1 for k in range(3)]) ** 2 for axis, place in enumerate(places))
+    rough = functional.interpolate(torch.exp(-6 * distance)[None, None], size=field.grids[-2].shape, mode="trilinear")
+    with torch.no_grad():
+        for grid in field.grids:
+            grid.zero_()
+        field.grids[-2].copy_(7 * rough[0, 0] - 4)
+    skip = Occupancy(torch.ones(1, 1, 1), shape) if occupancy else None
+    return TomographySignal(field, projector, Transmission(1.0), weight=0.5, occupancy=skip)
+
+
+def images_of(model):
+    with torch.no_grad():
+        return model.signal().view(len(_ANGLES), model.projector.detector_width, model.field.height)
+
+
+@pytest.mark.parametrize("occupancy", [False, True])
+@pytest.mark.parametrize("offset", [0.0, 1.3])
+@pytest.mark.parametrize("shape", _SHAPES)
+def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
+    model = smooth_model(shape, occupancy=occupancy, offset=offset, detector_width=shape[2] + 5)
+    half = HalfResolution.of(model)
+    seen, expected = images_of(half.signal_model), half.pixels(images_of(model))
+    assert seen.shape == expected.shape
+    assert 4 * seen.numel() <= 1.1 * model.num_pixels
+    contrast, error = float(expected.max() - expected.min()), seen - expected
+    assert contrast > 0.1
+    assert float(error.square().mean().sqrt()) < 0.02 * contrast
+    slopes = expected.diff(dim=1)[..., 1:], expected.diff(dim=2)[:, 1:]
+    allowed = 0.3 if any(size % 2 for size in shape) else 0.05  # half of an odd number of voxels is a little too wide
+    for slope in slopes:  # error along a slope is a shift, in pixels at half the resolution
+        assert abs(float((error[:, 1:, 1:] * slope).sum() / slope.square().sum())) < allowed
+
+
+def test_total_variation_weighs_as_much():
+    model = smooth_model((64, 64, 64))
+    model.smoothing = 1e-3
+    half = HalfResolution.of(model).signal_model
+    assert float(half.penalty()) == pytest.approx(float(model.penalty()), rel=0.08)
+
+
+def test_pixels_come_from_everywhere_and_are_as_they_were():
+    half = HalfResolution.of(smooth_model(_SHAPES[0]))
+    images = torch.arange(len(_ANGLES) * 64 * 40).view(len(_ANGLES), 64, 40)
+    picked = half.pixels(images)
+    columns, rows = picked // 40 % 64, picked % 40
+    assert picked.shape == (len(_ANGLES), 32, 20)
+    assert (columns.diff(dim=1) == 2).all()
+    assert (rows.diff(dim=2) == 2).all()
+    assert {(int(c), int(r)) for c, r in zip(columns[:, 0, 0], rows[:, 0, 0], strict=True)} == {
+        (c, r) for c in (0, 1) for r in (0, 1)
+    }
+
+
+def test_what_is_learnt_is_learnt_for_both():
+    model = smooth_model(_SHAPES[1])
+    half = HalfResolution.of(model).signal_model
+    before = model.volume()
+    (half.signal().mean() + half.penalty()).backward()
+    assert model.field.grids[-1].grad is None
+    with torch.no_grad():
+        for grid in model.field.grids[:-1]:
+            grid -= 100 * grid.grad
+    assert not torch.equal(model.volume(), before)
+    assert model.image_formation is half.image_formation
+
+
+def test_the_full_resolution_begins_around_what_was_found():
+    model = smooth_model(_SHAPES[0], occupancy=True)
+    HalfResolution.of(model).hand_over()
+    something = (model.field.volume() > 0.3 * model.field.scale).transpose(1, 2)
+    assert something.any()
+    assert model.occupancy.mask[something].all()
+    assert model.occupancy.share < 0.5
+
+
+def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
+    model = smooth_model(_SHAPES[0])
+    assert HalfResolution.of(model)
+    small = smooth_model((24, 24, half_resolution._LEAST - 1))
+    voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
+    blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
+    for other in (small, voxels, blurred):
+        assert HalfResolution.of(other) is None
+
+
+@pytest.mark.parametrize(
+    ("noise_model", "coarse_to_fine", "sizes"),
+    [
+        (Gaussian(), True, [(32, 20), (32, 20)]),
+        (Gaussian(), False, [(64, 40)]),
+        (SplineFlow(neighbourhood=3), True, [(64, 40)]),
+    ],
+)
+def test_a_fit_begins_at_half_the_resolution_where_it_can(noise_model, coarse_to_fine, sizes):
+    seen = []
+
+    def run_fit(noise_model, signal, observation, **options):
+        assert options["mask"].shape == options["held_out"].shape == observation.shape
+        seen.append(tuple(observation.shape[1:]))
+        return FitResult(noise_model)
+
+    model = smooth_model(_SHAPES[0])
+    images, use = images_of(model), torch.ones(len(_ANGLES), 64, 40, dtype=torch.bool)
+    task = Alternation(model, images, use, 0, run_fit, coarse_to_fine=coarse_to_fine)
+    assert task.begin(Gaussian(), noise_model, num_steps=40) == 10 * len(sizes)
+    assert seen == sizes
+
+
+def slices(phantom, seed=0):
+    """Some slices: truth, noisy series and true noise."""
+    whole, rows = make_scene(64, phantom=phantom, tilts="-60:60:4", seed=seed), slice(24, 40)
+    return whole.truth[:, rows], replace(whole.noisy, images=whole.noisy.images[:, rows]), whole.noise_model
+
+
+def test_half_the_steps_at_half_the_resolution_lose_nothing():
+    gains = []
+    for phantom, seed in itertools.product(("shells", "virions"), (0, 1)):  # by chance, one alone may differ by 0.15
+        truth, noisy, noise_model = slices(phantom, seed)
+        fit = JointReconstructor(weight=0.4, noise_model=lambda noise_model=noise_model: noise_model)
+        fits = [replace(fit, coarse_to_fine=wanted) for wanted in (True, False)]
+        coarsely, finely = (compare(each(noisy).volume.attenuation, truth).psnr for each in fits)
+        gains.append(coarsely - finely)
+    assert np.mean(gains) > -0.05
+
+
+def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
+    _, noisy, _ = slices("shells")
+    fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16)
+    stopped = []
+
+    def stop(title, done, total, note):
+        if title == "fitting the volume" and done == 2:
+            stopped.append(done)
+            raise KeyboardInterrupt
+
+    journal = Journal(tmp_path, {}, report=stop)
+    with pytest.raises(KeyboardInterrupt):
+        replace(fit, run_fit=journal.fit)(noisy, progress=journal.progress("fitting the volume", 16))
+    assert stopped
+    resumed = replace(fit, run_fit=Journal(tmp_path, {}, resume=True).fit)(noisy).volume.attenuation
+    np.testing.assert_allclose(resumed, fit(noisy).volume.attenuation, rtol=1e-5, atol=1e-5 * resumed.max())

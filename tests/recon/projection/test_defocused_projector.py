@@ -1,0 +1,135 @@
+"""Blur by depth: the exact layers against jittered rays and against a slow sum, and the laws of the operator."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from recon.benchmarks.defocus import defocused_scene
+from recon.benchmarks.scenes import make_scene
+from recon.joint.joint import JointReconstructor
+from recon.methods import methods
+from recon.metrics.metrics import compare
+from recon.projection.defocused_projector import DefocusedProjector, jittered_projection, with_defocus
+from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
+from recon.scale.blocks import reconstruct_in_blocks
+from recon.series.tilt_series import VolumeGrid
+
+ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]
+
+
+def projector(depth=20, width=24, **options):
+    return SliceProjector(tilt_angles=ANGLES, depth=depth, width=width, dtype=torch.float64, **options)
+
+
+def random_volume(*shape):
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def test_layers_add_up_to_the_whole():
+    whole, volume = projector(), random_volume(20, 3, 24)
+    layers = whole.layers(lambda distance: np.digitize(distance, [-5.0, 0.0, 4.0]))
+    assert len(layers) == 4
+    torch.testing.assert_close(sum(layer(volume) for layer in layers), whole(volume))
+    torch.testing.assert_close(sum(layer.T(whole(volume)) for layer in layers), whole.T(whole(volume)))
+
+
+def test_point_is_blurred_by_its_distance_from_the_focal_plane():
+    volume = torch.zeros(41, 41, 41, dtype=torch.float64)
+    volume[34, 20, 26] = 1  # z = 14, x = 6
+    operator = DefocusedProjector(projector(41, 41), 0.15, most_layers=40)
+    position = torch.arange(41, dtype=torch.float64) - 20
+    for angle, image in zip(np.deg2rad(ANGLES), operator(volume), strict=True):
+        distance = 14 * math.cos(angle) - 6 * math.sin(angle)
+        along_y = image.sum(1) / image.sum()
+        spread = math.sqrt(float((along_y * position**2).sum()))
+        assert spread == pytest.approx(0.15 * abs(distance), abs=0.13)  # half a layer
+
+
+def test_exact_and_jittered_blur_agree():
+    position = torch.arange(20, dtype=torch.float64) - 9.5
+    z, y, x = torch.meshgrid(position[2:-2], position, position, indexing="ij")
+    volume = torch.exp(-((z - 5) ** 2 + y**2 + x**2) / 6) + torch.exp(-((z + 4) ** 2 + (y - 1) ** 2 + (x - 3) ** 2) / 6)
+    sharp = SliceProjector(tilt_angles=[-60.0, 35.0], depth=16, width=20, dtype=torch.float64)
+    exact = DefocusedProjector(sharp, 0.3)(volume)
+    generator = torch.Generator().manual_seed(0)
+    random = jittered_projection(volume, [-60.0, 35.0], 0.3, num_rays=400, generator=generator)
+    inner = (slice(None), slice(2, -2), slice(2, -2))  # blur ends at the detector's edges, rays do not
+    error = (exact - random)[inner].square().mean().sqrt()
+    change = (sharp(volume) - random)[inner].square().mean().sqrt()
+    assert error < 0.01 * random.max()
+    assert error < 0.15 * change
+
+
+def test_adjoint_and_gradient():
+    operator = DefocusedProjector(projector(7, 11, detector_width=13), 0.3)
+    assert len(operator.blurs) > 3
+    x, y = random_volume(7, 5, 11).requires_grad_(), random_volume(5, 5, 13)
+    forward, back = (operator(x) * y).sum(), (x * operator.T(y)).sum()
+    assert abs(forward - back) < 1e-10 * abs(forward)
+    forward.backward()
+    torch.testing.assert_close(x.grad, operator.T(y))
+
+
+def test_blur_below_a_quarter_of_a_pixel_is_skipped():
+    sharp, volume = projector(), random_volume(20, 3, 24)
+    operator = DefocusedProjector(sharp, 0.01)
+    assert operator.blurs == [0.0]
+    torch.testing.assert_close(operator(volume), sharp(volume), rtol=0, atol=0)
+
+
+def test_knowing_the_blur_sharpens_the_reconstruction():
+    truth = torch.zeros(20, 12, 24, dtype=torch.float64)
+    truth[2:5, 4:8, 10:13] = truth[15:18, 4:8, 6:9] = 1
+    blurred = DefocusedProjector(projector(), 0.15)
+    images = blurred(truth)
+    error = {
+        name: float((sirt(images, operator, num_iterations=100) - truth).square().mean())
+        for name, operator in {"known": blurred, "ignored": projector()}.items()
+    }
+    assert error["known"] < 0.8 * error["ignored"]
+
+
+def test_impossible_convergence_is_refused():
+    with pytest.raises(ValueError, match="convergence"):
+        DefocusedProjector(projector(), -0.1)
+
+
+def test_blur_below_a_quarter_of_a_pixel_leaves_the_projector_as_it_is():
+    sharp = projector()
+    assert with_defocus(sharp, 0.01) is sharp
+    assert isinstance(with_defocus(sharp, 0.1), DefocusedProjector)
+
+
+@pytest.fixture(scope="module")
+def defocused():
+    return defocused_scene(make_scene(32, phantom="shells", noise="skewed", tilts="-60:60:5"), 0.15)
+
+
+def test_joint_fit_that_knows_the_defocus_finds_the_better_volume(defocused):
+    psnr = {}
+    for defocus in (0.0, 0.15):
+        fit = JointReconstructor(weight=0.3, noise_model=lambda: defocused.noise_model, defocus=defocus)
+        psnr[defocus] = compare(fit(defocused.noisy).volume.attenuation, defocused.truth).psnr
+    assert psnr[0.15] > psnr[0.0] + 0.4
+
+
+def test_methods_model_it_or_refuse_and_say_what_they_did(tmp_path):
+    defocused = defocused_scene(make_scene(12, phantom="shells", noise="skewed", tilts="-60:60:20"), 0.3)
+    grid, options = VolumeGrid.of(defocused.noisy), {"weight": 0.3, "num_steps": 4}
+    outcome = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.3, **options)
+    assert outcome.choices["defocus"].startswith("0.3, blurs up to 2.")
+    left_out = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.001, **options)
+    assert "left out" in left_out.choices["defocus"]
+    blocks = reconstruct_in_blocks(
+        defocused.noisy, grid, tmp_path / "v.npy", method="l2", rows_at_once=8, defocus=0.3, **options
+    )
+    assert blocks.choices["defocus"] == outcome.choices["defocus"]
+    with pytest.raises(ValueError, match="--defocus"):
+        methods.reconstruct(defocused.noisy, grid, method="sirt", defocus=0.3)
+    with pytest.raises(ValueError, match="--defocus"):
+        reconstruct_in_blocks(defocused.noisy, grid, tmp_path / "w.npy", method="wbp", rows_at_once=9, defocus=0.3)
+    with pytest.raises(ValueError, match="0 to 1"):
+        methods.reconstruct(defocused.noisy, grid, method="l2", defocus=-0.1)

@@ -1,0 +1,109 @@
+"""Blocks of slices: the same volume as in one go, in the memory of one block."""
+
+import tracemalloc
+
+import mrcfile
+import numpy as np
+import pytest
+
+from noiseflow import io
+from recon.methods.methods import reconstruct
+from recon.scale.blocks import reconstruct_in_blocks
+from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series, write_tilt_series
+from recon.simulate.phantoms import shells
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+
+@pytest.fixture(scope="module")
+def scene():
+    density = shells(28, generator=np.random.default_rng(1), count=10)
+    clean, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0))
+    return density * unit, add_noise(clean, ACQUISITIONS["skewed"].noise(), seed=2)
+
+
+@pytest.mark.parametrize(("method", "settings"), [("sirt", {"num_steps": 12}), ("wbp", {"window": "hann"})])
+@pytest.mark.parametrize("rows", [1, 5, 100])
+def test_blocks_of_independent_slices_give_the_same_volume(scene, tmp_path, method, settings, rows):
+    _, noisy = scene
+    grid = VolumeGrid.of(noisy, thickness=20)
+    whole = reconstruct(noisy, grid, method=method, **settings)
+    blocks = reconstruct_in_blocks(noisy, grid, tmp_path / "v.npy", method=method, rows_at_once=rows, **settings)
+    np.testing.assert_allclose(blocks.volume.attenuation, whole.volume.attenuation, atol=1e-6)
+    np.testing.assert_allclose(blocks.projections, whole.projections, atol=1e-5)
+    np.testing.assert_array_equal(np.load(tmp_path / "v.npy"), blocks.volume.attenuation)
+
+
+def test_memory_mapped_series_is_read_block_by_block(scene, tmp_path):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    with mrcfile.mmap(tmp_path / "tilts.mrc") as file:
+        mapped = TiltSeries(file.data, noisy.tilt_angles)
+        assert np.shares_memory(mapped.images, file.data)
+        options = {"method": "wbp", "window": "hann", "rows_at_once": 8}
+        found = reconstruct_in_blocks(mapped, VolumeGrid.of(mapped), tmp_path / "v.npy", **options)
+    whole = reconstruct(noisy, VolumeGrid.of(noisy), method="wbp", window="hann")
+    np.testing.assert_allclose(found.volume.attenuation, whole.volume.attenuation, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_fitted_blocks_differ_from_one_go_by_no_more_than_another_choice_of_held_out_pixels(scene, tmp_path):
+    _, noisy = scene
+    options = {"method": "l2", "weight": 0.5, "num_steps": 60}
+    whole, other, blocks = (
+        reconstruct_in_blocks(
+            noisy, VolumeGrid.of(noisy), tmp_path / f"{rows}-{seed}.npy", rows_at_once=rows, seed=seed, **options
+        ).volume.attenuation
+        for rows, seed in ((28, 0), (28, 1), (10, 0))
+    )
+    assert np.sqrt(np.mean((blocks - whole) ** 2)) < 1.5 * np.sqrt(np.mean((other - whole) ** 2))
+
+
+def test_command_streams_and_leaves_nothing_behind(scene, tmp_path, run, refused):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    command = ["reconstruct", tmp_path / "tilts.mrc", "-o", tmp_path / "v.mrc", "--method", "wbp", "--window", "hann"]
+    run(*command)
+    whole = mrcfile.read(tmp_path / "v.mrc")
+    run(*command, "--slices-at-once", 6)
+    np.testing.assert_allclose(mrcfile.read(tmp_path / "v.mrc"), whole, atol=1e-6)
+    assert {path.name for path in tmp_path.iterdir()} == {"tilts.mrc", "tilts.rawtlt", "v.mrc"}
+    command[command.index("wbp")] = "explicit"
+    assert "--slices-at-once" in refused(*command, "--slices-at-once", 6)
+
+
+@pytest.fixture
+def tall(tmp_path):
+    """A series of 14 MiB, of few columns, on the disk."""
+    generator = np.random.default_rng(0)
+    angles = np.arange(-60, 61, 8.0)
+    stack = np.exp(-generator.uniform(0, 1, (len(angles), 7000, 32)).astype(np.float32) / 4)
+    stack[:, :, 12:20] *= 0.5
+    write_tilt_series(tmp_path / "tall.mrc", TiltSeries(stack, angles))
+    return tmp_path / "tall.mrc"
+
+
+def test_command_holds_one_block_in_memory(tall, tmp_path, run):
+    """Neither images nor volume nor projections, of 14, 27 and 14 MiB, are ever whole in memory."""
+    command = ["reconstruct", tall, "-o", tmp_path / "v.npy", "--method", "sirt", "--steps", 2]
+    command += ["--slices-at-once", 7000 // 4]
+    peaks = []
+    for _ in range(2):  # imports count in the first run
+        tracemalloc.start()
+        run(*command)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 13 * 2**20
+
+
+def test_mapped_stack_is_left_on_the_disk_and_unchanged(scene, tmp_path):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    before = (tmp_path / "tilts.mrc").read_bytes()
+    mapped = read_tilt_series(tmp_path / "tilts.mrc", mapped=True)
+    np.testing.assert_array_equal(mapped.images, noisy.images)
+    mapped.images[0, 0, 0] = 7.0
+    assert (tmp_path / "tilts.mrc").read_bytes() == before
+    for name in ("one.npy", "one.mrc"):
+        io.write(tmp_path / name, noisy.images)
+        assert isinstance(io.read(tmp_path / name, mapped=True).data, np.memmap)
+        assert not isinstance(io.read(tmp_path / name).data, np.memmap)

@@ -1,0 +1,141 @@
+"""Raw series, rotated and shifted by known amounts, are aligned to a fraction of a pixel."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from recon.series.alignment import Alignment
+from recon.series.alignment_search import find_alignment
+from recon.series.tilt_series import TiltSeries, read_tilt_series
+
+ANGLES = np.arange(-60, 61, 4.0)
+
+
+def blobs(axis, shifts, *, shape=(40, 40), noise=0.05, mode="linear", seed=0):
+    """Projections of Gaussian blobs, exactly, as a microscope with this axis (degrees) and these shifts (y, x) sees them."""
+    generator = np.random.default_rng(seed)
+    centres = generator.uniform(-0.28, 0.28, (14, 3)) * min(shape)  # z, y, x
+    widths = generator.uniform(1.2, 2.5, 14)
+    theta, axis = np.deg2rad(ANGLES), np.deg2rad(axis)
+    rows, columns = (np.arange(size) - (size - 1) / 2 for size in shape)
+    images = np.zeros((len(ANGLES), *shape))
+    for (z, y, x), width in zip(centres, widths, strict=True):
+        u = x * np.cos(theta) + z * np.sin(theta)
+        down = y * np.cos(axis) + u * np.sin(axis) + shifts[:, 0]
+        across = u * np.cos(axis) - y * np.sin(axis) + shifts[:, 1]
+        squares = (rows - down[:, None])[:, :, None] ** 2 + (columns - across[:, None])[:, None, :] ** 2
+        images += np.exp(-squares / (2 * width**2))
+    if mode == "transmission":
+        images = 100 * np.exp(-images / images.max())
+        noise *= 30
+    images += noise * generator.normal(size=images.shape)
+    return TiltSeries(images.astype(np.float32), ANGLES, 2.0, mode)
+
+
+def shift_errors(found, axis, shifts):
+    """Root mean squares along and across the axis, without what only moves the object."""
+    axis, theta = np.deg2rad(axis), np.deg2rad(ANGLES)
+    error = found.shifts - shifts
+    along = error @ [np.cos(axis), -np.sin(axis)]
+    across = error @ [np.sin(axis), np.cos(axis)]
+    moves = np.stack([np.cos(theta), np.sin(theta)], 1)
+    across = across - moves @ np.linalg.lstsq(moves, across, rcond=None)[0]
+    return along.std(), np.sqrt(np.mean(across**2))
+
+
+def random_shifts(size=3.0, offset=(0.0, 2.5)):
+    return np.random.default_rng(5).uniform(-size, size, (len(ANGLES), 2)) + offset
+
+
+@pytest.mark.parametrize(
+    ("axis", "shape", "mode"),
+    [
+        (-79.0, (28, 28), "linear"),
+        pytest.param(4.0, (40, 40), "linear", marks=pytest.mark.slow),
+        pytest.param(-5.0, (48, 36), "transmission", marks=pytest.mark.slow),
+    ],
+)
+def test_shifts_axis_and_offset_are_found(axis, shape, mode):
+    shifts = random_shifts()
+    found = find_alignment(blobs(axis, shifts, shape=shape, mode=mode))
+    assert found.tilt_axis == pytest.approx(axis, abs=2.5)  # half a pixel at the edge of what is there
+    along, across = shift_errors(found, axis, shifts)
+    assert along < 0.2
+    assert across < 0.2
+
+
+@pytest.mark.slow
+def test_known_axis_is_kept_to_and_large_shifts_are_found():
+    shifts = random_shifts(8.0)
+    found = find_alignment(blobs(2.0, shifts, shape=(56, 56), seed=3), tilt_axis=0.0)
+    assert found.tilt_axis == pytest.approx(2.0, abs=1.0)
+    assert max(shift_errors(found, 2.0, shifts)) < 0.3
+
+
+def test_aligned_images_are_those_of_an_aligned_microscope():
+    shifts = random_shifts(2.0)
+    raw = blobs(5.0, shifts, noise=0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        aligned = Alignment(5.0, shifts, ANGLES).apply(raw)
+    wanted = blobs(0.0, np.zeros_like(shifts), noise=0.0)
+    error = np.abs(aligned.images - wanted.images)[aligned.used]
+    assert error.max() < 0.02 * wanted.images.max()
+    assert 0.7 < aligned.used.mean() < 1
+
+
+def test_quarter_turn_swaps_the_sides_and_keeps_the_readings():
+    images = np.random.default_rng(0).integers(0, 1000, (3, 5, 8), dtype=np.uint16)
+    series = TiltSeries(images, np.array([-10.0, 0.0, 10.0]), 1.0, "linear")
+    turned = Alignment(-90.0, np.zeros((3, 2)), series.tilt_angles).apply(series)
+    assert turned.images.dtype == np.uint16
+    assert turned.mask is None
+    np.testing.assert_array_equal(turned.images, np.rot90(images, -1, axes=(1, 2)))
+    same = Alignment(0.0, np.zeros((3, 2)), series.tilt_angles).apply(series)
+    np.testing.assert_array_equal(same.images, images)
+
+
+def test_axis_offset_is_told_apart_from_where_the_object_is():
+    theta = np.deg2rad(ANGLES)
+    across = 2.5 + 4 * np.cos(theta) - 7 * np.sin(theta)
+    assert Alignment(0.0, np.stack([0 * across, across], 1), ANGLES).axis_offset == pytest.approx(2.5)
+    assert Alignment(90.0, np.stack([across, 0 * across], 1), ANGLES).axis_offset == pytest.approx(2.5)
+
+
+def test_few_tilts_and_images_moved_out_of_view_are_refused():
+    series = TiltSeries(np.random.default_rng(0).random((4, 8, 8)), np.arange(4.0) * 5, mode="linear")
+    with pytest.raises(ValueError, match="too few"):
+        find_alignment(series)
+    with pytest.raises(ValueError, match="out of view"):
+        Alignment(0.0, np.full((4, 2), 9.0), series.tilt_angles).apply(series)
+    with pytest.raises(ValueError, match="do not belong"):
+        Alignment(0.0, np.zeros((3, 2)), series.tilt_angles).apply(series)
+
+
+def test_command_aligns_and_reports(tmp_path, run):
+    shifts = random_shifts(2.0)
+    np.save(tmp_path / "raw.npy", blobs(3.0, shifts, shape=(24, 24)).images)
+    np.savetxt(tmp_path / "raw.tlt", ANGLES)
+    command = ["reconstruct", tmp_path / "raw.npy", "-o", tmp_path / "v.npy", "--mode", "linear", "--method", "wbp"]
+    result = run(*command, "--refine-alignment", "--tilt-axis", 0, "--report", tmp_path / "report")
+    alignment = result["alignment"]
+    assert result["choices"]["tilt axis (°)"] == f"{alignment['tilt_axis_degrees']:.2f}"
+    assert len(alignment["shifts_yx_pixels"]) == len(ANGLES)
+    assert "axis offset (pixels)" in result["choices"]
+    assert "axis offset" in (tmp_path / "report" / "index.html").read_text()
+    only_turned = run(*command, "--tilt-axis", 90)
+    assert only_turned["alignment"]["tilt_axis_degrees"] == 90
+    assert run(*command)["alignment"] is None
+
+
+@pytest.mark.slow
+def test_raw_microscope_file_becomes_a_volume_in_one_command(tmp_path, run, data):
+    raw = data.parent.parent.parent / "shared" / "data" / "tilt_needle" / "needle_raw.dm3"
+    if not raw.exists():
+        pytest.skip("the raw series is not at hand")
+    options = ["--mode", "linear", "--refine-alignment", "--method", "sirt"]
+    result = run("reconstruct", raw, "-o", tmp_path / "volume.mrc", *options)
+    assert abs(result["alignment"]["tilt_axis_degrees"]) == pytest.approx(79.75, abs=0.7)
+    aligned = read_tilt_series(raw.with_name("needle_aligned.mrc"), mode="linear")
+    assert float(result["figures"]["residual rms"]) < 0.05 * aligned.images.std()

@@ -1,0 +1,121 @@
+"""Tilts that do not belong, and a beam that drifts, are found before the reconstruction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from recon.joint.joint import JointReconstructor
+from recon.methods.methods import Outcome
+from recon.metrics.metrics import compare
+from recon.projection.image_formation import Linear, Transmission
+from recon.report.page import reconstruction_report
+from recon.series.screening import screen
+from recon.series.tilt_series import Volume
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+ANGLES = np.arange(-60, 61, 3.0)
+
+
+def scene(noise="clipped", phantom="shells", size=48):
+    """Truth, clean series, and a function that draws its noise."""
+    density = make_phantom(phantom, size, generator=np.random.default_rng(0))
+    acquisition = ACQUISITIONS[noise]
+    clean, unit = clean_tilt_series(density, ANGLES, acquisition=acquisition)
+    return density * unit, clean, lambda series: add_noise(series, acquisition.noise(), seed=1)
+
+
+def changed(clean, tilt, how):
+    images = clean.images.copy()
+    images[tilt] = how(images)
+    return replace(clean, images=images)
+
+
+DAMAGES = {
+    "shifted": lambda images: np.roll(images[7], 6, 1),
+    "of another tilt": lambda images: images[30],
+    "shaded": lambda images: images[7] * np.linspace(0.1, 1, images.shape[2], dtype=np.float32),
+    "blank": lambda images: np.full_like(images[7], np.quantile(images, 0.9)),
+    "dark": lambda images: np.zeros_like(images[7]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("noise", ["clipped", "low-dose"])
+def test_a_tilt_that_does_not_belong_is_found(noise, damage):
+    _, clean, noisy = scene(noise)
+    found = screen(noisy(changed(clean, 7, DAMAGES[damage])))
+    assert np.flatnonzero(found.bad).tolist() == [7]
+
+
+@pytest.mark.parametrize("noise", ["clipped", "skewed", "outliers", "low-dose", "8-bit"])
+@pytest.mark.parametrize("phantom", ["shells", "filaments", "particles", "slab"])
+def test_good_series_loses_no_tilt_and_has_a_steady_beam(phantom, noise):
+    _, clean, noisy = scene(noise, phantom)
+    series = noisy(clean)
+    passed = screen(series).passed(series)
+    assert passed.num_tilts == series.num_tilts
+    assert passed.beam is None
+
+
+@pytest.mark.parametrize(("noise", "error"), [("gaussian", 0.01), ("low-dose", 0.04)])
+def test_drift_of_the_beam_is_estimated(noise, error):
+    _, clean, noisy = scene(noise)
+    beam = np.exp(0.1 * np.random.default_rng(2).normal(size=len(ANGLES)))
+    series = noisy(replace(clean, images=(clean.images * beam[:, None, None]).astype(np.float32)))
+    passed = screen(series).passed(series)
+    assert passed.num_tilts == series.num_tilts
+    assert np.std(np.log(passed.beam / beam)) < error
+
+
+@pytest.mark.slow
+def test_reconstruction_with_the_beam_is_nearly_as_good_as_without_drift():
+    truth, clean, noisy = scene("gaussian", size=32)
+    beam = np.exp(0.2 * np.random.default_rng(2).normal(size=len(ANGLES)))
+    drifting = noisy(replace(clean, images=(clean.images * beam[:, None, None]).astype(np.float32)))
+    passed = screen(drifting).passed(drifting)
+    psnr = {}
+    for name, series in {"steady": noisy(clean), "known": passed, "unknown": drifting}.items():
+        result = JointReconstructor(weight=0.5, num_steps=60, slab=8)(series)
+        psnr[name] = compare(result.volume.attenuation, truth).psnr
+    assert psnr["known"] > psnr["steady"] - 0.3
+    assert psnr["known"] > psnr["unknown"] + 0.3
+
+
+def test_linear_response_learns_the_beam_up_to_its_mean():
+    beam = torch.tensor([0.8, 1.0, 1.25])
+    response = Linear(2.0, offset=1.0, beam=beam)
+    rays = torch.rand(3, 4, 5)
+    torch.testing.assert_close(response.invert(response(rays)), rays)
+    torch.testing.assert_close(response(rays), 2 * beam[:, None, None] * rays + 1)
+    torch.testing.assert_close(Linear(2.0, offset=1.0, beam=3 * beam)(rays), response(rays))
+
+
+def test_intensity_and_offset_of_every_tilt_are_in_the_report(tmp_path):
+    response = Linear(2.0, offset=torch.tensor([1.0, 3.0]), beam=torch.tensor([0.5, 2.0]))
+    assert response.per_tilt(2) == {"relative intensity": pytest.approx([0.5, 2.0]), "offset": [1.0, 3.0]}
+    assert Transmission(4.0, offset=1.0).per_tilt(2) == {"intensity": pytest.approx([4.0, 4.0]), "offset": [1.0, 1.0]}
+    _, clean, _ = scene(size=16)
+    volume, steady = Volume(np.zeros((16, 16, 16), np.float32)), [0.0] * clean.num_tilts
+    for changing, found in ((steady, False), (np.linspace(1, 2, clean.num_tilts).tolist(), True)):
+        outcome = Outcome(volume, clean.images, "l2", None, None, {}, {}, {"intensity": changing, "offset": steady})
+        page = reconstruction_report(clean, outcome, []).save(tmp_path / "page.html")
+        assert ("Beam and detector" in page.read_text(encoding="utf-8")) is found
+
+
+def test_command_leaves_the_tilt_out_and_says_so(tmp_path, run):
+    _, clean, noisy = scene(size=32)
+    series = noisy(changed(clean, 7, DAMAGES["shifted"]))
+    np.save(tmp_path / "tilts.npy", series.images)
+    np.savetxt(tmp_path / "tilts.tlt", ANGLES)
+    command = ["reconstruct", tmp_path / "tilts.npy", "-o", tmp_path / "volume.npy", "--method", "wbp"]
+    result = run(*command, "--report", tmp_path / "report")
+    assert any("-39°" in warning for warning in result["warnings"])
+    assert result["choices"]["tilts left out"] == "1"
+    assert [i for i, bad in enumerate(result["screening"]["bad"]) if bad] == [7]
+    assert "tilts left out" in (tmp_path / "report" / "index.html").read_text()
+    kept = run(*command, "--keep-tilts")
+    assert any("kept" in warning for warning in kept["warnings"])
+    assert kept["figures"]["tilts"].startswith("41")
