@@ -13,10 +13,11 @@ from noiseflow.fitting.loop import FitResult
 from recon.benchmarks.scenes import make_scene
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
+from recon.joint import half_resolution
 from recon.joint.alternation import Alternation
 from recon.joint.checkpoint import Journal
 from recon.joint.half_resolution import HalfResolution
-from recon.joint.joint import JointReconstructor, half_resolution
+from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import with_defocus

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from noiseflow import RadialFlow, fit
-from recon.commands import cli
+from recon.commands.reconstruct import reconstruct as reconstruct_command
 from recon.methods import methods
 from recon.methods.classical import best_num_iterations, best_window
 from recon.methods.kniesel2022.presets import PRESETS
@@ -85,7 +85,7 @@ def test_a_method_is_one_registered_function(scene, monkeypatch):
 
 
 def test_help_names_every_method():
-    text = cli.reconstruct.__annotations__["method"]
+    text = reconstruct_command.__annotations__["method"]
     assert all(name in text for name in set(methods.METHODS) - set(PRESETS))
 
 
