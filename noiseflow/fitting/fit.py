@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from noiseflow.arrays import as_tensor
 from noiseflow.distributions.picked import needs_image
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixels import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
@@ -40,12 +42,15 @@ def fit(
     noise_interval: int = 10,
     noise_steps: int = 10,
     standardise: bool = True,
+    train_noise: bool = True,
     tabulate: bool = True,
     generator: torch.Generator | None = None,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
     checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
+    parameter_groups: Sequence[dict[str, Any]] | None = None,
+    tables: TableKeeper | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
 
@@ -70,12 +75,15 @@ def fit(
             as far, which a rough start gains from and a good one is lost to.
         noise_interval, noise_steps: in a joint fit, this many noise-model steps after every so many signal steps.
         standardise: measure the data's scaling first and store it in the noise model.
+        train_noise: whether the noise model learns; otherwise it stays as it is.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
         progress: called with the steps done and a note.
         checkpoint: called at every look at the held-out pixels, and on Ctrl-C, with all that `resume` needs.
         checkpoint_interval: call it after a step every so many seconds instead.
-        resume: a state that `checkpoint` was given; the fit goes on from there.
+        resume: a state that `checkpoint` was given; the fit continues from there.
+        parameter_groups: of the signal model with their learning rates, in place of its own ``parameter_groups()``.
+        tables: keeps the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
         The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
@@ -107,8 +115,13 @@ def fit(
         )
     choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
     pixels = choose(_as_floating(observation), use, held_out, _own_generator(generator))
-    loop = FitLoop(noise_model, signal_model, pixels, FitResult(noise_model, digitisation))
-    loop.prepare(num_steps, learning_rate, standardise and resume is None)
+    loop = FitLoop(noise_model, signal_model, pixels, FitResult(noise_model, digitisation), tables)
+    loop.prepare(
+        learning_rate,
+        standardise=standardise and resume is None,
+        train_noise=train_noise,
+        parameter_groups=parameter_groups,
+    )
     if resume is not None:
         loop.load_state(resume)
     schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
