@@ -23,7 +23,7 @@ from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
 from recon.joint.run import Progress, RunFit, Runner, run_fit
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task, block_mask
+from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.weight import WeightChoice
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.image_formation import Linear
@@ -37,6 +37,7 @@ _FIRST_WEIGHT = 0.4
 _HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2  # of the pixels: those of a slab are few to tell weights apart
 _SLAB, _SLAB_VOXELS = 24, 24 * 96**2  # slices; where they are small, as many as have so many voxels tell weights apart
 _NEARLY_WHOLE = 0.75  # share of the slices; a slab of more is made the whole, and its fit goes on
+_QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 _WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
 
 
@@ -192,13 +193,15 @@ class JointReconstructor:
     def _facts(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[Facts, slice, nn.Module | None]:
         """What is known before any fit, the slices that choices are made on, and the noise model that was given."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
+        quiet = given is None and noise_share(tilt_series.images) < _QUIET
         rows = contrast_slab(tilt_series, self._num_slices(whole.field))
         if rows.stop - rows.start >= _NEARLY_WHOLE * whole.field.height:
             rows = slice(0, whole.field.height)
         facts = Facts(
-            choose_noise=given is None,
+            choose_noise=given is None and not quiet,
             learn_noise=given is None or learns(given),
-            simple_is_final=isinstance(given, Gaussian),
+            simple_is_final=quiet or isinstance(given, Gaussian),
+            quiet=quiet,
             choose_weight=self.weight is None,
             whole_slab=rows.stop - rows.start == whole.field.height,
             can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),
@@ -210,14 +213,18 @@ class JointReconstructor:
         """A run whose choices are made."""
         facts, rows, given = self._facts(tilt_series, whole)
         simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
-        models = {"simple": simple, "chosen": simple if given is None else given}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             candidates = noise_candidates(tilt_series.images, quiet=facts.quiet) if given is None else []
+        if facts.quiet:
+            simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
+        models = {"simple": simple, "chosen": simple if given is None else given}
         part = whole if facts.whole_slab else self._part(whole, rows)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
+        if facts.quiet:
+            to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
         tasks = {"slab": to_choose, "whole": to_choose}
-        if not facts.whole_slab:
+        if facts.quiet or not facts.whole_slab:
             tasks["whole"] = self._task(whole, tilt_series, share=_HELD_OUT)
         run = _Run(self, facts, tasks, models, candidates, progress)
         run.choose()
@@ -290,7 +297,8 @@ class _Run:
     @property
     def noise_model(self) -> nn.Module:
         """The noise model of choice."""
-        return self.runner.models["simple" if self.facts.simple_is_final else "chosen"]
+        simple = self.facts.simple_is_final and not self.facts.quiet
+        return self.runner.models["simple" if simple else "chosen"]
 
     def choose(self) -> None:
         """The stages on the slab; the whole volume starts from the response found there."""

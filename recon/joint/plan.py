@@ -26,7 +26,10 @@ class Facts:
         can_halve: whether the field has a voxel grid half as fine that is worth using.
         hidden_offset: whether no vacuum shows the offset of a linear response.
         settled: whether noise model, weight and response are known from other slices of the same series.
-        quiet: whether noise is small beside the contrast: then most of what a fit leaves is misfit, not noise.
+        quiet: whether the noise model is chosen, and noise is small beside the contrast: most of what a fit leaves is then
+            misfit, which a width that follows the signal would excuse where it is bright. The volume is fitted by least squares,
+            weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and the noise model describes
+            what is left.
     """
 
     choose_noise: bool = True
@@ -53,6 +56,7 @@ class Schedule:
         trial: signal steps that compare weights, from a state fitted at the first one.
         whole: signal steps of the volume from a coarse start, unless the user gives their number.
         polish: the same where the slab was the whole volume.
+        quiet: the same where noise is small: there is more to fit.
         later_rate: learning rate of a signal that is not a rough start, relative to one that is: the first steps of Adam are as
             large where little is left.
         offset_rate: factor on the rate of an offset that no vacuum shows, from a rough start.
@@ -65,6 +69,7 @@ class Schedule:
     trial: int = 30
     whole: int = 100
     polish: int = 40
+    quiet: int = 240
     later_rate: float = 0.5
     offset_rate: float = 4.0
 
@@ -100,6 +105,9 @@ class FitStage:
     fits: int = 1
 
 
+_START = (
+    10  # steps of a noise model that is measured rather than fitted: of one parameter, or one width at every signal
+)
 _TRIALS, _CANDIDATES = 5, 2  # fits that these stages usually make, for the progress bar
 
 
@@ -114,16 +122,21 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     schedule = Schedule() if schedule is None else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
     stages = _on_the_slab(facts, schedule) if choosing else []
+    if not choosing and not facts.settled:
+        stages.append(FitStage("start noise", "noise", "whole", "simple", _START, standardise=True))
     warm = choosing and facts.whole_slab
-    usual = schedule.polish if warm else schedule.whole
-    return stages + _on_the_whole(facts, schedule, usual if num_steps is None else num_steps, warm=warm)
+    usual = schedule.quiet if facts.quiet else schedule.polish if warm else schedule.whole
+    stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps, warm=warm)
+    if facts.quiet and not facts.settled:
+        stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.refine, standardise=True))
+    return stages
 
 
 def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
     hasten = schedule.offset_rate if facts.hidden_offset else 1.0
     stages = [
-        FitStage("start noise", "noise", "slab", "simple", 10, standardise=True),
+        FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
         FitStage("settle", "signal", "slab", "simple", schedule.settle, offset_rate=hasten),
     ]
     if facts.choose_noise:
@@ -146,7 +159,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: boo
     later, left, stages = schedule.later_rate, num_steps, []
     if not warm:
         hasten = schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0
-        begin = num_steps // 4
+        begin = num_steps // 4  # the simple noise pulls at a rough signal steadily
         if begin:
             stages.append(
                 FitStage("begin", "signal", "whole", "simple", begin, half=facts.can_halve, offset_rate=hasten)
@@ -157,7 +170,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: boo
             left -= begin
     if not facts.learn_noise or facts.settled or left < 2:
         return [*stages, FitStage("fit", "signal", "whole", noise, left, rate=later)]
-    last = left // 3
+    last = max(1, left // 3)
     return [
         *stages,
         FitStage("fit", "signal", "whole", noise, left - last, rate=later),
@@ -169,3 +182,19 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: boo
 def total_steps(stages: Sequence[FitStage]) -> int:
     """Steps of all fits that a plan expects."""
     return sum(stage.num_steps * stage.fits for stage in stages)
+
+
+def describe(stages: Sequence[FitStage]) -> str:
+    """A plan as lines of text: where, name, kind, steps, and how."""
+    lines = []
+    for stage in stages:
+        steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
+        how = [stage.noise]
+        if stage.kind in ("signal", "weights"):
+            how.append(f"rate {stage.rate:g}")
+        if stage.offset_rate != 1:
+            how.append(f"offset x {stage.offset_rate:g}")
+        if stage.half:
+            how.append("half resolution")
+        lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")
+    return "\n".join(lines)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.fitting.observation_table import TableKeeper
@@ -51,6 +55,34 @@ class Task:
         use = None if self.use is None else half.pixels(self.use)
         yield Task(half.signal_model, half.pixels(self.observation), use, half.pixels(self.held_out))
         half.hand_over()
+
+
+def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
+    """Pixels (tilt, u, y) to hold out, shaped like a mask: all of two contiguous gaps of tilts, a third of the range apart, each
+    a tenth of the range and three tilts wide at least. Tilts between neighbours would be given away by them."""
+    order = np.argsort(tilt_angles, kind="stable")
+    span = tilt_angles[order[-1]] - tilt_angles[order[0]]
+    held_out = torch.zeros_like(like)
+    for middle in (tilt_angles[order[0]] + span / 3, tilt_angles[order[0]] + 2 * span / 3):
+        distance = np.abs(tilt_angles - middle)
+        near = distance <= max(span / 20, float(np.sort(distance)[min(2, len(order) - 1)]))
+        held_out[torch.from_numpy(near).to(like.device)] = True
+    return held_out
+
+
+def noise_share(images: NDArray[Any]) -> float:
+    """Noise of single pixels relative to the contrast: the mean size of a second difference along both axes, which smooth
+    structure hardly has, over the standard deviation of the images (Immerkær 1996, doi:10.1006/cviu.1996.0060).
+
+    Args:
+        images: (tilt, y, u) pixel values; about sixteen of them are looked at.
+    """
+    some = np.asarray(images[:: max(1, len(images) // 16)], dtype=np.float32)
+    if min(some.shape[1:]) < 3 or not some.std() > 0:
+        return math.inf
+    second = some[:, 2:] - 2 * some[:, 1:-1] + some[:, :-2]
+    second = second[:, :, 2:] - 2 * second[:, :, 1:-1] + second[:, :, :-2]
+    return math.sqrt(math.pi / 2) / 6 * float(np.abs(second).mean() / some.std())
 
 
 def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
