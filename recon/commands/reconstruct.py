@@ -103,6 +103,10 @@ def reconstruct(
     reference: Annotated[
         Path | None, typer.Option(help="Volume that the report correlates the result with, where --fsc is not given.")
     ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Print the plan with its memory and expected time, and stop before fitting."),
+    ] = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -158,7 +162,11 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        output.line(memory_line(tilt_series, grid, method, chosen_device, slices_at_once))
+        memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once)
+        output.line(memory)
+        if dry_run:
+            _show_plan(tilt_series, grid, options, memory, output)
+            return
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
         with stoppable(journal, context), scratch_beside(out) as scratch:
@@ -199,6 +207,29 @@ def _solve(
     halves = zip(("even tilts: ", "odd tilts: "), even_odd(tilt_series), strict=True)
     first, second = (reconstruct(half, grid, **options, prefix=prefix).volume for prefix, half in halves)
     return outcome, (first, second)
+
+
+def _show_plan(tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], memory: str, output: Output) -> None:
+    """What would be done, in words and for programs."""
+    from dataclasses import asdict
+
+    from recon.joint.plan import describe
+    from recon.methods import find_method, settings_of
+    from recon.scale.cost import expected_seconds
+
+    method = find_method(options["method"])
+    result: dict[str, Any] = {"method": method.name, "memory": memory, "stages": [], "expected_seconds": None}
+    if method.plan is None:
+        output.line(f"{method.name}: {method.description} It has no stages to plan.")
+    else:
+        made = {name: value for name, value in options.items() if name != "method"}
+        stages, slab = method.plan(tilt_series, grid, settings_of(method.name, **made))
+        seconds = expected_seconds(stages, tilt_series, grid, slab)
+        output.line(f"slab: {slab} of {grid.height} slices")
+        output.line(describe(stages))
+        output.line(f"expected: about {seconds:.0f} s on this machine")
+        result |= {"stages": [asdict(stage) for stage in stages], "expected_seconds": seconds}
+    output.result(result)
 
 
 def _settings(

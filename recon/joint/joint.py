@@ -146,11 +146,11 @@ class JointReconstructor:
         run.weight_choice = settled.weight_choice
         return self._finish(run, tilt_series, grid)
 
-    def stages(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> list[FitStage]:
-        """The plan for a series; arguments as of a call."""
+    def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int]:
+        """The stages for a series, and the slices of the slab that choices are made on; arguments as of a call."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
-        facts, _, _ = self._facts(tilt_series, self.signal_model(tilt_series, grid))
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule)
+        facts, rows, _ = self._facts(tilt_series, self.signal_model(tilt_series, grid))
+        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start
 
     def signal_model(
         self, tilt_series: TiltSeries, grid: VolumeGrid, settled: Settled | None = None
@@ -202,6 +202,7 @@ class JointReconstructor:
             learn_noise=given is None or learns(given),
             simple_is_final=quiet or isinstance(given, Gaussian),
             quiet=quiet,
+            hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
             whole_slab=rows.stop - rows.start == whole.field.height,
             can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),

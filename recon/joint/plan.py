@@ -30,6 +30,8 @@ class Facts:
             misfit, which a width that follows the signal would excuse where it is bright. The volume is fitted by least squares,
             weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and the noise model describes
             what is left.
+        hold_offset: whether the offset of a linear response stays as the coarse reconstruction found it: without noise, a haze
+            over a lower offset looks as good as vacuum to least squares, and absorbs misfit.
     """
 
     choose_noise: bool = True
@@ -41,6 +43,7 @@ class Facts:
     hidden_offset: bool = False
     settled: bool = False
     quiet: bool = False
+    hold_offset: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,8 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
 
 def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    hasten = schedule.offset_rate if facts.hidden_offset else 1.0
+    usual = 0.0 if facts.hold_offset else 1.0
+    hasten = usual * (schedule.offset_rate if facts.hidden_offset else 1.0)
     stages = [
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
         FitStage("settle", "signal", "slab", "simple", schedule.settle, offset_rate=hasten),
@@ -144,11 +148,15 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
     later = schedule.later_rate
-    stages.append(FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later))
+    stages.append(FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later, offset_rate=usual))
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        stages.append(FitStage("choose weight", "weights", "slab", noise, schedule.trial, rate=later, fits=_TRIALS))
+        stages.append(
+            FitStage(
+                "choose weight", "weights", "slab", noise, schedule.trial, rate=later, offset_rate=usual, fits=_TRIALS
+            )
+        )
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -156,9 +164,10 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
 
 def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: bool) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    later, left, stages = schedule.later_rate, num_steps, []
+    later, left, stages = schedule.later_rate, num_steps, list[FitStage]()
+    usual = 0.0 if facts.hold_offset else 1.0
     if not warm:
-        hasten = schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0
+        hasten = usual * (schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0)
         begin = num_steps // 4  # the simple noise pulls at a rough signal steadily
         if begin:
             stages.append(
@@ -166,16 +175,16 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: boo
             )
             left -= begin
         if begin and facts.can_halve:
-            stages.append(FitStage("coarse", "signal", "whole", noise, begin, rate=later, half=True))
+            stages.append(FitStage("coarse", "signal", "whole", noise, begin, rate=later, offset_rate=usual, half=True))
             left -= begin
     if not facts.learn_noise or facts.settled or left < 2:
-        return [*stages, FitStage("fit", "signal", "whole", noise, left, rate=later)]
+        return [*stages, FitStage("fit", "signal", "whole", noise, left, rate=later, offset_rate=usual)]
     last = max(1, left // 3)
     return [
         *stages,
-        FitStage("fit", "signal", "whole", noise, left - last, rate=later),
+        FitStage("fit", "signal", "whole", noise, left - last, rate=later, offset_rate=usual),
         FitStage("refine noise on the volume", "noise", "whole", noise, schedule.refine),
-        FitStage("finish", "signal", "whole", noise, last, rate=later / 2),
+        FitStage("finish", "signal", "whole", noise, last, rate=later / 2, offset_rate=usual),
     ]
 
 
@@ -189,11 +198,11 @@ def describe(stages: Sequence[FitStage]) -> str:
     lines = []
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
-        how = [stage.noise]
+        how: list[str] = [stage.noise]
         if stage.kind in ("signal", "weights"):
             how.append(f"rate {stage.rate:g}")
-        if stage.offset_rate != 1:
-            how.append(f"offset x {stage.offset_rate:g}")
+        if stage.offset_rate != 1 and stage.kind in ("signal", "weights"):
+            how.append(f"offset x {stage.offset_rate:g}" if stage.offset_rate else "offset held")
         if stage.half:
             how.append("half resolution")
         lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")

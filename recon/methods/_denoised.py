@@ -29,4 +29,6 @@ def after_denoising(name: str, description: str, method: Method) -> Method:
         result = method.run(replace(tilt_series, images=cleaned.value.numpy()), grid, settings)
         return replace(result, method=name, choices={"denoiser": settings.denoiser, **result.choices})
 
-    return replace(method, name=name, description=description, run=run, keeps_noise_model=True, blockwise=None)
+    return replace(
+        method, name=name, description=description, run=run, keeps_noise_model=True, plan=None, blockwise=None
+    )

@@ -10,6 +10,7 @@ from torch import nn
 
 from noiseflow import Digitisation, Digitised
 from recon.joint.joint import JointReconstructor
+from recon.joint.plan import FitStage
 from recon.joint.signal_model import TomographySignal
 from recon.methods._registry import Finish, Method, Settings
 from recon.projection.defocused_projector import DefocusedProjector
@@ -34,6 +35,9 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         result = reconstructor(settings, options)(tilt_series, grid, progress=settings.progress)
         return replace(result, method=name, choices=_choices(result, settings, tilt_series))
 
+    def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int]:
+        return reconstructor(settings, options).plan(tilt_series, grid)
+
     def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[Solve, Finish]:
         fit = reconstructor(settings, options)
         settled = fit.settle(tilt_series, grid, progress=settings.progress)
@@ -55,7 +59,16 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
 
         return solve, finish
 
-    return Method(name, description, run, True, keeps_noise_model, True, blockwise)
+    return Method(
+        name,
+        description,
+        run,
+        fitted=True,
+        keeps_noise_model=keeps_noise_model,
+        learns_noise=True,
+        plan=make_plan,
+        blockwise=blockwise,
+    )
 
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:

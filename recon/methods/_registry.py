@@ -17,6 +17,7 @@ from torch import nn
 
 from noiseflow.described import described
 from noiseflow.kept_memory import kept_memory
+from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.projection.wbp import WINDOWS
@@ -75,6 +76,7 @@ class Settings:
 
 
 Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
+MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], int]]
 Finish = Callable[[Volume, Images], Reconstruction]
 Blockwise = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, Finish]]
 
@@ -90,6 +92,7 @@ class Method:
         fitted: whether it fits a volume, and so knows ``weight``, ``defocus`` and what a fit takes of memory.
         keeps_noise_model: whether it takes a calibrated noise model; another refuses one.
         learns_noise: whether its result has a noise model.
+        plan: the stages of its fit, and the slices of the slab that choices are made on; None where nothing is planned.
         blockwise: settles what all slices share, and returns what reconstructs some of them and what makes the result of all
             their volumes and projections; None where slices cannot be reconstructed apart.
     """
@@ -100,6 +103,7 @@ class Method:
     fitted: bool = False
     keeps_noise_model: bool = False
     learns_noise: bool = False
+    plan: MakePlan | None = None
     blockwise: Blockwise | None = None
 
 

@@ -43,7 +43,7 @@ def test_progress_counts_up_to_the_steps_that_are_expected(scene):
     fit(scene[2], progress=lambda done, total, note: seen.append((done, total)))
     done, total = zip(*seen, strict=True)
     assert list(done) == sorted(done)
-    assert done[-1] == total[-1] == total_steps(fit.stages(scene[2]))
+    assert done[-1] == total[-1] == total_steps(fit.plan(scene[2])[0])
 
 
 def test_signal_model_keeps_its_contract():

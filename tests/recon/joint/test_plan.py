@@ -79,20 +79,20 @@ PLANS = {
         """,
     ),
     "quiet": (
-        Facts(choose_noise=False, simple_is_final=True, quiet=True, can_halve=True),
+        Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, can_halve=True),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      40  simple, rate 1, offset held
         slab   learn noise                  noise       60  simple
-        slab   adapt                        signal      30  simple, rate 0.5
+        slab   adapt                        signal      30  simple, rate 0.5, offset held
         slab   refine noise                 noise       60  simple
-        slab   choose weight                weights     30 x 5  simple, rate 0.5
+        slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held
         slab   refine noise at the weight   noise       60  simple
-        whole  begin                        signal      60  simple, rate 1, half resolution
-        whole  coarse                       signal      60  simple, rate 0.5, half resolution
-        whole  fit                          signal      80  simple, rate 0.5
+        whole  begin                        signal      60  simple, rate 1, offset held, half resolution
+        whole  coarse                       signal      60  simple, rate 0.5, offset held, half resolution
+        whole  fit                          signal      80  simple, rate 0.5, offset held
         whole  refine noise on the volume   noise       60  simple
-        whole  finish                       signal      40  simple, rate 0.25
+        whole  finish                       signal      40  simple, rate 0.25, offset held
         whole  describe noise               noise       60  chosen
         """,
     ),
@@ -144,7 +144,7 @@ def test_what_is_done_is_what_was_planned(clipped, options):
         return result
 
     fit = JointReconstructor(run_fit=run_fit, **options)
-    planned = fit.stages(clipped)
+    planned, _ = fit.plan(clipped)
     fit(clipped)
     signal = [(s.name, s.num_steps) for s in planned if s.kind == "signal"]
     assert [step for step in done if "choose weight" not in step[0]] == signal
@@ -155,8 +155,8 @@ def test_little_noise_is_seen_before_any_fit(clipped):
     ramp = np.linspace(0, 1, 20, dtype=np.float32)
     smooth = TiltSeries(ramp + ramp[:, None] * np.ones((9, 1, 1), np.float32), np.arange(9) * 10.0, mode="linear")
     fit = JointReconstructor()
-    assert "describe noise" in [s.name for s in fit.stages(smooth)]
-    assert "choose noise" in [s.name for s in fit.stages(clipped)]
+    assert "describe noise" in [s.name for s in fit.plan(smooth)[0]]
+    assert "choose noise" in [s.name for s in fit.plan(clipped)[0]]
 
 
 def test_stages_are_values():
