@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -59,6 +59,17 @@ def alike(result: Tensor | NDArray[Any], given: Given) -> Given:
     if isinstance(given, Tensor):
         return result if isinstance(result, Tensor) else torch.from_numpy(result).to(given.device)
     return result.detach().cpu().numpy() if isinstance(result, Tensor) else result
+
+
+def is_array(data: Any) -> bool:
+    """Whether this is an array, and not a tensor."""
+    return isinstance(data, np.ndarray)
+
+
+def on_arrays(model: Callable[[Tensor], Any], signal: Any, device: torch.device) -> ArrayDistribution:
+    """The distribution of an array of signals under a noise model that lives on a device."""
+    pixels = floating(signal).to(device)
+    return ArrayDistribution(model(pixels), pixels)
 
 
 class ArrayDistribution:

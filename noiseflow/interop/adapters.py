@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from noiseflow.fitting.fit import fit
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics.evaluation import kl_divergence
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.mixture import MixtureDistribution
 
@@ -115,7 +115,7 @@ def _fitted_range(model: nn.Module) -> tuple[float, float]:
     )
 
 
-class PolynomialMixture(ArrayModel):
+class PolynomialMixture(NoiseModelBase):
     """The noise model of PN2V (Prakash et al. 2020, arXiv:1911.12291) as CAREamics evaluates it.
 
     With t the signal from 0 at `low` to 1 at `high`: the variances are Σ exp(a_i)·tⁱ, the log-weights Σ b_i·tⁱ before they are
@@ -130,7 +130,7 @@ class PolynomialMixture(ArrayModel):
 
     def __init__(self, low: float, high: float, num_gaussians: int, num_coefficients: int) -> None:
         super().__init__()
-        self.low, self.high = low, high
+        self.range = low, high
         place = torch.linspace(-1, 1, num_gaussians) if num_gaussians > 1 else torch.zeros(1)
         raw = torch.zeros(3, num_gaussians, num_coefficients)
         raw[0, :, 0], raw[1, :, 0], raw[1, :, 1:], raw[2, :, 0] = place, -0.5, -3.0, -place.abs()
@@ -146,7 +146,8 @@ class PolynomialMixture(ArrayModel):
 
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``."""
-        t = ((signal - self.low) / (self.high - self.low))[..., None, None]
+        low, high = self.range
+        t = ((signal - low) / (high - low))[..., None, None]
         powers = t ** torch.arange(self.raw.shape[-1], device=signal.device)
         centre, log_weight = ((self.raw[row] * powers).sum(-1) for row in (0, 2))
         variance = (torch.exp(self.raw[1]) * powers).sum(-1).clamp(min=_LEAST_VARIANCE)
@@ -162,7 +163,7 @@ class PolynomialMixture(ArrayModel):
         rows = [scale * centre, log_variance + 2 * torch.log(scale), log_weight]
         return {
             "trained_weight": torch.cat(rows).float().numpy(),
-            "min_signal": np.float32(self.low),
-            "max_signal": np.float32(self.high),
+            "min_signal": np.float32(self.range[0]),
+            "max_signal": np.float32(self.range[1]),
             "min_sigma": np.float32(_LEAST_VARIANCE * float(scale) ** 2),
         }
