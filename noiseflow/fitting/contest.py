@@ -21,7 +21,9 @@ _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times what the long fit still gains on the short one
 _SHARE_FROM_MAXIMUM = 0.1  # of the steps, for a model that starts at its most likely parameters
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; a slower pace needs ten more of them
-_STILL_FAR = 1.5  # times what the round before gained: at twice the rate, a model that has far to go gains twice as much
+_STILL_FAR = (
+    1.5  # times what the round before gained: at twice the rate, a model that has far to go gains twice as much
+)
 _SETTLED = (
     5e-4  # nats per pixel gained in the second half of a fit, whose rates are small; a tenth of the path lies there
 )

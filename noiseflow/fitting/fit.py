@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import as_tensor
+from noiseflow.arrays import as_tensor, is_array, unmasked
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
 from noiseflow.fitting.pixels import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal
+from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
 from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
@@ -58,9 +58,9 @@ def fit(
             trainable parameters stays as it is.
         signal: clean signals, a tensor or an array shaped like `observation`, or a `SignalModel`. A trainable one may offer
             ``parameter_groups()``, parameter groups with their learning rates for Adam.
-        observation: noisy readings, a tensor or an array of any shape and real type, detector units; for models that look
+        observation: noisy images, a tensor or an array of any shape and real type, detector units; for models that look
             beyond single pixels, images (..., y, x).
-        mask: pixels to use, shaped like `observation`; all by default.
+        mask: pixels to use, shaped like `observation`; all by default. What a masked array masks is left out besides.
         skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
         digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
             model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
@@ -84,20 +84,25 @@ def fit(
         The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, or no finite step could be made.
+        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, a signal model that gives other
+            shapes than `SignalModel` says, or no finite step could be made.
     """
     if not 0 <= warm_up < 1:
         raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
-    if isinstance(signal, np.ndarray):
-        signal = as_tensor(signal)
+    (signal, observation), kept = unmasked(signal, observation)
+    signal = as_tensor(signal) if is_array(signal) else signal
     observation = as_tensor(observation)
     mask = mask if mask is None else as_tensor(mask)
-    held_out = as_tensor(held_out) if isinstance(held_out, np.ndarray) else held_out
+    held_out = held_out if isinstance(held_out, float | int) else as_tensor(held_out)
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
         )
     signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
+    check_signal_model(signal_model, observation.numel())
+    if kept is not None:
+        kept = kept.to(observation.device).reshape(observation.shape)
+        mask = kept if mask is None else mask.reshape(observation.shape).bool() & kept
     use = _usable(signal_model, observation, mask, skip_non_finite)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     if digitise and model.learns and not model.describes_single_readings:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import as_tensor
+from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
 from noiseflow.fitting.contest import Contest, Progress, mean_and_error
 from noiseflow.fitting.judged_pixels import JudgedPixels
@@ -163,6 +163,8 @@ def select(
     if not models:
         raise ValueError("there are no candidates; give noise models by name, simplest first")
     wrapped = {name: as_noise_model(model) for name, model in models.items()}
+    (signal, observation), kept = unmasked(signal, observation)
+    mask = kept if mask is None else mask if kept is None else as_tensor(mask).reshape(-1).bool().cpu() & kept
     pixels = JudgedPixels.of(
         as_tensor(signal), as_tensor(observation), list(wrapped.values()), mask, held_out, blocks, seed
     )

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.arrays import is_array, on_arrays
+from noiseflow.array_distribution import distribution_of_array
+from noiseflow.arrays import is_array
 from noiseflow.distributions.base import NoiseDistribution
 
 
@@ -58,8 +59,10 @@ class NoiseModelBase(Described, ABC):
         """
 
     def __call__(self, signal: Any) -> Any:
-        """As `forward`; arrays are taken too, and the distribution then takes and gives arrays of their kind."""
-        return on_arrays(super().__call__, signal, self.device) if is_array(signal) else super().__call__(signal)
+        """As `forward`; numbers and arrays of any library are taken too, and the distribution then takes and gives arrays."""
+        if is_array(signal):
+            return distribution_of_array(self, signal, needs_image=self.needs_image)
+        return super().__call__(signal)
 
     # What the model looks at
 
