@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,8 @@ class ArrayDistribution:
         bare, mask = [], self._mask
         for value in values:
             _, numbers, masked = _taken_apart(value)
-            numbers = np.asarray(numbers) if masked is None else np.where(masked, np.nan, np.asarray(numbers, float))
+            if masked is not None:
+                numbers = np.where(masked, np.nan, np.asarray(numbers, float))
             bare.append(as_tensor(numbers, like=self._like))
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():
@@ -118,24 +120,20 @@ class LazyDistribution(ArrayDistribution):
         return f"LazyDistribution({type(self._model).__name__} of {' x '.join(map(str, self._signal.shape))} pixels)"
 
     def _ask(self, name: str, *values: Any) -> Any:
-        import dask.array
-
-        lazy = [dask.array.asanyarray(_taken_apart(value)[1]) for value in values]
-        lazy = [dask.array.broadcast_to(each, self._signal.shape).rechunk(self._signal.chunks) for each in lazy]
-        blocks = dask.array.map_blocks(partial(_ask_block, self._model, name), self._signal, *lazy, **self._numbers())
+        dask = import_module("dask.array")
+        lazy = [dask.asanyarray(_taken_apart(value)[1]) for value in values]
+        lazy = [dask.broadcast_to(each, self._signal.shape).rechunk(self._signal.chunks) for each in lazy]
+        blocks = dask.map_blocks(partial(_ask_block, self._model, name), self._signal, *lazy, **self._numbers())
         return self._wrap(blocks)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Any:
-        import dask.array
-
+        dask = import_module("dask.array")
         seed = int(torch.randint(2**62, (), generator=generator))
         shape = tuple(sample_shape)
         added = {"new_axis": list(range(len(shape)))} if shape else {}
         draw = partial(_sample_block, self._model, shape, seed)
         chunks = (*((size,) for size in shape), *self._signal.chunks)
-        return self._wrap(
-            dask.array.map_blocks(draw, self._signal, chunks=chunks, **added, **self._numbers(len(shape)))
-        )
+        return self._wrap(dask.map_blocks(draw, self._signal, chunks=chunks, **added, **self._numbers(len(shape))))
 
     def _numbers(self, more_axes: int = 0) -> dict[str, Any]:
         kind = self._signal.dtype if self._signal.dtype in (np.float32, np.float64) else np.dtype(np.float32)

@@ -59,8 +59,9 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
             "some values of this array are masked; leave them out (mask=~array.mask, where there is such an argument) or "
             "fill them, with array.filled(value)"
         )
-    if hasattr(data, "__dlpack_device__") and data.__dlpack_device__()[0] != _CPU:
-        tensor: Tensor = torch.from_dlpack(data)
+    capsule = hasattr(data, "__dlpack_device__")
+    if capsule and (data.__dlpack_device__()[0] != _CPU or not hasattr(data, "__array__")):
+        tensor: Tensor = torch.utils.dlpack.from_dlpack(data)
     else:
         tensor = _from_numpy(np.asarray(data))
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)

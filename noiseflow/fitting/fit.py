@@ -90,7 +90,8 @@ def fit(
     if not 0 <= warm_up < 1:
         raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
     (signal, observation), kept = unmasked(signal, observation)
-    signal = as_tensor(signal) if is_array(signal) else signal
+    if is_array(signal):
+        signal = as_tensor(signal)
     observation = as_tensor(observation)
     mask = mask if mask is None else as_tensor(mask)
     held_out = held_out if isinstance(held_out, float | int) else as_tensor(held_out)
@@ -98,7 +99,7 @@ def fit(
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
         )
-    signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
+    signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal  # type: ignore[assignment]
     check_signal_model(signal_model, observation.numel())
     if kept is not None:
         kept = kept.to(observation.device).reshape(observation.shape)

@@ -48,6 +48,9 @@ class StaticScene(Described):
     doi:10.2307/1914288). What the model predicts for a pixel of an exposure therefore lies further from that exposure, by the
     inverse factor: the noise learnt has the right width, of whatever law, and its skewness to about 1/n.
 
+    Scenes need signals over many widths of the noise, or a noise model that does not depend on the signal: a free value for every
+    pixel could otherwise tell the noise model, by moving a little, how far its exposures are off.
+
     Args:
         exposures: (n, ...) repeated exposures, detector units; the clean image starts at their mean. NaN and infinite pixels are
             left out.
@@ -118,7 +121,7 @@ def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
     kind = type(signal_model).__name__
     device = next((p.device for p in signal_model.parameters()), torch.device("cpu"))
     if hasattr(signal_model, "signal"):
-        shape = tuple(signal_model.signal().shape)
+        shape = tuple(signal_model.signal().shape)  # type: ignore[operator]
         if shape != (num_pixels,):
             raise ValueError(
                 f"{kind}.signal() has shape {shape} and the observation {num_pixels} pixels; return all of them flat, "
@@ -131,7 +134,7 @@ def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
             f"{kind} predicts shape {shape} for {some.numel()} pixel indices; return one signal for each index"
         )
     if hasattr(signal_model, "penalty"):
-        penalty = signal_model.penalty()
+        penalty = signal_model.penalty()  # type: ignore[operator]
         if not (isinstance(penalty, float | int) or penalty.ndim == 0):
             raise ValueError(
                 f"{kind}.penalty() has shape {tuple(penalty.shape)}; return a scalar, such as .sum() or .mean()"

@@ -115,6 +115,10 @@ class NoiseModelBase(Described, ABC):
         """The model of a pixel by itself, before rounding, clipping and what its place in an image adds; itself."""
         return self
 
+    def without_converter(self) -> NoiseModelBase:
+        """The model before rounding, clipping and the gains and offsets of single pixels; itself."""
+        return self
+
     def behind(self, converter: Callable[[NoiseModelBase], NoiseModelBase]) -> NoiseModelBase:
         """This model with a converter, such as `Digitised`, put where it belongs; around the whole.
 

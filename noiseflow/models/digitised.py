@@ -13,6 +13,7 @@ from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.distributions.picked import Signal, given_to, values_of
 from noiseflow.models.around import ModelAround
+from noiseflow.models.base import NoiseModelBase
 
 _MOMENT_NODES = 257
 _MOMENT_COUNT = 2**18
@@ -112,6 +113,9 @@ class Digitised(ModelAround):
             return found
         between = self.model.log_prob_from(signal, fixed_part[:, 3:5])
         return torch.where(fixed_part[:, 5] > 0, found, between)
+
+    def without_converter(self) -> NoiseModelBase:
+        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""

@@ -13,6 +13,7 @@ from noiseflow.arrays import floating
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.around import ModelAround
+from noiseflow.models.base import NoiseModelBase
 
 
 class WithMaps(ModelAround):
@@ -78,6 +79,9 @@ class WithMaps(ModelAround):
         """Standardise the model inside on the readings of ideal pixels."""
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
+
+    def without_converter(self) -> NoiseModelBase:
+        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside and the maps."""

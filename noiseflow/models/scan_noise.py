@@ -92,6 +92,9 @@ class ScanNoise(ModelAround):
         left = observation - (share * (mean - mean.mean())).to(observation)[:, None]
         self.model.standardise(given_to(self.model, signal[present]), left[present])
 
+    def without_converter(self) -> ScanNoise:
+        return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale)), along=self.along)
+
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""
         return {"along": self.along}
