@@ -13,6 +13,8 @@ from .projection.image_formation import Transmission as Transmission
 from .projection.projector import SliceProjector as SliceProjector
 from .projection.sirt import sirt as sirt
 from .projection.wbp import wbp as wbp
+from .series.prepare import Prepared as Prepared
+from .series.prepare import prepare as prepare
 from .series.tilt_series import TiltSeries as TiltSeries
 from .series.tilt_series import Volume as Volume
 from .series.tilt_series import VolumeGrid as VolumeGrid
