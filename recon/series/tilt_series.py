@@ -29,6 +29,8 @@ class TiltSeries:
         mask: (tilt, y, u), True for the pixels to use; None for all. Fits leave the others out; the classical methods take
             them as they stand in `images`, so they should hold something plausible.
         beam: (tilt,) incident intensity relative to the median tilt's, where the beam drifts; a fit starts from it.
+        tilt_axis: direction of the tilt axis in raw images that their file states, degrees from y towards −x, or None; only an
+            alignment starts from it.
 
     Raises:
         ValueError: not a stack, angles, mask or beam that do not match it, pixels or angles that are not finite, a flat stack.
@@ -40,6 +42,7 @@ class TiltSeries:
     mode: Mode = "transmission"
     mask: NDArray[np.bool_] | None = None
     beam: NDArray[np.float64] | None = None
+    tilt_axis: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
