@@ -78,7 +78,7 @@ class Alignment:
 
     @property
     def residual(self) -> float | None:
-        """Share of the variance of tilts in contiguous gaps that a volume of the others does not explain; None without a search."""
+        """Share of the variance of tilts in contiguous gaps that no volume of the others explains; None without a search."""
         return self.evidence[0].residual if self.evidence else None
 
     @property

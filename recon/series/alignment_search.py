@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from recon.series.alignment import Alignment
-from recon.series.evidence import Evidence, weigh
+from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
 from recon.series.matching import Match, Matcher
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import without_level
 
 Progress = Callable[[str, int, int, str], None]
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
@@ -207,25 +208,27 @@ def _weighed(matcher: Matcher, match: Match, known: bool) -> _Candidate:
 
 
 def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
-    """The axis where the parabola through three directions has its least residual."""
+    """The axis where the parabola through three directions leaves the least unexplained in every second tilt."""
     found, step = candidate.match, 2 * _EDGE / matcher.size
 
-    def tried(start: Match, turn: float) -> _Candidate:
-        return _weighed(matcher, matcher.match(*matcher.about_mass(start, turn), rounds=_FEWER_ROUNDS), candidate.known)
+    def tried(start: Match, turn: float) -> tuple[float, Match]:
+        match = matcher.match(*matcher.about_mass(start, turn), rounds=_FEWER_ROUNDS)
+        return unexplained_in_halves(matcher, match), match
 
     sides = [tried(found, side * step) for side in (-1.0, 0.0, 1.0)]
-    left, middle, right = (each.residual for each in sides)
+    left, middle, right = (residual for residual, _ in sides)
     curvature = left - 2 * middle + right
     place = 0.5 * (left - right) / curvature if curvature > 0 else math.copysign(1.5, left - right)
-    nearest = min(sides, key=lambda each: each.residual)
-    turn = found.axis + step * min(max(place, -1.5), 1.5) - nearest.match.axis
-    return min(nearest, tried(nearest.match, turn), key=lambda each: each.residual)
+    nearest = min(sides, key=lambda pair: pair[0])
+    turn = found.axis + step * min(max(place, -1.5), 1.5) - nearest[1].axis
+    best = min(nearest, tried(nearest[1], turn), key=lambda pair: pair[0])[1]
+    return _weighed(matcher, best, candidate.known)
 
 
 def _line_integrals(tilt_series: TiltSeries) -> Tensor:
     """Images as line integrals, of order one."""
-    images = torch.from_numpy(tilt_series.images.astype(np.float32))
-    integrals = estimate_response(tilt_series).invert(images).detach()
+    lowered, _ = without_level(tilt_series)
+    integrals = estimate_response(lowered).invert(torch.from_numpy(lowered.images)).detach()
     return integrals / integrals.std().clamp_min(1e-30)
 
 

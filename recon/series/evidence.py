@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
+from recon.series.views import view_numbers
 
 _GAP = 15.0  # degrees; neighbours nearer than this give each other away, whatever the axis
 _FEWEST_GAPS = 5  # three between the outer two, the fewest that show a spread
@@ -86,29 +87,58 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
     extrapolated, and do not count.
     """
     angles = np.asarray(matcher.projector.tilt_angles)
-    gaps, shifts = _gaps(angles), matcher.in_own_pixels(found.shifts)
-    images, seen = matcher.aligned(found.axis, shifts)
-    turned = frame(found.axis, shifts)
-    there = (places(matcher.images.shape[1:], shifts) - shifts[:, None, None, :]) @ turned.T
-    measured, unexplained, unchanged = matcher.images, *np.zeros((2, len(angles)))
-    inside = sampled(images, there)[1]
-    if matcher.used is not None:
-        inside = inside * (matcher.used > 0.99)
+    gaps, view = _gaps(angles), _View.of(matcher, found)
+    unexplained, unchanged = np.zeros((2, len(angles)))
     for fold in range(_FOLDS):
         out = gaps % _FOLDS == fold
-        kept = torch.from_numpy(~out).to(images.device)[:, None, None]
-        volume = matcher.sirt(images, seen * kept, None, 3 * ITERATIONS)
-        across = torch.from_numpy(_interpolation(angles, out)).to(images)
-        for share, predicted in (
-            (unexplained, matcher.projector(volume)),
-            (unchanged, torch.tensordot(across, images, 1)),
-        ):
-            squares = ((sampled(predicted, there)[0] - measured).square() * inside).sum((1, 2))
-            share[out] = squares.double().cpu().numpy()[out]
-    whole = float(((measured - measured.mean()).square() * inside).sum((1, 2)).mean())
-    return Evidence(
-        found.degrees, unexplained / whole, unchanged / whole, _unconserved(images, seen), found.occupied, gaps
+        across = torch.from_numpy(_interpolation(angles, out)).to(view.images)
+        unexplained[out] = view.errors(view.predicted_without(out))[out]
+        unchanged[out] = view.errors(torch.tensordot(across, view.images, 1))[out]
+    conserved = _unconserved(view.images, view.seen)
+    return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, gaps)
+
+
+def unexplained_in_halves(matcher: Matcher, found: Match) -> float:
+    """Share of the variance that volumes of every second view leave in the others: it finds degrees, not directions."""
+    view, angles = _View.of(matcher, found), np.asarray(matcher.projector.tilt_angles)
+    rank = view_numbers(angles) % 2
+    return float(
+        sum(view.errors(view.predicted_without(rank == half))[rank == half].sum() for half in (0, 1)) / len(rank)
     )
+
+
+@dataclass(frozen=True)
+class _View:
+    """Aligned images and where raw pixels are in them."""
+
+    matcher: Matcher
+    images: Tensor
+    seen: Tensor
+    there: Tensor
+    inside: Tensor
+
+    @classmethod
+    def of(cls, matcher: Matcher, found: Match) -> _View:
+        shifts = matcher.in_own_pixels(found.shifts)
+        images, seen = matcher.aligned(found.axis, shifts)
+        raw = places(matcher.images.shape[1:], shifts) - shifts[:, None, None, :]
+        there = raw @ frame(found.axis, shifts).T
+        inside = sampled(images, there)[1]
+        if matcher.used is not None:
+            inside = inside * (matcher.used > 0.99)
+        return cls(matcher, images, seen, there, inside)
+
+    def predicted_without(self, out: NDArray[np.bool_]) -> Tensor:
+        """All images, by a volume of those that are not `out`."""
+        kept = torch.from_numpy(~out).to(self.images.device)[:, None, None]
+        return self.matcher.projector(self.matcher.sirt(self.images, self.seen * kept, None, 3 * ITERATIONS))
+
+    def errors(self, predicted: Tensor) -> NDArray[np.float64]:
+        """(tilt,) squared errors in raw pixels over the mean variance of an image."""
+        measured = self.matcher.images
+        squares = ((sampled(predicted, self.there)[0] - measured).square() * self.inside).sum((1, 2))
+        whole = ((measured - measured.mean()).square() * self.inside).sum((1, 2)).mean()
+        return np.asarray((squares / whole.clamp_min(1e-30)).double().cpu().numpy())
 
 
 def _gaps(angles: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -16,6 +16,7 @@ from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
 from recon.series.screening import Screening, screen
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import in_order
 
 Progress = Callable[[str, int, int, str], None]
 """``progress(title, done, total, note)``."""
@@ -26,7 +27,7 @@ class Prepared:
     """A tilt series ready to reconstruct, and what was found on the way.
 
     Attributes:
-        tilt_series: aligned, without the tilts that do not belong.
+        tilt_series: aligned, by rising angle, without the tilts that do not belong.
         screening: how well every tilt fits the others, in the order of the series as given.
         alignment: of the raw images, in the order of the series as given; None where they were not moved.
     """
@@ -76,17 +77,28 @@ def prepare(
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")
     _warn_of_outliers(tilt_series)
     _warn_of_order(tilt_series.tilt_angles)
-    alignment = None
-    if refine_alignment:
-        alignment = find_alignment(tilt_series, tilt_axis=tilt_axis, device=device, progress=progress)
-    elif tilt_axis is not None:
-        alignment = Alignment(tilt_axis, np.zeros((tilt_series.num_tilts, 2)), tilt_series.tilt_angles)
+    alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
     check_contrast(tilt_series)
     found = screen(tilt_series)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
-    return Prepared(found.passed(tilt_series, keep=keep_tilts), found, alignment)
+    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
+
+
+def _alignment(
+    series: TiltSeries,
+    tilt_axis: float | None,
+    *,
+    refine: bool,
+    device: torch.device | str,
+    progress: Progress | None,
+) -> Alignment | None:
+    if refine:
+        return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)
+    if tilt_axis is None:
+        return None
+    return Alignment(tilt_axis, np.zeros((series.num_tilts, 2)), series.tilt_angles)
 
 
 def _warn_of_order(angles: NDArray[np.float64]) -> None:
@@ -117,6 +129,13 @@ def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
 
 
 def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> None:
+    if found.suspect.any():
+        warnings.warn(
+            f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others, too many for exceptions: "
+            "the alignment, the tilt axis or the tilt angles are probably wrong; give --refine-alignment, --tilt-axis or the "
+            "right --angles",
+            stacklevel=3,
+        )
     if not found.bad.any():
         return
     angles = series.tilt_angles[found.bad]

@@ -238,10 +238,11 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of so many pixels, image by image; what is left over at the far edges is left out."""
+    """Means of blocks of so many pixels, image by image; what is left over is left out at both edges."""
     height, width = images.shape[1] // down, images.shape[2] // across
-    whole = (image[: height * down, : width * across].astype(np.float32) for image in images)
-    return np.stack([image.reshape(height, down, width, across).mean((1, 3)) for image in whole])
+    top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
+    whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
+    return np.stack([image.reshape(height, down, width, across).mean((1, 3)).astype(np.float32) for image in whole])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
