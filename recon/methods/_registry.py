@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -174,10 +174,24 @@ def reconstruct(
         scratch: with `slices_at_once`, a new ``.npy`` file that holds the volume; the result maps it to memory.
         **settings: the attributes of `Settings`.
 
+    Returns:
+        The volume, projections in the order of the tilts, and the response by rising angle.
+
     Raises:
         ValueError: an unknown method, settings that make no sense, or a grid that does not match the images.
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
+    order = np.argsort(tilt_series.tilt_angles, kind="stable")
+    if (np.diff(order) != 1).any():  # the order of the tilts must not change the volume by a bit
+        result = reconstruct(
+            tilt_series.select(order),
+            grid,
+            method=method,
+            slices_at_once=slices_at_once,
+            scratch=scratch,
+            **settings,
+        )
+        return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
         return found.run(tilt_series, grid, chosen)
