@@ -18,3 +18,5 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
+from .lock import locked as locked
+from .partials import partial_folder as partial_folder

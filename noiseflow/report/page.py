@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow.io import atomic_path, check_output
+from noiseflow.io.ownership import signature
 from noiseflow.report.charts import themed_svg
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class Report:
         title, lead = html.escape(self.title), html.escape(self.lead)
         page = (
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            f'<meta name="generator" content="{signature()}">'
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}"><title>{title}</title>'
             '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
             f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'

@@ -122,12 +122,9 @@ def memory_line(
 
 @contextlib.contextmanager
 def scratch_beside(out: Path) -> Iterator[Path]:
-    """A name for a file beside `out`, gone at the end if it was made."""
-    scratch = out.with_name(f".{out.name}.blocks.npy")
-    try:
-        yield scratch
-    finally:
-        scratch.unlink(missing_ok=True)
+    """A name for a file beside `out`, gone at the end; what a killed run left is cleared by the next one."""
+    with partial_folder(out) as folder:
+        yield folder / "blocks.npy"
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
