@@ -2,6 +2,7 @@
 
 from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
+from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of

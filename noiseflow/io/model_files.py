@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import nn
 import noiseflow
 from noiseflow.io import check_output
 from noiseflow.io.tensor_files import save_tensors
+from noiseflow.plugins import load_plugins
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
@@ -29,7 +30,7 @@ def kinds() -> dict[str, type[nn.Module]]:
         for name, kind in own.items()
         if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")
     }
-    return found | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
+    return found | load_plugins("noiseflow.noise_models")
 
 
 def save(

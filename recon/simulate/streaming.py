@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.io import partial_folder
+from noiseflow.io import locked, partial_folder
 from noiseflow.io.files import reserve
 from noiseflow.io.ownership import signature
 from noiseflow.io.partials import link_target
@@ -80,7 +80,7 @@ class Simulation:
         is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            with partial_folder(folder / "simulate") as partial:
+            with locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
                 unit = _Writer(self, partial, progress).run()
                 for path in sorted(partial.iterdir()):
                     path.replace(link_target(folder / path.name))
