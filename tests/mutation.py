@@ -234,11 +234,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--number", type=int, default=60, help="how many mutants, drawn at random; 0 for all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="files whose path contains this")
+    parser.add_argument("--only", nargs="*", default=[""], help="files whose path contains one of these")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="start no mutant after so much time")
     parser.add_argument("--results", type=Path, help="JSON file to write")
     asked = parser.parse_args()
-    every = [mutant for file in TARGETS if asked.only in file for mutant in mutants(file)]
+    every = [mutant for file in TARGETS if any(part in file for part in asked.only) for mutant in mutants(file)]
     chosen = random.Random(asked.seed).sample(every, min(asked.number, len(every))) if asked.number else every
     started, verdicts = time.monotonic(), []
     for verdict in judge(chosen):
