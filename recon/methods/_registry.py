@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
@@ -17,6 +16,7 @@ from torch import nn
 
 from noiseflow.described import described
 from noiseflow.kept_memory import kept_memory
+from noiseflow.plugins import load_plugin, plugins
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
@@ -111,7 +111,7 @@ def method_names() -> list[str]:
     """All methods, without importing any: those of this package, then those of others (entry points ``noiseflow.methods``)."""
     own = [module.name for module in iter_modules([str(Path(__file__).parent)]) if not module.name.startswith("_")]
     names = sorted(name.replace("_", "-") for name in own)
-    return ["auto", *(name for name in names if name != "auto"), *sorted(entry.name for entry in _others())]
+    return ["auto", *(name for name in names if name != "auto"), *sorted(plugins(_GROUP))]
 
 
 @cache
@@ -123,15 +123,11 @@ def find_method(name: str) -> Method:
     """
     if name not in method_names():
         raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
-    other = next((entry for entry in _others() if entry.name == name), None)
-    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else other.load()
+    other = plugins(_GROUP).get(name)
+    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; a method is a recon.methods.Method")
     return found
-
-
-def _others() -> list[Any]:
-    return list(entry_points(group=_GROUP))
 
 
 def settings_of(method: str, **settings: Any) -> Settings:
