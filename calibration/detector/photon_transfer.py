@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line
+from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
 
 
@@ -18,7 +18,7 @@ class NotMeasurable(ValueError):
 
 
 @described(
-    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²"
+    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²", gain_error="counts per electron"
 )
 @dataclass(frozen=True)
 class PhotonTransfer:
@@ -32,6 +32,8 @@ class PhotonTransfer:
         clipped: (L,) share of the readings at a rail; levels with any are left out of the line where others suffice.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
+        gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.
+        chi_squared: of the points about the line per degree of freedom.
     """
 
     signal: Image
@@ -40,6 +42,19 @@ class PhotonTransfer:
     clipped: Image
     gain: float
     intercept: float
+    gain_error: float = 0.0
+    chi_squared: float = 1.0
+
+    @property
+    def bent(self) -> bool:
+        """Whether the points depart from the line by more than their errors and by over 2 % of the variance anywhere."""
+        free = self.clipped < 1e-3
+        if free.sum() < 5:
+            return False
+        departure = self.variance[free] - (self.gain * self.signal[free] + self.intercept)
+        significant = np.abs(departure) > 4 * self.variance_error[free] * max(1.0, self.chi_squared**0.25)
+        large = np.abs(departure) > 0.02 * self.variance[free].max()
+        return bool(np.sum(significant & large) >= 2)
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
@@ -55,12 +70,22 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     if free.sum() < 3:
         free = np.ones_like(free)
     line = fit_line(signal[free], variance[free])
+    gain_error, chi_squared = _line_error(signal[free], variance[free], error[free], line)
     if not line.rate > 0:
         raise NotMeasurable(
             "the noise does not grow with the signal, so the gain cannot be measured; give exposures with more "
             "contrast, or flat frames at several levels"
         )
-    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor)
+    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
+
+
+def _line_error(signal: Image, variance: Image, error: Image, line: VarianceLine) -> tuple[float, float]:
+    """Standard error of the slope of a line that weights all points by their level, and χ² per degree of freedom."""
+    weight = 1 / np.maximum(line(signal), 0.1 * abs(variance.mean())) ** 2
+    centred = signal - np.average(signal, weights=weight)
+    chi_squared = float(np.sum(((variance - line.floor - line.rate * signal) / error) ** 2)) / max(len(signal) - 2, 1)
+    slope_error = np.sqrt(np.sum((weight * centred * error) ** 2)) / np.sum(weight * centred**2)
+    return float(slope_error * np.sqrt(max(chi_squared, 1.0))), chi_squared
 
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
