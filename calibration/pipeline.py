@@ -9,12 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.detector.correlation import Correlation, correlation_of
+from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
+from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image
+from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
+from calibration.verdict import Reason, Verdict, judge_calibration, verdict_of
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -36,14 +41,22 @@ class Findings:
         detector: None where no gain shows.
         no_detector: why not.
         burst: what moved or faded; None for pairs.
+        figures: gain, offset and read noise as reported; None where no gain shows.
+        verdict: how far they can be believed.
+        correlation: between the residuals of neighbouring pixels.
+        repairs: what of the exposures was modelled before the detector was measured.
     """
 
     pairs: Sequence[AlignedPair]
-    pixels: Pixels
-    scores: Sequence[ModelScore]
+    pixels: Pixels | None = None
+    scores: Sequence[ModelScore] = ()
     detector: Detector | None = None
     no_detector: str = ""
     burst: BurstReport | None = None
+    figures: Figures | None = None
+    verdict: Verdict = Verdict("bad", ())
+    correlation: Correlation | None = None
+    repairs: Repairs = Repairs()
 
 
 def calibrate_exposures(
@@ -68,6 +81,22 @@ def calibrate_exposures(
     Raises:
         ValueError: exposures that cannot be aligned, or a posterior that does not converge.
     """
+    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, bar=bar)
+    pixels = collect_pixels(measured.pairs, seed=seed)
+    with bar("Fitting noise models", NUM_STEPS * len(KINDS)) as progress:
+        scores = fit_models(pixels, seed=seed, device=device, progress=progress)
+    return replace(measured, pixels=pixels, scores=scores)
+
+
+def measure_exposures(
+    exposures: Sequence[ExposurePair] | Burst,
+    *,
+    dark: Burst | None = None,
+    flat: Burst | None = None,
+    seed: int = 0,
+    bar: Bar = lambda title, total: nullcontext(),
+) -> Findings:
+    """Align exposures, measure the detector and judge its figures, without fitting noise models. As `calibrate_exposures`."""
     if dark is not None:
         exposures = without_pattern(exposures, dark)
     burst = None
@@ -75,16 +104,32 @@ def calibrate_exposures(
         pairs, burst = align_burst(exposures)
     else:
         pairs = [align_pair(pair) for pair in exposures]
-    detector, reason = None, ""
+    pairs, repairs = repaired(pairs)
+    correlation = correlation_of(pairs)
+    if correlation.found and not repairs.refitted:
+        pairs = [_own_noise_by_scale(pair) for pair in pairs]
+    detector, figures, reason = None, None, ""
+    verdict = Verdict("bad", ())
     try:
         with bar("Sampling the detector's posterior", 16000) as progress:
             detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+        figures = figures_of(detector, correlation, repairs)
+        verdict = judge_calibration(pairs, detector, figures, correlation, repairs)
     except NotMeasurable as error:
         reason = str(error)
-    pixels = collect_pixels(pairs, seed=seed)
-    with bar("Fitting noise models", NUM_STEPS * len(KINDS)) as progress:
-        scores = fit_models(pixels, seed=seed, device=device, progress=progress)
-    return Findings(pairs, pixels, scores, detector, reason, burst)
+        verdict = verdict_of([Reason("not measurable", "bad", f"the detector was not measured: {reason}.")])
+    return Findings(
+        pairs, None, (), detector, reason, burst, figures, verdict, correlation=correlation, repairs=repairs
+    )
+
+
+def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
+    """The pair with the signal's own noise from the exposures' scale: a filter has taken it out of the finest band."""
+    if pair.frames > 1 or not 0 < pair.scaling.slope < 1:
+        return pair
+    share = pair.scaling.slope / (1 + pair.scaling.slope)
+    total = pair.total_variance
+    return replace(pair, signal_variance=VarianceLine(share * total.floor, share * total.rate))
 
 
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Sequence[ExposurePair] | Burst:

@@ -19,8 +19,9 @@ REACH = 4
 CLEAR = 5.0
 """Standard errors beyond which a correlation is one: among 40 lags noise reaches them once in 10⁵ frames."""
 
-PEAK = 14.0
-"""Power of a spectral line over its neighbourhood's mean: noise exceeds it by exp(−14), once in 10³ frames of 1000 lines."""
+PEAK = 25.0
+"""Power of a spectral line over its neighbourhood's mean. Noise exceeds it with probability exp(−25); the mean is known to 30 %,
+which leaves exp(−17), once in 10⁴ frames of 1000 lines."""
 
 LONGEST_PERIOD = 10.0
 """Pixels: blocks of image compression have 8, resampling by factors near 1 has more but then hardly changes the noise."""

@@ -19,6 +19,10 @@ LARGEST_DISAGREEMENT = 0.02
 """Relative difference of the posterior's gain from that of the photon-transfer line, beyond three errors of the line, at which
 the shape of the noise speaks against its variance: the goal for the gain."""
 
+LARGEST_UNEVENNESS = 0.05
+"""Relative deviation of the pixels' variances above which one gain and read noise do not describe them all: mixed so, the tails
+of the noise exceed any single pixel's by the square, a quarter of a percent, which pulls an offset but hardly a gain."""
+
 NINETY = 1.645
 """Standard deviations either way of a 90 % interval."""
 
@@ -57,7 +61,7 @@ def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -
     if not poisson_gaussian(detector):
         figures = _by_line(detector)
     if correctable(correlation, repairs):
-        return _decorrelated(figures, detector, correlation)
+        return _decorrelated(figures, correlation)
     return figures
 
 
@@ -66,17 +70,10 @@ def poisson_gaussian(detector: Detector) -> bool:
     return detector.misfit <= LARGEST_MISFIT and not disagrees(detector) and detector.uneven <= LARGEST_UNEVENNESS
 
 
-LARGEST_UNEVENNESS = 0.05
-"""Relative deviation of the pixels' variances above which one gain and read noise do not describe them all: mixed so, the tails
-of the noise exceed any single pixel's by the square, a quarter of a percent, which pulls an offset but hardly a gain."""
-
-
 def disagrees(detector: Detector) -> bool:
     """Whether the posterior's gain departs from the photon-transfer line."""
     line, gain = detector.line, detector.posterior.gain.median
-    own = (detector.posterior.gain.q95 - detector.posterior.gain.q05) / (2 * NINETY)
-    limit = max(LARGEST_DISAGREEMENT * gain, 3 * float(np.hypot(line.gain_error, 0.0 * own)))
-    return bool(abs(gain - line.gain) > limit)
+    return bool(abs(gain - line.gain) > max(LARGEST_DISAGREEMENT * gain, 3 * line.gain_error))
 
 
 def correctable(correlation: Correlation, repairs: Repairs) -> bool:
@@ -97,12 +94,11 @@ def _by_line(detector: Detector) -> Figures:
     return Figures(gain, _normal(*detector.offset), noise, "photon transfer")
 
 
-def _decorrelated(figures: Figures, detector: Detector, correlation: Correlation) -> Figures:
+def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     """Variance before a filter that keeps the mean: the noise's spectral density at frequency 0."""
     factor, error = correlation.factor, correlation.factor_error
     gain = figures.gain
-    share = detector.signal_share  # of the interpolated long exposure, whose own noise the filter hides from its finest band
-    middle = gain.median * factor * (1 - share)
+    middle = gain.median * factor
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
     whole = middle * float(np.hypot(width, error / factor))
     read = figures.read_noise

@@ -13,6 +13,11 @@ from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
 
 
+MODEL_ERROR = 0.005
+"""Relative error of a level's variance that is granted to the straight line itself, so that one level of a million dark pixels
+does not rule all others."""
+
+
 class NotMeasurable(ValueError):
     """The exposures cannot tell the detector's gain, though a noise model can still be fitted."""
 
@@ -33,7 +38,7 @@ class PhotonTransfer:
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.
-        chi_squared: of the points about the line per degree of freedom.
+        chi_squared: of the points about the line per degree of freedom, with half a percent of the variance granted to the line.
     """
 
     signal: Image
@@ -69,8 +74,7 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     free = clipped < 1e-3
     if free.sum() < 3:
         free = np.ones_like(free)
-    line = fit_line(signal[free], variance[free])
-    gain_error, chi_squared = _line_error(signal[free], variance[free], error[free], line)
+    line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if not line.rate > 0:
         raise NotMeasurable(
             "the noise does not grow with the signal, so the gain cannot be measured; give exposures with more "
@@ -79,13 +83,23 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
 
 
-def _line_error(signal: Image, variance: Image, error: Image, line: VarianceLine) -> tuple[float, float]:
-    """Standard error of the slope of a line that weights all points by their level, and χ² per degree of freedom."""
-    weight = 1 / np.maximum(line(signal), 0.1 * abs(variance.mean())) ** 2
-    centred = signal - np.average(signal, weights=weight)
-    chi_squared = float(np.sum(((variance - line.floor - line.rate * signal) / error) ** 2)) / max(len(signal) - 2, 1)
-    slope_error = np.sqrt(np.sum((weight * centred * error) ** 2)) / np.sum(weight * centred**2)
-    return float(slope_error * np.sqrt(max(chi_squared, 1.0))), chi_squared
+def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[VarianceLine, float, float]:
+    """The line, the standard error of its slope, and χ² per degree of freedom.
+
+    Errors grow with the line's own level, not with the point's, which would favour points that are too low by chance.
+    """
+    relative = error / np.maximum(variance, np.finfo(float).tiny)
+    line = fit_line(signal, variance)
+    for _ in range(3):
+        level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
+        weight = 1 / (level**2 * (relative**2 + MODEL_ERROR**2))
+        middle = float(np.average(signal, weights=weight))
+        information = float(np.sum(weight * (signal - middle) ** 2))
+        rate = float(np.sum(weight * (signal - middle) * variance)) / information
+        line = VarianceLine(float(np.average(variance, weights=weight)) - rate * middle, rate)
+    departure = variance - line.floor - line.rate * signal
+    chi_squared = float(np.sum(weight * departure**2)) / max(len(signal) - 2, 1)
+    return line, float(np.sqrt(max(chi_squared, 1.0) / information)), chi_squared
 
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
