@@ -41,7 +41,8 @@ def calibrate(
     """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
-    from calibration.detector.models import require_kind
+    from calibration.detector.models import SIMPLE, require_kind
+    from calibration.pipeline import saved_model
     from calibration.report.page import write_report
     from noiseflow.io import check_folder, check_output
     from noiseflow.io.model_files import MODEL_SUFFIXES
@@ -56,20 +57,22 @@ def calibrate(
     exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
     findings = calibrate_exposures(
         exposures,
-        dark=read_burst(dark, name="the dark frames") if dark else None,
-        flat=read_burst(flat, name="the flat frames") if flat else None,
+        dark=read_burst(dark, name="the dark frames", calibration=True) if dark else None,
+        flat=read_burst(flat, name="the flat frames", calibration=True) if flat else None,
+        kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
         seed=seed,
         device=chosen_device,
         bar=partial(progress_bar, json_mode=json),
     )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
+    model = saved_model(best.model, findings)
     inputs = [*short, *(long or []), *(dark or []), *(flat or [])]
     page = None if report is None else write_report(report, findings, inputs=inputs, seed=seed)
     provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
-    noiseflow.save(best.model, output, units="counts", provenance=provenance)
+    noiseflow.save(model, output, units="counts", provenance=provenance)
     out = Output(json)
-    _tell(out, findings)
+    _report(out, findings)
     out.line(f"Noise model ({best.name}): {output}" + (f"\nReport: {page}" if page else ""))
     out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
 
@@ -77,6 +80,8 @@ def calibrate(
 def summary(findings: Findings) -> dict[str, Any]:
     """What the findings hold, as plain values: ``detector``, ``registration``, ``models``."""
     found: dict[str, Any] = {
+        "verdict": findings.verdict.grade,
+        "reasons": [vars(reason) for reason in findings.verdict.reasons],
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score) for score in findings.scores},
@@ -96,7 +101,7 @@ def _device(name: str) -> Any:
     return chosen
 
 
-def _tell(out: Output, findings: Findings) -> None:
+def _report(out: Output, findings: Findings) -> None:
     from calibration.report.page import (
         TABLE_HEADER,
         describe_burst,
@@ -110,35 +115,37 @@ def _tell(out: Output, findings: Findings) -> None:
         out.line(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"Pair {number}: {describe_registration(pair)}")
-    detector = findings.detector
-    out.line("\nDetector: " + (describe_detector(detector) if detector else f"not measured: {findings.no_detector}"))
+    out.line("\nDetector: " + describe_detector(findings))
     out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
     out.table(TABLE_HEADER, table_rows(findings.scores))
-    out.line("\n" + " ".join(judge(findings)))
+    out.line("\n" + "\n".join(judge(findings)))
 
 
 def _detector(findings: Findings) -> dict[str, Any] | None:
     from calibration.detector.measure import EXCESS_NOISE
     from calibration.report.page import unknown_read_noise
 
-    detector = findings.detector
-    if detector is None:
+    detector, figures = findings.detector, findings.figures
+    if detector is None or figures is None:
         return None
 
-    def interval(value: Interval) -> dict[str, float]:
-        return {"median": value.median, "q05": value.q05, "q95": value.q95}
+    def interval(value: Interval | None) -> dict[str, float] | None:
+        return None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
 
     found = detector.posterior
     return {
-        "gain": interval(found.gain),
-        "offset": interval(found.offset),
-        "read_noise": interval(found.read_noise),
+        "gain": interval(figures.gain),
+        "offset": interval(figures.offset),
+        "read_noise": interval(figures.read_noise),
+        "source": figures.source,
+        "correlation_factor": figures.factor,
         "rhat": found.rhat,
         "autocorrelation_time": found.autocorrelation_time,
         "num_steps": found.num_steps,
         "misfit": detector.misfit,
+        "photon_transfer_gain": detector.line.gain,
         "offset_measured": detector.offset is not None,
-        "read_noise_identifiable": not unknown_read_noise(detector),
+        "read_noise_identifiable": not unknown_read_noise(figures),
         "caveat": EXCESS_NOISE,
     }
 

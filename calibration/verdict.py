@@ -18,6 +18,7 @@ from calibration.detector.figures import (
 )
 from calibration.detector.measure import Detector
 from calibration.detector.repair import LEAST_SHARE, Repairs
+from calibration.exposures.compression import block_compressed
 from calibration.exposures.frames import rails
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
@@ -83,7 +84,7 @@ def judge_calibration(
     """
     reasons = [
         *_scene(repairs, correlation),
-        *_correlation(correlation, repairs, figures),
+        *_correlation(pairs, correlation, repairs, figures),
         *_shape(detector, figures),
         *_range(pairs, detector, figures),
     ]
@@ -125,7 +126,9 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
     return found
 
 
-def _correlation(correlation: Correlation, repairs: Repairs, figures: Figures) -> list[Reason]:
+def _correlation(
+    pairs: Sequence[AlignedPair], correlation: Correlation, repairs: Repairs, figures: Figures
+) -> list[Reason]:
     found = []
     for name, deviation in (("rows", repairs.rows), ("columns", repairs.columns)):
         if deviation:
@@ -146,6 +149,9 @@ def _correlation(correlation: Correlation, repairs: Repairs, figures: Figures) -
         else:
             grade, text = "bad", text + ", which no short filter explains. Give raw frames, or remove the interference"
         found.append(Reason("correlated pixels", grade, text + "."))
+    if any(block_compressed(pair.short) for pair in pairs[:1]):
+        text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
+        found.append(Reason("compressed", "bad", text + ". Give raw frames."))
     if correlation.period:
         text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed in blocks"
         found.append(Reason("periodic noise", "bad", text + ", so that the gain is not the camera's. Give raw frames."))

@@ -68,6 +68,7 @@ class Burst:
     Args:
         frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
         name: how messages call the burst.
+        calibration: dark or flat frames, which need no scene.
 
     Raises:
         ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
@@ -75,13 +76,14 @@ class Burst:
 
     frames: Image
     name: str = "the burst"
+    calibration: bool = False
 
     def __post_init__(self) -> None:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
-                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give a long "
-                "exposure with it, or a burst of at least two equal exposures"
+                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give "
+                + ("at least two" if self.calibration else "a long exposure with it, or a burst of at least two equal exposures")
             )
         checked = [checked_frame(frame, f"{self.name}, frame {i}") for i, frame in enumerate(frames)]
         for i, (first, second) in enumerate(pairwise(checked)):
@@ -177,12 +179,13 @@ def read_pairs(
     ]
 
 
-def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst:
+def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False) -> Burst:
     """Read a burst from one stack, or from files of one frame each in the order taken.
 
     Args:
         paths: the files.
         name: how messages call it; by default the file, or "the burst".
+        calibration: dark or flat frames.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -196,7 +199,7 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst
         frames += list(data) if data.ndim == 3 else [data]
     for frame in frames[1:]:
         _require_same_size(frames[0], "the first frame", frame, "a later one")
-    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"))
+    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"), calibration)
 
 
 def _require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
