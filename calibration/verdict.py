@@ -40,6 +40,10 @@ MOST_CHANGED = 0.005
 """Share of the pixels in places that change, from which on the user should know that they were left out."""
 
 
+BINS = 32
+"""Of the upper half of a histogram that is searched for a second mode."""
+
+
 @described()
 @dataclass(frozen=True)
 class Reason:
@@ -207,9 +211,11 @@ def full_share(pair: AlignedPair) -> float:
         return 0.0
     values = pair.short[pair.mask]
     low, high = np.percentile(values, (50, 99.99))
-    counts, _ = np.histogram(values, np.linspace(low, high, 33))
+    width = max(1.0, np.ceil((high - low) / BINS))  # whole counts, or the histogram beats with the converter's steps
+    counts, _ = np.histogram(values, low - 0.5 + width * np.arange(BINS + 1))
     smooth = np.convolve(counts, np.ones(3) / 3, mode="same")
-    peak = 8 + int(np.argmax(smooth[8:]))
-    valley = smooth[: peak + 1].min()
-    rise = smooth[peak] - valley - 5 * np.sqrt(smooth[peak])
-    return float(counts[int(np.argmin(smooth[: peak + 1])) :].sum() / values.size) if rise > 0.3 * smooth[peak] else 0.0
+    last = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
+    peak = BINS // 4 + int(np.argmax(smooth[BINS // 4 :]))
+    valley = BINS // 8 + int(np.argmin(smooth[BINS // 8 : peak + 1]))
+    second = peak > 0.6 * last and smooth[peak] > 3 * (smooth[valley] + np.sqrt(smooth[valley]) + 1)
+    return float(counts[valley:].sum() / values.size) if second else 0.0

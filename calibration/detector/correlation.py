@@ -79,13 +79,23 @@ def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
         pairs: aligned, of one detector setting.
     """
     residuals = [residual_of(pair) for pair in pairs]
+    expected = [one.share * _of_interpolation(pair) for one, pair in zip(residuals, pairs, strict=True)]
+    return correlation_of_residuals(residuals, expected)
+
+
+def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[Image] | None = None) -> Correlation:
+    """Correlation of standardised residuals of one detector.
+
+    Args:
+        residuals: of one frame each.
+        expected: (K,) for each, what is no correlation of the noise; None: nothing.
+    """
     products, counts = np.zeros(len(LAGS)), np.zeros(len(LAGS))
-    for one, pair in zip(residuals, pairs, strict=True):
-        expected = one.share * _of_interpolation(pair)
+    for one, known in zip(residuals, expected or [np.zeros(len(LAGS))] * len(residuals), strict=True):
         for index, (dy, dx) in enumerate(LAGS):
             first, second = _shifted(dy, dx)
             count = float(np.count_nonzero(one.mask[first] & one.mask[second]))
-            products[index] += float((one.z[first] * one.z[second]).sum()) - count * expected[index]
+            products[index] += float((one.z[first] * one.z[second]).sum()) - count * known[index]
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
     near = _near_clear(value, error)
