@@ -18,17 +18,22 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    short: Annotated[
-        list[Path], typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
-    ],
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
+    short: Annotated[
+        list[Path] | None, typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
+    ] = None,
     long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short one, or one for all.")] = None,
     dark: Annotated[
         list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")
     ] = None,
-    flat: Annotated[list[Path] | None, typer.Option(help="Two or more equal frames of even illumination.")] = None,
+    flat: Annotated[
+        list[Path] | None,
+        typer.Option(help="Equal frames of even illumination; without --short a stack for each level of light (EMVA 1288)."),
+    ] = None,
+    flat_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each level of --flat, s.")] = None,
+    dark_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each stack of --dark, s.")] = None,
     kind: Annotated[
-        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, signal-gaussian, mixture, flow, spline.")
+        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow.")
     ] = "auto",
     exposure_ratio: Annotated[
         float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
@@ -52,6 +57,11 @@ def calibrate(
         check_folder(report)
     require_kind(kind)
     chosen_device = _device(device)
+    if not short:
+        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, output, report, seed, Output(json))
+        return
+    if flat_time or dark_time:
+        raise ValueError("--flat-time and --dark-time belong to flats without exposures of a scene; leave --short out")
     if not long and exposure_ratio is not None:
         raise ValueError("--exposure-ratio is given without --long; a burst of equal exposures has none")
     exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
@@ -75,6 +85,38 @@ def calibrate(
     _report(out, findings)
     out.line(f"Noise model ({best.name}): {output}" + (f"\nReport: {page}" if page else ""))
     out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
+
+
+def _calibrate_camera(
+    flat: list[Path],
+    dark: list[Path],
+    flat_time: list[float] | None,
+    dark_time: list[float] | None,
+    output: Path,
+    report: Path | None,
+    seed: int,
+    out: Output,
+) -> None:
+    """From flats and darks alone: figures as EMVA 1288 reports them, maps beside the model file."""
+    import noiseflow
+    from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
+    from calibration.exposures.frames import read_burst, read_levels
+    from calibration.report.camera_page import describe_camera_verdict, write_camera_report
+
+    if not flat:
+        raise ValueError("neither --short nor --flat was given; give exposures of a scene, or flat frames at several levels of light")
+    darks = []
+    if dark:
+        darks = read_levels(dark, name="the dark frames") if dark_time else [read_burst(dark, name="the dark frames", calibration=True)]
+    camera = calibrate_camera(read_levels(flat), darks, flat_times=flat_time or None, dark_times=dark_time or None)
+    page = None if report is None else write_camera_report(report, camera, inputs=[*flat, *dark], seed=seed)
+    found = summary_of(camera)
+    noiseflow.save(camera.model, output, units="counts", provenance={"flat": flat, "dark": dark, "camera": found["camera"]})
+    maps = write_maps(camera, output)
+    out.table(("figure", "value"), rows_of(camera))
+    out.line("\n" + "\n".join(describe_camera_verdict(camera)))
+    out.line(f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else ""))
+    out.result({"model": output, "maps": maps, "report": page} | found)
 
 
 def summary(findings: Findings) -> dict[str, Any]:

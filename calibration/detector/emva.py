@@ -168,7 +168,7 @@ def measure_camera(
         saturation=float(saturation),
         saturated=bool(top.mean < levels[-1].mean or top.clipped > 0),
         dynamic_range=None if least is None else float(saturation / least),
-        snr_maximum=max((level.mean - zero) / np.sqrt(level.variance) for level in levels if level.variance > 0),
+        snr_maximum=max((level.mean - zero) / np.sqrt(level.variance) for level in levels if level.mean <= top.mean),
         linearity_error=None if times is None else linearity_error(levels, times, zero, top.mean),
         dsnu=None if dark is None else float(np.sqrt(max(dark.spatial, 0.0)) / slope),
         prnu=None if dark is None else float(np.sqrt(max(half.spatial - dark.spatial, 0.0)) / (half.mean - dark.mean)),

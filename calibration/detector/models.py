@@ -23,6 +23,7 @@ KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
     "poisson": "Poisson",
     "poisson-gaussian": "PoissonGaussian",
+    "excess-noise": "ExcessNoise",
     "signal-gaussian": "SignalDependentGaussian",
     "mixture": "Mixture",
     "flow": "RadialFlow",
