@@ -10,7 +10,7 @@ from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
 from recon.projection.projector import SliceProjector
 
-_LEAST = 96  # voxels; smaller lattices take little time, and half of their resolution loses too much
+_LEAST = 128  # voxels; half the resolution of 96 costs 0.2 dB of a volume of shells for a tenth of the time
 
 
 class HalfResolution:

@@ -36,7 +36,6 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 _FIRST_WEIGHT = 0.4
 _HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2  # of the pixels: those of a slab are few to tell weights apart
 _SLAB, _SLAB_VOXELS = 24, 24 * 96**2  # slices; where they are small, as many as have so many voxels tell weights apart
-_NEARLY_WHOLE = 0.75  # share of the slices; a slab of more is made the whole, and its fit goes on
 _QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 _WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
 
@@ -85,7 +84,7 @@ class JointReconstructor:
         num_steps: signal steps of the whole volume; None as the schedule says.
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
-        coarse_to_fine: whether the first steps are taken at half the resolution, where the field knows it and is 96 voxels wide
+        coarse_to_fine: whether the first steps are taken at half the resolution, where the field knows it and is 128 voxels wide
             or more; without defocus.
         defocus: blur to model, pixels per voxel out of the plane of focus, see
             `recon.projection.defocused_projector.DefocusedProjector`.
@@ -195,8 +194,6 @@ class JointReconstructor:
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         quiet = given is None and noise_share(tilt_series.images) < _QUIET
         rows = contrast_slab(tilt_series, self._num_slices(whole.field))
-        if rows.stop - rows.start >= _NEARLY_WHOLE * whole.field.height:
-            rows = slice(0, whole.field.height)
         facts = Facts(
             choose_noise=given is None and not quiet,
             learn_noise=given is None or learns(given),
@@ -204,7 +201,6 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
-            whole_slab=rows.stop - rows.start == whole.field.height,
             can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),
             hidden_offset=whole.occupancy is None and isinstance(whole.image_formation, Linear),
         )
@@ -220,13 +216,11 @@ class JointReconstructor:
         if facts.quiet:
             simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
         models = {"simple": simple, "chosen": simple if given is None else given}
-        part = whole if facts.whole_slab else self._part(whole, rows)
+        part = self._part(whole, rows)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
-        tasks = {"slab": to_choose, "whole": to_choose}
-        if facts.quiet or not facts.whole_slab:
-            tasks["whole"] = self._task(whole, tilt_series, share=_HELD_OUT)
+        tasks = {"slab": to_choose, "whole": self._task(whole, tilt_series, share=_HELD_OUT)}
         run = _Run(self, facts, tasks, models, candidates, progress)
         run.choose()
         return run

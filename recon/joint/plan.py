@@ -22,7 +22,6 @@ class Facts:
         learn_noise: whether the noise model that the volume ends with has anything to learn.
         simple_is_final: whether that model is the simple one that every fit begins with (least squares).
         choose_weight: whether the weight of the regulariser is chosen.
-        whole_slab: whether the slab that choices are made on is the whole volume.
         can_halve: whether the field has a voxel grid half as fine that is worth using.
         hidden_offset: whether no vacuum shows the offset of a linear response.
         settled: whether noise model, weight and response are known from other slices of the same series.
@@ -38,7 +37,6 @@ class Facts:
     learn_noise: bool = True
     simple_is_final: bool = False
     choose_weight: bool = True
-    whole_slab: bool = False
     can_halve: bool = False
     hidden_offset: bool = False
     settled: bool = False
@@ -57,11 +55,10 @@ class Schedule:
         adapt: signal steps on the slab under the chosen noise model.
         refine: noise-model steps on a signal that has become better.
         trial: signal steps that compare weights, from a state fitted at the first one.
-        whole: signal steps of the volume from a coarse start, unless the user gives their number.
-        polish: the same where the slab was the whole volume.
+        whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
-        later_rate: learning rate of a signal that is not a rough start, relative to one that is: the first steps of Adam are as
-            large where little is left.
+        whole_rate: learning rate of the volume; twice as much can diverge on sparse objects of 96 voxels and more.
+        later_rate: learning rate of a slab that is not a rough start: the first steps of Adam are as large where little is left.
         offset_rate: factor on the rate of an offset that no vacuum shows, from a rough start.
     """
 
@@ -71,8 +68,8 @@ class Schedule:
     refine: int = 60
     trial: int = 30
     whole: int = 100
-    polish: int = 40
     quiet: int = 240
+    whole_rate: float = 0.5
     later_rate: float = 0.5
     offset_rate: float = 4.0
 
@@ -127,9 +124,8 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     stages = _on_the_slab(facts, schedule) if choosing else []
     if not choosing and not facts.settled:
         stages.append(FitStage("start noise", "noise", "whole", "simple", _START, standardise=True))
-    warm = choosing and facts.whole_slab
-    usual = schedule.quiet if facts.quiet else schedule.polish if warm else schedule.whole
-    stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps, warm=warm)
+    usual = schedule.quiet if facts.quiet else schedule.whole
+    stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps)
     if facts.quiet and not facts.settled:
         stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.refine, standardise=True))
     return stages
@@ -162,30 +158,23 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     return stages
 
 
-def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: bool) -> list[FitStage]:
+def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitStage]:
+    """From the coarse reconstruction again, under what is chosen: steps under other noise or another weight leave traces."""
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    later, left, stages = schedule.later_rate, num_steps, list[FitStage]()
     usual = 0.0 if facts.hold_offset else 1.0
-    if not warm:
-        hasten = usual * (schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0)
-        begin = num_steps // 4  # the simple noise pulls at a rough signal steadily
-        if begin:
-            stages.append(
-                FitStage("begin", "signal", "whole", "simple", begin, half=facts.can_halve, offset_rate=hasten)
-            )
-            left -= begin
-        if begin and facts.can_halve:
-            stages.append(FitStage("coarse", "signal", "whole", noise, begin, rate=later, offset_rate=usual, half=True))
-            left -= begin
-    if not facts.learn_noise or facts.settled or left < 2:
-        return [*stages, FitStage("fit", "signal", "whole", noise, left, rate=later, offset_rate=usual)]
-    last = max(1, left // 3)
-    return [
-        *stages,
-        FitStage("fit", "signal", "whole", noise, left - last, rate=later, offset_rate=usual),
-        FitStage("refine noise on the volume", "noise", "whole", noise, schedule.refine),
-        FitStage("finish", "signal", "whole", noise, last, rate=later / 2, offset_rate=usual),
-    ]
+    hasten = usual * (schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0)
+    quarter, stages = num_steps // 4, list[FitStage]()
+
+    def add(name: str, model: Noise, steps: int, *, half: bool = False, offset_rate: float = usual) -> None:
+        rate = schedule.whole_rate
+        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, offset_rate=offset_rate))
+
+    if quarter:  # the simple noise pulls at a rough signal steadily
+        add("begin", "simple", quarter, half=facts.can_halve, offset_rate=hasten)
+    if quarter and facts.can_halve:
+        add("coarse", noise, quarter, half=True)
+    add("fit", noise, num_steps - sum(stage.num_steps for stage in stages))
+    return stages
 
 
 def total_steps(stages: Sequence[FitStage]) -> int:

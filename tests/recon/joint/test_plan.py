@@ -16,25 +16,8 @@ from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 PLANS = {
-    "everything chosen, large": (
-        Facts(can_halve=True),
-        """
-        slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  60 x 2  chosen
-        slab   adapt                        signal      30  chosen, rate 0.5
-        slab   refine noise                 noise       60  chosen
-        slab   choose weight                weights     30 x 5  chosen, rate 0.5
-        slab   refine noise at the weight   noise       60  chosen
-        whole  begin                        signal      25  simple, rate 1, half resolution
-        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
-        whole  fit                          signal      34  chosen, rate 0.5
-        whole  refine noise on the volume   noise       60  chosen
-        whole  finish                       signal      16  chosen, rate 0.25
-        """,
-    ),
     "everything chosen, small": (
-        Facts(whole_slab=True),
+        Facts(),
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
@@ -43,9 +26,8 @@ PLANS = {
         slab   refine noise                 noise       60  chosen
         slab   choose weight                weights     30 x 5  chosen, rate 0.5
         slab   refine noise at the weight   noise       60  chosen
-        whole  fit                          signal      27  chosen, rate 0.5
-        whole  refine noise on the volume   noise       60  chosen
-        whole  finish                       signal      13  chosen, rate 0.25
+        whole  begin                        signal      25  simple, rate 0.5
+        whole  fit                          signal      75  chosen, rate 0.5
         """,
     ),
     "least squares, weight given, offset hidden": (
@@ -56,17 +38,30 @@ PLANS = {
         slab   learn noise                  noise       60  simple
         slab   adapt                        signal      30  simple, rate 0.5
         slab   refine noise                 noise       60  simple
-        whole  begin                        signal      25  simple, rate 1, offset x 4
-        whole  fit                          signal      50  simple, rate 0.5
-        whole  refine noise on the volume   noise       60  simple
-        whole  finish                       signal      25  simple, rate 0.25
+        whole  begin                        signal      25  simple, rate 0.5, offset x 4
+        whole  fit                          signal      75  simple, rate 0.5
+        """,
+    ),
+    "everything chosen, large": (
+        Facts(can_halve=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1
+        slab   choose noise                 candidates  60 x 2  chosen
+        slab   adapt                        signal      30  chosen, rate 0.5
+        slab   refine noise                 noise       60  chosen
+        slab   choose weight                weights     30 x 5  chosen, rate 0.5
+        slab   refine noise at the weight   noise       60  chosen
+        whole  begin                        signal      25  simple, rate 0.5, half resolution
+        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
+        whole  fit                          signal      50  chosen, rate 0.5
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
         """
         whole  start noise                  noise       10  simple
-        whole  begin                        signal      25  simple, rate 1, half resolution
+        whole  begin                        signal      25  simple, rate 0.5, half resolution
         whole  coarse                       signal      25  chosen, rate 0.5, half resolution
         whole  fit                          signal      50  chosen, rate 0.5
         """,
@@ -74,7 +69,7 @@ PLANS = {
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      25  simple, rate 1
+        whole  begin                        signal      25  simple, rate 0.5
         whole  fit                          signal      75  chosen, rate 0.5
         """,
     ),
@@ -88,11 +83,9 @@ PLANS = {
         slab   refine noise                 noise       60  simple
         slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held
         slab   refine noise at the weight   noise       60  simple
-        whole  begin                        signal      60  simple, rate 1, offset held, half resolution
+        whole  begin                        signal      60  simple, rate 0.5, offset held, half resolution
         whole  coarse                       signal      60  simple, rate 0.5, offset held, half resolution
-        whole  fit                          signal      80  simple, rate 0.5, offset held
-        whole  refine noise on the volume   noise       60  simple
-        whole  finish                       signal      40  simple, rate 0.25, offset held
+        whole  fit                          signal      120  simple, rate 0.5, offset held
         whole  describe noise               noise       60  chosen
         """,
     ),
