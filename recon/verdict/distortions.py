@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
-NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "blur", "brightness", "background")
+NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "brightness", "background")
 _DEGREE = 5  # of the curves over the tilts: drifts and wrong angles are smooth, noise is not
 
 
@@ -59,7 +58,7 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
 def _units(residuals: Residuals) -> tuple[float, ...]:
     """From coefficients to pixels at the edge, and to shares of the contrast."""
     edge = residuals.images.shape[2] / 2
-    return 1.0, 1.0, edge, edge, edge, 1.0, 1.0, 1 / max(residuals.contrast, 1e-30)
+    return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30)
 
 
 def _fields(residuals: Residuals) -> list[tuple[Array, Array]]:
@@ -73,7 +72,7 @@ def _fields(residuals: Residuals) -> list[tuple[Array, Array]]:
         right = np.gradient(image, axis=1)
         columns = (down, right, along * down + across * right, along * right - across * down)
         brightness = image - image.mean()
-        parts = [*columns, by_angle[tilt], ndimage.laplace(image) / 2, brightness, np.ones_like(image)]
+        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image)]
         found.append((np.stack([part.ravel() for part in parts], 1), residual.ravel().astype(np.float64)))
     return found
 

@@ -15,7 +15,6 @@ _MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for 
 _AT_ANGLES = 0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
 _TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.046
 _BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
-_BLUR = 0.4  # squared pixels of blur
 _RESIDUAL = 0.06  # share of the structure that the volume leaves
 
 
@@ -31,7 +30,7 @@ def image_findings(
         "noise over contrast": residuals.noise / max(residuals.contrast, 1e-30),
         "distortions": {name: _as_dict(one) for name, one in found.items()},
     }
-    findings = [*_shifts(found), *_geometry(found), *_turned(found), *_beam(found), *_focus(found)]
+    findings = [*_shifts(found), *_geometry(found), *_turned(found), *_beam(found)]
     if share - 3 * error > _RESIDUAL:
         words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
         findings.append(Finding("residuals", min(3.5, (share - 3 * error) / _RESIDUAL), words, "look at the residuals in the report for what moves", "general"))
@@ -97,14 +96,6 @@ def _beam(found: dict[str, Distortion]) -> list[Finding]:
     size = max(found[name].size, found[name].smooth)
     words = f"the {name} changes from tilt to tilt by {size:.0%} of the contrast against the volume"
     return [Finding("beam", strengths[name], words, "normalise the images by their incident beam, or check the mode")]
-
-
-def _focus(found: dict[str, Distortion]) -> list[Finding]:
-    strength = _strength(found["blur"], _BLUR, _BLUR)
-    if strength < 1:
-        return []
-    words = "some tilts are blurred against the volume and others are not: focus or resolution changes along the series"
-    return [Finding("resolution", strength, words, "leave the blurred tilts out, or see --defocus")]
 
 
 def _as_dict(one: Distortion) -> dict[str, float]:

@@ -15,7 +15,7 @@ from recon.verdict.verdict import Finding
 Array = NDArray[Any]
 _WEDGE, _GAP, _FEWEST = 90.0, 15.0, 20  # degrees without data: with more, most directions are guessed; tilts
 _LEFT_OUT = 0.1  # of the tilts: so many are no exceptions
-_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of the usual agreement with what the others predict; of the tilts
+_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of a tilt's own structure that the others predict; of the tilts
 _TWINS = 0.2  # of the structure: twins show the same object but for noise
 _RADIANS = 1.6
 _DRIFT = 0.2  # of the beam: the fit follows a drift, but not exactly
@@ -105,8 +105,8 @@ def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Findin
     measured, predicted = (each - each.mean((1, 2), keepdims=True) for each in (coarse.images, coarse.images - errors))
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
-    usual = float(np.median(agreement))
-    foreign = agreement + 3 * chance < _FOREIGN * usual
+    own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
+    foreign = agreement + 3 * chance < _FOREIGN * own
     share = float(foreign.mean())
     evidence = {"tilts unlike the others": int(foreign.sum())}
     if share <= _FOREIGN_SHARE:
