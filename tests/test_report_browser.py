@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
-from recon.methods.methods import reconstruct
+from recon.methods._registry import reconstruct
 from recon.report.page import even_odd, reconstruction_report
 from recon.series.tilt_series import Volume, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series

@@ -2,33 +2,64 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Mapping
 from importlib.metadata import entry_points, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 import noiseflow
 from noiseflow.io import atomic_path, check_output
+from noiseflow.models.base import NoiseModelBase
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
+Kind = TypeVar("Kind", bound=type[NoiseModelBase])
+_REGISTERED: dict[str, type[NoiseModelBase]] = {}
+
+
+def register(kind: Kind) -> Kind:
+    """Let model files name a class of noise models; a class decorator. No package needs to be installed.
+
+    A program that loads such a file registers the class too, before `load`: a file holds parameters and never code.
+
+    Args:
+        kind: a concrete subclass of `NoiseModelBase`; its ``config()`` gives the arguments that make the model again.
+
+    Raises:
+        TypeError: not a noise model, or an abstract one.
+        ValueError: another class has that name already.
+    """
+    if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
+        raise TypeError(
+            f"{kind!r} is no class of noise models; derive it from noiseflow.NoiseModelBase and give it forward()"
+        )
+    taken = kinds().get(kind.__name__)
+    if taken is not None and (taken.__module__, taken.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(
+            f"{kind.__name__} is the name of {taken.__module__}.{taken.__qualname__}; give the class another"
+        )
+    _REGISTERED[kind.__name__] = kind
+    return kind
+
+
 def kinds() -> dict[str, type[nn.Module]]:
-    """Every noise model that a file may name: the public ones here, and those of installed packages (entry points
-    ``noiseflow.noise_models``)."""
+    """Every noise model that a file may name: the public ones here, those given to `register`, and those of installed packages
+    (entry points ``noiseflow.noise_models``)."""
     own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
     found = {
         name: kind
         for name, kind in own.items()
-        if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")
+        if inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
     }
-    return found | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
+    return found | _REGISTERED | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
 
 
 def save(
@@ -153,7 +184,8 @@ def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
         raise ValueError(
-            f"{kind} is not a known kind of noise model; register it as an entry point of 'noiseflow.noise_models'"
+            f"{kind} is not a known kind of noise model; put @noiseflow.register before its class, or name it under the "
+            "entry points 'noiseflow.noise_models' of a package"
         )
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
@@ -162,6 +194,8 @@ def _describe(model: nn.Module) -> dict[str, Any]:
 def _build(description: Mapping[str, Any]) -> nn.Module:
     known = kinds()
     if description["kind"] not in known:
-        raise ValueError(f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}")
+        raise ValueError(
+            f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}; import what registers it"
+        )
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
     return known[description["kind"]](**description["arguments"], **inner)

@@ -83,6 +83,10 @@ class TiltSeries:
         """(tilt, y, u), True for the pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
+    def rows(self, rows: slice) -> TiltSeries:
+        """Some rows (y) of all images."""
+        return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
+
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice."""
         mask = None if self.mask is None else self.mask[tilts]

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from recon.joint.joint import JointReconstructor
-from recon.methods.methods import Outcome
 from recon.metrics.metrics import compare
 from recon.projection.image_formation import Linear, Transmission
+from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.screening import screen
 from recon.series.tilt_series import Volume
@@ -100,7 +100,9 @@ def test_intensity_and_offset_of_every_tilt_are_in_the_report(tmp_path):
     _, clean, _ = scene(size=16)
     volume, steady = Volume(np.zeros((16, 16, 16), np.float32)), [0.0] * clean.num_tilts
     for changing, found in ((steady, False), (np.linspace(1, 2, clean.num_tilts).tolist(), True)):
-        outcome = Outcome(volume, clean.images, "l2", None, None, {}, {}, {"intensity": changing, "offset": steady})
+        outcome = Reconstruction(
+            volume, clean.images, "l2", None, None, {}, {}, {"intensity": changing, "offset": steady}
+        )
         page = reconstruction_report(clean, outcome, []).save(tmp_path / "page.html")
         assert ("Beam and detector" in page.read_text(encoding="utf-8")) is found
 
