@@ -498,5 +498,8 @@ def _turned_volume(volume: Array, degrees: float) -> Array:
     """A volume turned about the tilt axis so that its images at θ + `degrees` are those of the volume at θ."""
     theta, size = np.deg2rad(degrees), (np.array(volume.shape)[[0, 2]] - 1) / 2
     matrix = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-    slices = [ndimage.affine_transform(volume[:, row], matrix, size - matrix @ size, order=1) for row in range(volume.shape[1])]
+    slices = [
+        ndimage.affine_transform(volume[:, row], matrix, size - matrix @ size, order=1)
+        for row in range(volume.shape[1])
+    ]
     return np.stack(slices, 1)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from noiseflow.report import COLOURS, Report, add_legend, new_chart
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
+from recon.verdict.expected import expected_images
 from recon.verdict.residuals import Residuals
-from recon.verdict.verdict import Verdict
+from recon.verdict.verdict import Result, Verdict
 
 _WORDS = {
     "good": "Good: nothing speaks against this volume.",
@@ -20,7 +21,7 @@ _WORDS = {
 }
 
 
-def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, result: Any) -> None:
+def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, result: Result) -> None:
     """Add heading, grade, reasons and charts of a verdict to a report.
 
     Args:
@@ -33,7 +34,7 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
-    residuals = Residuals.of(tilt_series, result.projections)
+    residuals = Residuals.of(tilt_series, expected_images(result))
     found = distortions(residuals)
     angles = residuals.tilt_angles
     shifts = {name: found[name].values for name in ("shift across", "shift along y")}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -82,7 +81,10 @@ class Geometry:
         """The best other scale of the tilt angles."""
         widest = float(np.abs(self.coarse.tilt_angles).max())
         scales = [scale for scale in _SCALES if scale * widest <= 95]
-        return max((self._with(f"multiplied by {scale:g}", tilt_angles=self.coarse.tilt_angles * scale) for scale in scales), key=_share)
+        return max(
+            (self._with(f"multiplied by {scale:g}", tilt_angles=self.coarse.tilt_angles * scale) for scale in scales),
+            key=_share,
+        )
 
     def thicker(self) -> Gain:
         """A volume as deep as wide, where it is thinner."""
@@ -124,5 +126,5 @@ def _smaller(*gains: Gain) -> Gain:
 
 
 def _turned(images: Array, degrees: float) -> Array:
-    turn: Callable[[Array], Array] = lambda image: ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest")  # noqa: E731
-    return np.stack([turn(image) for image in images])
+    turned = [ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest") for image in images]
+    return np.stack(turned)

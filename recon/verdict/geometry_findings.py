@@ -45,17 +45,25 @@ def geometry_findings(
         return evidence, [Finding("noise", 10.0, words, "use a longer exposure, or check the file")]
     findings = [*_axis(axis), *_angles(angles), *_objects(objects), *_thicker(thicker)]
     if edge > _EDGE and beyond > 0.5:
-        words = f"the object goes on beyond the sides of the images ({edge:.0%} of the mean signal is there) and the tilts contradict each other"
-        findings.append(Finding("field", min(3.5, max(1.0, 2 * beyond)), words, "use a larger field of view, or a smaller object"))
+        words = f"the object goes on beyond the sides of the images, with {edge:.0%} of the mean signal there"
+        findings.append(
+            Finding("field", min(3.5, max(1.0, 2 * beyond)), words, "use a larger field of view, or a smaller object")
+        )
     if beyond >= 1:
         words = (
             f"{gap.share:.0%} of the structure of tilts left out in gaps is not explained by the others, where a right volume "
             f"would leave {expected.share:.0%}"
         )
-        findings.append(Finding("consistency", min(beyond, 3.5), words, "check axis, shifts and angles of the series", "general"))
+        findings.append(
+            Finding("consistency", min(beyond, 3.5), words, "check axis, shifts and angles of the series", "general")
+        )
     if gap.error > _BLUNT:
-        words = f"noise hides how much of the left-out tilts is explained, {gap.error:.0%} of their structure either way"
-        findings.append(Finding("noise", min(2.9, gap.error / _BLUNT), words, "average exposures, or bin the images", "general"))
+        words = (
+            f"noise hides how much of the left-out tilts is explained, {gap.error:.0%} of their structure either way"
+        )
+        findings.append(
+            Finding("noise", min(2.9, gap.error / _BLUNT), words, "average exposures, or bin the images", "general")
+        )
     return evidence, findings
 
 
@@ -76,15 +84,24 @@ def _angles(gain: Gain) -> list[Finding]:
 def _objects(gain: Gain) -> list[Finding]:
     if gain.share < _OBJECTS or gain.score < _OBJECTS_SCORE:
         return []
-    words = f"the series falls into two parts ({gain.what}) that contradict each other: each by itself is explained better, by {gain.share:.0%}"
-    return [Finding("specimen", min(6.0, 1 + gain.share / _OBJECTS), words, "reconstruct the parts apart; the specimen moved or changed between them")]
+    words = f"two parts of the series contradict each other ({gain.what}): each alone is explained better, by {gain.share:.0%}"
+    return [
+        Finding(
+            "specimen",
+            min(6.0, 1 + gain.share / _OBJECTS),
+            words,
+            "reconstruct the parts apart; the specimen moved or changed between them",
+        )
+    ]
 
 
 def _thicker(gain: Gain) -> list[Finding]:
     if gain.share < _THICKER or gain.score < _THICKER_SCORE:
         return []
     words = f"the volume is too thin: one {gain.what} explains left-out tilts better by {gain.share:.0%}"
-    return [Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "leave out --thickness, or give a larger one")]
+    return [
+        Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "leave out --thickness, or give a larger one")
+    ]
 
 
 def _edge(geometry: Geometry) -> float:

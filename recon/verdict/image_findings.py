@@ -12,7 +12,9 @@ from recon.verdict.verdict import Finding
 _SCATTER, _TREND, _OFFSET = 1.4, 2.1, 2.8  # standard errors: by chance 1 ± 0.1, 1 ± 0.3 and 0 ± 1 for some forty tilts
 _PIXELS, _SMOOTH_PIXELS = 0.25, 0.13  # rms; a volume takes part of every shift into itself, so more was there
 _MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for a trend, reach 0.11 where there is one
-_AT_ANGLES = 0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
+_AT_ANGLES = (
+    0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
+)
 _TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.046
 _BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
 _RESIDUAL = 0.06  # share of the structure that the volume leaves
@@ -33,7 +35,15 @@ def image_findings(
     findings = [*_shifts(found), *_geometry(found), *_turned(found), *_beam(found)]
     if share - 3 * error > _RESIDUAL:
         words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
-        findings.append(Finding("residuals", min(3.5, (share - 3 * error) / _RESIDUAL), words, "look at the residuals in the report for what moves", "general"))
+        findings.append(
+            Finding(
+                "residuals",
+                min(3.5, (share - 3 * error) / _RESIDUAL),
+                words,
+                "look at the residuals in the report for what moves",
+                "general",
+            )
+        )
     return evidence, findings
 
 
@@ -73,7 +83,9 @@ def _geometry(found: dict[str, Distortion]) -> list[Finding]:
         f"along the series the images {what} against the volume: tilt angles are wrong, the tilt axis is turned, or the specimen "
         "or its magnification changes"
     )
-    return [Finding("geometry", strengths[what], words, "check the angle file and --tilt-axis, or use --refine-alignment")]
+    return [
+        Finding("geometry", strengths[what], words, "check the angle file and --tilt-axis, or use --refine-alignment")
+    ]
 
 
 def _turned(found: dict[str, Distortion]) -> list[Finding]:
@@ -84,7 +96,8 @@ def _turned(found: dict[str, Distortion]) -> list[Finding]:
     )
     if strength < 1:
         return []
-    words = f"the images are turned against the volume, by {max(abs(turn.mean), turn.smooth):.2f} pixels at their edge and more: the tilt axis is another"
+    size = max(abs(turn.mean), turn.smooth)
+    words = f"the images are turned against the volume, by {size:.2f} pixels at their edge and more: the tilt axis is another"
     return [Finding("axis", strength, words, "give --tilt-axis, or use --refine-alignment")]
 
 

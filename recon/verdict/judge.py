@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ from recon.series.contrast import explained, invert_contrast
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, block_means
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
-from recon.verdict.distortions import Distortion, distortions
+from recon.verdict.distortions import distortions
+from recon.verdict.expected import expected_images
 from recon.verdict.fits import fit_findings
 from recon.verdict.gap_fit import Unexplained, unexplained
 from recon.verdict.geometry import Geometry
@@ -22,20 +23,10 @@ from recon.verdict.image_findings import image_findings
 from recon.verdict.pixels import pixel_findings
 from recon.verdict.residuals import Residuals
 from recon.verdict.tilts import tilt_findings
-from recon.verdict.verdict import Finding, Verdict, verdict_of
+from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
-
-
-class Result(Protocol):
-    """What of a reconstruction is judged: every method's result has it."""
-
-    @property
-    def volume(self) -> Volume: ...
-    @property
-    def projections(self) -> NDArray[np.float32]: ...
-    @property
-    def fit_result(self) -> Any: ...
+_CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
 
 
 def judge(
@@ -49,7 +40,7 @@ def judge(
 
     Args:
         tilt_series: what was reconstructed: aligned, and without the tilts that were thrown out.
-        result: volume, projections (tilt, y, u) in detector units, and the fit's history where there is one.
+        result: volume, projections (tilt, y, u) in detector units, and noise model and history of the fit where there are any.
         screening: of the tilts before some were thrown out.
         alignment: of the raw images, where they were aligned.
 
@@ -63,13 +54,14 @@ def judge(
         )
     shape = np.shape(result.volume.attenuation)
     grid = VolumeGrid(shape[0], shape[1], shape[2])
-    residuals = Residuals.of(tilt_series, result.projections)
+    expected = expected_images(result)
+    residuals = Residuals.of(tilt_series, expected)
     coarse = coarse_series(tilt_series, grid)
     geometry = Geometry(coarse)
-    gap, expected = _gaps(tilt_series, result, coarse, geometry)
+    gap, own = _gaps(tilt_series, expected, coarse, geometry)
     found = distortions(residuals)
     parts = [
-        geometry_findings(geometry, gap, expected, found),
+        geometry_findings(geometry, gap, own, found),
         image_findings(residuals, found, gap),
         tilt_findings(tilt_series, coarse, geometry.errors, screening),
         pixel_findings(tilt_series, residuals),
@@ -85,11 +77,11 @@ def judge(
 
 
 def _gaps(
-    tilt_series: TiltSeries, result: Result, coarse: Coarse, geometry: Geometry
+    tilt_series: TiltSeries, expected: Array, coarse: Coarse, geometry: Geometry
 ) -> tuple[Unexplained, Unexplained]:
     """What left-out gaps leave of the images, and what they leave of the volume's own projections, which are consistent."""
     some = tilt_series.select(coarse.tilts)
-    own = line_integrals(some, result.projections[coarse.tilts], coarse.binning)
+    own = line_integrals(some, expected[coarse.tilts], coarse.binning)
     return unexplained(coarse.images, geometry.errors), unexplained(own, geometry.fit.errors(own))
 
 
@@ -102,11 +94,13 @@ def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
     if swapped < as_given + _CONTRAST:
         return evidence, []
     other = "--mode transmission" if tilt_series.mode == "linear" else "--mode linear"
-    words = f"the contrast looks inverted: a volume explains {max(as_given, 0):.0%} of the images, and {swapped:.0%} with bright and dark swapped"
-    return evidence, [Finding("mode", 3.0 + (swapped - as_given) / _CONTRAST, words, f"give {other}, or --invert-contrast")]
-
-
-_CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
+    words = (
+        f"the contrast looks inverted: a volume explains {max(as_given, 0):.0%} of the images, and {swapped:.0%} with bright and "
+        "dark swapped"
+    )
+    return evidence, [
+        Finding("mode", 3.0 + (swapped - as_given) / _CONTRAST, words, f"give {other}, or --invert-contrast")
+    ]
 
 
 def _good(gap: Unexplained, residuals: Residuals) -> str:
@@ -115,6 +109,3 @@ def _good(gap: Unexplained, residuals: Residuals) -> str:
         f"tilts left out in gaps are explained to {min(1.0, 1 - gap.share):.1%} of their structure, and neighbouring residuals "
         f"correlate by {white:.2f} at most; the sign of the tilt angles and their zero cannot be told from images"
     )
-
-
-__all__ = ["Distortion", "judge"]

@@ -13,10 +13,15 @@ from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SATURATED = 0.005  # share of pixels amid a full neighbourhood at a limit; noise about a limit fills nine with chance 2⁻⁹
+_SATURATED = (
+    0.005  # share of pixels amid a full neighbourhood at a limit; noise about a limit fills nine with chance 2⁻⁹
+)
 _BLANK = 0.3  # the same at the end of vacuum, where a full neighbourhood loses nothing but weak contrast
 _SPIKE = 5.0  # ranges from the 0.5 to the 99.5 % quantile: noise with long tails reaches two
-_PATTERN, _PATTERN_CONTRAST = 1.6, 0.02  # variance over that by chance; share of the contrast that it must reach to matter
+_PATTERN, _PATTERN_CONTRAST = (
+    1.6,
+    0.02,
+)  # variance over that by chance; share of the contrast that it must reach to matter
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -43,7 +48,11 @@ def _saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) ->
         if share > limit and (noisy or name != empty) and (name != empty or tilt_series.mode == "transmission"):
             sentence = f"{share:.1%} of the pixels and all their neighbours stand at the {name} limit {ends[name]:.4g}"
             strength = 1 + 2 * min(1.0, share / (10 * limit))
-            findings.append(Finding("saturation", strength, sentence, "use a series that is not saturated, or mask these parts", "seen"))
+            findings.append(
+                Finding(
+                    "saturation", strength, sentence, "use a series that is not saturated, or mask these parts", "seen"
+                )
+            )
     return {"saturated": shares}, findings
 
 
@@ -54,7 +63,9 @@ def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[
         return {"spikes": far}, []
     sentence = f"{far:.2%} of the pixels lie more than {_SPIKE:g} ranges away from the others"
     strength = 1.5 + min(1.4, 500 * far)
-    return {"spikes": far}, [Finding("outliers", strength, sentence, "mask the spikes with --mask FILE, or replace them", "seen")]
+    return {"spikes": far}, [
+        Finding("outliers", strength, sentence, "mask the spikes with --mask FILE, or replace them", "seen")
+    ]
 
 
 def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
@@ -82,9 +93,16 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
     steady = float(np.var(fine.mean(0)))
     ratio = steady * len(fine) / max(float(np.var(fine)), 1e-30)
-    evidence = {"fixed pattern": {"over chance": ratio, "share of contrast": float(np.sqrt(steady)) / max(residuals.contrast, 1e-30)}}
+    evidence = {
+        "fixed pattern": {
+            "over chance": ratio,
+            "share of contrast": float(np.sqrt(steady)) / max(residuals.contrast, 1e-30),
+        }
+    }
     size = evidence["fixed pattern"]["share of contrast"]
     if ratio < _PATTERN or size < _PATTERN_CONTRAST:
         return evidence, []
-    sentence = f"the residuals hold a pattern that stays with the detector's pixels, {size:.1%} of the contrast, {ratio:.1f} times chance"
-    return evidence, [Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")]
+    sentence = f"the residuals hold a pattern of the detector's pixels, {size:.1%} of the contrast and {ratio:.1f} times chance"
+    return evidence, [
+        Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")
+    ]

@@ -12,7 +12,9 @@ from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[Any]
-_MOST_PIXELS = 4_000_000  # of a large series, the slices of most contrast: more pixels only sharpen what is sharp already
+_MOST_PIXELS = (
+    4_000_000  # of a large series, the slices of most contrast: more pixels only sharpen what is sharp already
+)
 
 
 @dataclass(frozen=True)

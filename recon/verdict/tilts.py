@@ -60,7 +60,9 @@ def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
         findings.append(Finding("range", wedge / _WEDGE, words, "add tilts, or trust only what faces the beam", "seen"))
     if inner > _GAP and len(directions) >= _FEWEST:
         words = f"the tilts leave a gap of {inner:.0f}° inside their range"
-        findings.append(Finding("range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks across it", "seen"))
+        findings.append(
+            Finding("range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks across it", "seen")
+        )
     if len(directions) < _FEWEST:
         words = f"{len(directions)} different tilt angles are too few for fine detail"
         findings.append(Finding("range", min(2.9, _FEWEST / len(directions)), words, "take more tilts", "seen"))
@@ -90,12 +92,16 @@ def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
         return {}, []
     difference = (coarse.images[order][1:] - coarse.images[order][:-1])[close]
     whole = coarse.images - coarse.images.mean()
-    share = float(np.mean(difference[:, 1:] * difference[:, :-1]) / 2 / max(float(np.mean(whole[:, 1:] * whole[:, :-1])), 1e-30))
+    share = float(
+        np.mean(difference[:, 1:] * difference[:, :-1]) / 2 / max(float(np.mean(whole[:, 1:] * whole[:, :-1])), 1e-30)
+    )
     evidence = {"twins differ by": share}
     if share < _TWINS:
         return evidence, []
     words = f"images of the same angle differ by {share:.0%} of their structure"
-    return evidence, [Finding("angles", min(6.0, 3 * share / _TWINS), words, "check the list of tilt angles and its signs", "seen")]
+    return evidence, [
+        Finding("angles", min(6.0, 3 * share / _TWINS), words, "check the list of tilt angles and its signs", "seen")
+    ]
 
 
 def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
@@ -124,8 +130,17 @@ def _screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding
     evidence = {"tilts thrown out": int(screening.bad.sum()), "beam drift": drift}
     findings = []
     if share > _LEFT_OUT:
-        words = f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were left out because they do not fit the others"
-        findings.append(Finding("tilts", min(3.5, 1 + (share - _LEFT_OUT) / _LEFT_OUT), words, "align the series, or check the list of angles"))
+        words = (
+            f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were left out because they do not fit the others"
+        )
+        findings.append(
+            Finding(
+                "tilts",
+                min(3.5, 1 + (share - _LEFT_OUT) / _LEFT_OUT),
+                words,
+                "align the series, or check the list of angles",
+            )
+        )
     if drift > _DRIFT:
         words = f"the beam changes by {drift:.0%} from tilt to tilt"
         findings.append(Finding("beam", min(2.9, drift / _DRIFT), words, "normalise the images by their incident beam"))

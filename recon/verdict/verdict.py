@@ -4,13 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from recon.series.tilt_series import Volume
 
 Grade = Literal["good", "doubtful", "bad"]
 Kind = Literal["seen", "inferred", "general"]
 _KINDS = ("seen", "inferred", "general")
 BAD = 3.0  # a finding this many times beyond what is tolerable: no part of the volume is safe from it
 _TOLD = 4  # reasons: whoever mends the first ones judges again
+
+
+class Result(Protocol):
+    """What of a reconstruction is judged: every method's result has it."""
+
+    @property
+    def volume(self) -> Volume: ...
+    @property
+    def projections(self) -> NDArray[np.float32]: ...
+    @property
+    def fit_result(self) -> Any: ...
+    @property
+    def noise_model(self) -> nn.Module | None: ...
 
 
 @dataclass(frozen=True)
@@ -74,11 +93,13 @@ def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: s
     if not found:
         return Verdict("good", (good,), evidence)
     first = _unrepeated(found)[:_TOLD]
-    reasons = tuple(f"{each.sentence}; {each.advice}" for each in first)
-    bad = any(each.bad for each in found)
-    if bad:
-        reasons = (f"{_capital(first[0].advice)}: {_small(first[0].sentence)}", *reasons[1:])
-    return Verdict("bad" if bad else "doubtful", reasons, evidence, tuple(first))
+    reasons = [f"{each.sentence}; {each.advice}" for each in first]
+    worst = next((each for each in first if each.bad), None)
+    if worst is not None:  # what to try stands before everything else
+        number = first.index(worst)
+        reasons[number] = worst.sentence
+        reasons[0] = f"{_capital(worst.advice)}: {_small(reasons[0])}"
+    return Verdict("doubtful" if worst is None else "bad", tuple(reasons), evidence, tuple(first))
 
 
 def _unrepeated(findings: list[Finding]) -> list[Finding]:
