@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, block_means
+from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import distortions
 from recon.verdict.expected import expected_images
