@@ -15,6 +15,7 @@ from .models.baselines import Poisson as Poisson
 from .models.digitisation import Digitisation as Digitisation
 from .models.digitisation import detect_digitisation as detect_digitisation
 from .models.digitised import Digitised as Digitised
+from .models.excess_noise import ExcessNoise as ExcessNoise
 from .models.flow import RadialFlow as RadialFlow
 from .models.flow import SignalDependentGaussian as SignalDependentGaussian
 from .models.flow import SplineFlow as SplineFlow

@@ -15,6 +15,8 @@ from .projection.projector import SliceProjector as SliceProjector
 from .projection.sirt import sirt as sirt
 from .projection.wbp import wbp as wbp
 from .reconstruction import Reconstruction as Reconstruction
+from .series.prepare import Prepared as Prepared
+from .series.prepare import prepare as prepare
 from .series.tilt_series import TiltSeries as TiltSeries
 from .series.tilt_series import Volume as Volume
 from .series.tilt_series import VolumeGrid as VolumeGrid

@@ -50,7 +50,8 @@ class WithMaps(ModelAround):
             raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or two of one size")
         self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
         self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
-        if not bool((torch.isfinite(self.gain) & torch.isfinite(self.offset) & (self.gain > 0)).all()):
+        given = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
+        if not all(bool(torch.isfinite(each).all()) for each in given):
             raise ValueError(
                 "some gains are not positive, or gains or offsets are NaN; mend or mask these pixels' maps"
             )

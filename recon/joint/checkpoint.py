@@ -25,6 +25,8 @@ from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.io import atomic_path
 from recon.joint.stages import Stage
+from recon.joint.state_files import read_state as read_state
+from recon.joint.state_files import write_state as write_state
 
 StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)`` after every step of every fit."""
@@ -234,59 +236,3 @@ def _replay(
         tables.table, tables.resume = None, kept["tables"]
     torch.set_rng_state(kept["rng"])
     return FitResult(models["noise_model"], **kept["result"])
-
-
-def write_state(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts and lists of tensors, numbers and strings, all at once or not at all."""
-    from safetensors.torch import save_file
-
-    tensors: dict[str, Tensor] = {}
-    description = json.dumps(_packed(state, tensors))
-    with atomic_path(path) as partial:
-        save_file(tensors, partial, metadata={"format": _FORMAT, "state": description})
-
-
-def read_state(path: Path) -> dict[str, Any]:
-    """Read what `write_state` wrote.
-
-    Raises:
-        ValueError: another file, or a damaged one.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            packed = json.loads((file.metadata() or {})["state"])
-            state: dict[str, Any] = _unpacked(packed, file)
-    except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise ValueError(
-            f"checkpoint {path} is damaged ({type(error).__name__}); leave out --resume to start over"
-        ) from error
-    return state
-
-
-def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
-    if isinstance(value, Tensor):
-        name = str(len(tensors))
-        kept = value.detach().cpu().contiguous()
-        whole = kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
-        shared = any(kept.data_ptr() == other.data_ptr() for other in tensors.values())
-        tensors[name] = kept if whole and not shared else kept.clone()
-        return {"tensor": name}
-    if isinstance(value, dict):
-        return {"dict": [[key, _packed(item, tensors)] for key, item in value.items()]}
-    if isinstance(value, (list, tuple)):
-        return {"list": [_packed(item, tensors) for item in value]}
-    if isinstance(value, (str, int, float, bool, type(None))):
-        return value
-    raise TypeError(f"a checkpoint cannot hold {type(value).__name__}")
-
-
-def _unpacked(value: Any, file: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    if "tensor" in value:
-        return file.get_tensor(value["tensor"])
-    if "dict" in value:
-        return {key: _unpacked(item, file) for key, item in value["dict"]}
-    return [_unpacked(item, file) for item in value["list"]]

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
@@ -17,6 +16,7 @@ from torch import nn
 
 from noiseflow.described import described
 from noiseflow.kept_memory import kept_memory
+from noiseflow.plugins import load_plugin, plugins
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
@@ -111,7 +111,7 @@ def method_names() -> list[str]:
     """All methods, without importing any: those of this package, then those of others (entry points ``noiseflow.methods``)."""
     own = [module.name for module in iter_modules([str(Path(__file__).parent)]) if not module.name.startswith("_")]
     names = sorted(name.replace("_", "-") for name in own)
-    return ["auto", *(name for name in names if name != "auto"), *sorted(entry.name for entry in _others())]
+    return ["auto", *(name for name in names if name != "auto"), *sorted(plugins(_GROUP))]
 
 
 @cache
@@ -123,15 +123,11 @@ def find_method(name: str) -> Method:
     """
     if name not in method_names():
         raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
-    other = next((entry for entry in _others() if entry.name == name), None)
-    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else other.load()
+    other = plugins(_GROUP).get(name)
+    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; a method is a recon.methods.Method")
     return found
-
-
-def _others() -> list[Any]:
-    return list(entry_points(group=_GROUP))
 
 
 def settings_of(method: str, **settings: Any) -> Settings:
@@ -174,10 +170,24 @@ def reconstruct(
         scratch: with `slices_at_once`, a new ``.npy`` file that holds the volume; the result maps it to memory.
         **settings: the attributes of `Settings`.
 
+    Returns:
+        The volume, projections in the order of the tilts, and the response by rising angle.
+
     Raises:
         ValueError: an unknown method, settings that make no sense, or a grid that does not match the images.
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
+    order = np.argsort(tilt_series.tilt_angles, kind="stable")
+    if (np.diff(order) != 1).any():  # the order of the tilts must not change the volume by a bit
+        result = reconstruct(
+            tilt_series.select(order),
+            grid,
+            method=method,
+            slices_at_once=slices_at_once,
+            scratch=scratch,
+            **settings,
+        )
+        return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
         return found.run(tilt_series, grid, chosen)
