@@ -139,9 +139,14 @@ def needle(options: Options) -> dict[str, Any]:
 def sabotage(options: Options) -> dict[str, Any]:
     """Series spoilt on purpose: whether the verdict sees it and names the reason."""
     results = options.results_of_series("sabotage")
-    effort = {"method": "l2" if options.quick else "joint", "quick": options.quick}
-    seed = options.scene["seed"]
-    benchmark_sabotage.run(results, options.output.line, size=options.size, seed=seed, **effort)
+    benchmark_sabotage.run(
+        results,
+        options.output.line,
+        size=options.size,
+        method="l2" if options.quick else "joint",
+        seed=options.scene["seed"],
+        quick=options.quick,
+    )
     return _told(options, results, benchmark_sabotage.table(results.cells))
 
 

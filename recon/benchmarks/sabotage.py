@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,12 +36,12 @@ Result = tuple[TiltSeries, Any, Verdict]
 def run(results: Results, line: Callable[[str], None], *, size: int, method: str, seed: int, quick: bool) -> None:
     """Fill a cell for each good series, and for each scene and way of spoiling it; what is there already is kept."""
     for phantom, noise in SCENES if quick else STANDARD:
-        _cell(results, line, f"good/{phantom}, {noise}", lambda p=phantom, n=noise: _good(p, n, size, method, seed))
+        _cell(results, line, f"good/{phantom}, {noise}", partial(_good, phantom, noise, size, method, seed))
     _cell(results, line, "good/needle", lambda: _graded(_result(load(), method, seed)[2]))
     for phantom, noise in SCENES[:1] if quick else SCENES:
         for name in WAYS:
             key = f"{phantom}, {noise}/{name}"
-            _cell(results, line, key, lambda p=phantom, n=noise, w=name: _spoilt(p, n, w, size, method, seed))
+            _cell(results, line, key, partial(_spoilt, phantom, noise, name, size, method, seed))
 
 
 def _cell(results: Results, line: Callable[[str], None], key: str, compute: Callable[[], Cell]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.metrics.comparison import project
-from recon.series.tilt_series import TiltSeries
+from recon.series.tilt_series import Mode, TiltSeries
 
 Array = NDArray[Any]
 
@@ -241,7 +241,7 @@ def _jittered(source: Source) -> TiltSeries:
 
 @way("wrong mode", "mode")
 def _mode(source: Source) -> TiltSeries:
-    other = "transmission" if source.series.mode == "linear" else "linear"
+    other: Mode = "transmission" if source.series.mode == "linear" else "linear"
     return replace(source.series, mode=other)
 
 

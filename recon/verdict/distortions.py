@@ -92,7 +92,7 @@ def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
     inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))
     found = inverse @ (scaled.T @ residual)
     left = scaled * (residual - scaled @ found)[:, None]
-    variance = np.diag(inverse @ (left.T @ left) @ inverse)
+    variance: Array = np.diag(inverse @ (left.T @ left) @ inverse)
     return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
 
 
@@ -108,7 +108,7 @@ def _over_tilts(values: Array, errors: Array, residuals: Residuals) -> Distortio
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
     curve = covariance @ (basis.T @ (weights * values))
     inside = np.linalg.pinv(covariance[1:, 1:])
-    trend = float(np.sqrt(max(0.0, curve[1:] @ inside @ curve[1:]) / (len(curve) - 1)))
+    trend = float(np.sqrt(max(0.0, float(curve[1:] @ inside @ curve[1:])) / (len(curve) - 1)))
     smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
     left = 1.4826 * float(np.median(np.abs(away - basis @ curve + mean)))
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(errors**2)))))

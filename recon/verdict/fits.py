@@ -8,15 +8,20 @@ from typing import Any
 from recon.series.alignment import Alignment
 from recon.verdict.verdict import Finding
 
+_MARGIN = 2.0  # standard errors: a lead that chance gives once in forty
 _JUMP = 0.1  # nats per pixel that a fit ends above its best: later steps change the likelihood by some thousandths
 
 
 def fit_findings(result: Any, alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings about the held-out likelihood and the axis."""
     evidence, findings = _history(getattr(result, "fit_result", None))
-    margin = getattr(alignment, "margin", None)
-    if margin is not None and isinstance(margin, int | float):
-        evidence["axis margin"] = float(margin)
+    if alignment is None or alignment.margin is None:
+        return evidence, findings
+    evidence["axis margin"] = alignment.margin
+    if alignment.margin < _MARGIN:
+        words = f"another tilt axis explains the images nearly as well, {alignment.margin:.1f} standard errors behind"
+        advice = "give the direction with --tilt-axis"
+        findings = [*findings, Finding("axis", min(2.9, _MARGIN / max(alignment.margin, 0.1)), words, advice)]
     return evidence, findings
 
 

@@ -115,7 +115,7 @@ def _structure(geometry: Geometry) -> float:
     """What neighbouring pixels share, in standard errors of chance: along y or u, whichever is more."""
     images = geometry.coarse.images
     flat = images - images.mean((1, 2), keepdims=True)
-    chance = max(float(np.mean(flat**2)) / np.sqrt(flat.size), 1e-30)
+    chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
     return max(neighbours(flat, axis) for axis in (1, 2)) / chance
 
 
