@@ -13,6 +13,7 @@ from recon.benchmarks import ablations as benchmark_ablations
 from recon.benchmarks import needle as benchmark_needle
 from recon.benchmarks import paper as benchmark_paper
 from recon.benchmarks import rivals as benchmark_rivals
+from recon.benchmarks import sabotage as benchmark_sabotage
 from recon.benchmarks.rivals import Effort
 from recon.benchmarks.scenes import Results, make_scene
 from recon.methods._classical import part_of
@@ -55,6 +56,10 @@ class Options:
         if self.again:
             results.forget(self.again)
         return results
+
+    def results_of_series(self, name: str) -> Results:
+        """The kept results of a benchmark that has scenes of its own, of this size."""
+        return self._kept(name, str(self.size), str(self.scene["seed"]))
 
     def results_on_real_data(self, name: str) -> Results:
         """The kept results of a benchmark that has data of its own."""
@@ -131,6 +136,20 @@ def needle(options: Options) -> dict[str, Any]:
     return _told(options, results, benchmark_needle.table(results.cells))
 
 
+def sabotage(options: Options) -> dict[str, Any]:
+    """Series spoilt on purpose: whether the verdict sees it and names the reason."""
+    results = options.results_of_series("sabotage")
+    benchmark_sabotage.run(
+        results,
+        options.output.line,
+        size=options.size,
+        method="l2" if options.quick else "joint",
+        seed=options.scene["seed"],
+        quick=options.quick,
+    )
+    return _told(options, results, benchmark_sabotage.table(results.cells))
+
+
 def _told(options: Options, results: Results, table: tuple[tuple[str, ...], list[tuple[str, ...]]]) -> dict[str, Any]:
     options.output.table(*table)
     options.output.line(f"results: {results.path}")
@@ -144,5 +163,6 @@ BENCHMARKS: dict[str, Callable[[Options], dict[str, Any]]] = {
     "paper-table": paper_table,
     "ablations": ablations,
     "needle": needle,
+    "sabotage": sabotage,
 }
 """Benchmarks by name."""

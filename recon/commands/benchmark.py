@@ -14,7 +14,7 @@ def benchmark(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="rivals, slow-rivals, resolution, paper-table, ablations, needle; the first alone if not given."
+            help="rivals, slow-rivals, resolution, paper-table, ablations, needle, sabotage; the first alone if not given."
         ),
     ] = None,
     size: Annotated[int | None, typer.Option(help="Voxels along each edge; 64, or 48 with --quick.")] = None,

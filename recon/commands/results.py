@@ -18,6 +18,8 @@ from recon.commands.inputs import Prepared
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
+from recon.verdict.judge import judge
+from recon.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -57,20 +59,30 @@ class Targets:
         halves: tuple[Volume, Volume] | None = None,
         reference: Volume | None = None,
         warned: Sequence[str] = (),
-    ) -> None:
-        """Write what was asked for and tell what was found."""
+    ) -> Verdict:
+        """Write what was asked for, report what was found, and return the verdict."""
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
         outcome.volume.write(self.volume)
+        verdict = judge(tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment)
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])
         output.table(("figure", "value"), list(rows.items()))
         output.line(f"volume: {self.volume}")
+        for line in verdict.lines():
+            output.line(line)
         page = None
         if self.report is not None:
             self.report.mkdir(parents=True, exist_ok=True)
             content = reconstruction_report(
-                tilt_series, outcome, list(rows.items()), inputs=inputs, seed=seed, halves=halves, reference=reference
+                tilt_series,
+                outcome,
+                list(rows.items()),
+                inputs=inputs,
+                seed=seed,
+                halves=halves,
+                reference=reference,
+                verdict=verdict,
             )
             page = content.save(self.report / "index.html")
             output.line(f"report: {page}")
@@ -80,9 +92,10 @@ class Targets:
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
-            | {"seconds": seconds}
+            | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
+        return verdict
 
 
 def _save_noise_model(outcome: Reconstruction, path: Path, source: Path) -> None:

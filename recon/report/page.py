@@ -15,7 +15,9 @@ from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_char
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.noise import noise_charts
+from recon.report.verdict import add_verdict
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.verdict.verdict import Verdict
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
@@ -38,6 +40,7 @@ def reconstruction_report(
     seed: int | None = None,
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
+    verdict: Verdict | None = None,
 ) -> Report:
     """A page with slices, the tilt series against its prediction, the noise, the fit's course, settings and provenance.
 
@@ -49,9 +52,12 @@ def reconstruction_report(
         seed: of the random choices.
         halves: reconstructions of the even and of the odd tilts, for the Fourier shell correlation.
         reference: a volume to correlate with instead.
+        verdict: stands first, with its pictures.
     """
     name = Path(inputs[0]).name if inputs else "tilt series"
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
+    if verdict is not None:
+        add_verdict(report, verdict, tilt_series, outcome)
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
     _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
     _add_tilts(report, tilt_series, outcome)

@@ -1,0 +1,60 @@
+"""The verdict on top of a report: its grade, its reasons and the pictures that show them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.report import COLOURS, Report, add_legend, new_chart
+from recon.series.tilt_series import TiltSeries
+from recon.verdict.distortions import distortions
+from recon.verdict.expected import expected_images
+from recon.verdict.residuals import Residuals
+from recon.verdict.verdict import Result, Verdict
+
+_WORDS = {
+    "good": "Good: nothing speaks against this volume.",
+    "doubtful": "Doubtful: parts of this volume may be wrong.",
+    "bad": "Bad: do not use this volume before its first reason is mended.",
+}
+
+
+def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, result: Result) -> None:
+    """Add heading, grade, reasons and charts of a verdict to a report.
+
+    Args:
+        report: the page so far.
+        verdict: to show.
+        tilt_series: what was reconstructed.
+        result: whose projections are compared with it.
+    """
+    report.heading("Verdict")
+    report.text(_WORDS[verdict.grade])
+    rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
+    report.table(("", "reason"), rows, prose=True)
+    residuals = Residuals.of(tilt_series, expected_images(result))
+    found = distortions(residuals)
+    angles = residuals.tilt_angles
+    shifts = {name: found[name].values for name in ("shift across", "shift along y")}
+    edges = {name: found[name].values for name in ("magnification", "rotation")}
+    charts = [
+        _chart("Shift of each image", "pixels", angles, shifts),
+        _chart("Magnification and rotation", "pixels at the edge", angles, edges),
+        _chart("Residual of each tilt", "rms, detector units", angles, {"residual": residuals.residual.std((1, 2))}),
+    ]
+    caption = (
+        "What each image differs by from the projection of the volume, by linear regression. Scatter about zero is chance; "
+        "waves and steps are shifts, wrong angles, or a specimen that changes. A volume follows part of each difference."
+    )
+    report.charts(charts, caption=caption)
+
+
+def _chart(title: str, unit: str, angles: NDArray[Any], curves: dict[str, NDArray[Any]]) -> Any:
+    figure, axis = new_chart(title, x="tilt, degrees", y=unit)
+    for (name, values), colour in zip(curves.items(), (COLOURS["accent"], COLOURS["warm"]), strict=False):
+        axis.plot(angles, np.asarray(values), color=colour, marker="o", markersize=2.5, label=name)
+    if len(curves) > 1:
+        add_legend(axis)
+    return figure

@@ -1,0 +1,116 @@
+"""How each image differs from the volume's projection: moved, turned, magnified, brighter or at another angle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from recon.verdict.residuals import Residuals
+
+Array = NDArray[Any]
+NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "brightness", "background")
+_DEGREE = 5  # of the curves over the tilts: drifts and wrong angles are smooth, noise is not
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """One kind of difference over all tilts.
+
+    Attributes:
+        size: rms over the tilts beyond chance and beyond the mean; pixels at the image's edge, or a share of the contrast.
+        smooth: rms of its smooth part over the tilts, alike.
+        rough: spread about its smooth part beyond chance, alike; a few tilts far out do not count.
+        mean: over all tilts, alike.
+        scatter: rms of the deviations from the mean in standard errors, 1 by chance.
+        trend: rms of the coefficients of the smooth part in standard errors, 1 by chance.
+        offset: the mean in standard errors.
+        values: (tilt,) as measured.
+    """
+
+    size: float
+    smooth: float
+    rough: float
+    mean: float
+    scatter: float
+    trend: float
+    offset: float
+    values: Array
+
+
+def distortions(residuals: Residuals) -> dict[str, Distortion]:
+    """Regress each residual on what small changes of its image would do to it, with errors that hold under any noise.
+
+    The errors are White's (doi:10.2307/1912934): noise need be neither Gaussian nor of one width. Fitted volumes take part of a
+    distortion into themselves, so what is found is a lower bound.
+    """
+    estimates, errors = zip(*(_of_tilt(*pair) for pair in _fields(residuals)), strict=True)
+    units = _units(residuals)
+    return {
+        name: _over_tilts(np.array(estimates)[:, number] * unit, np.array(errors)[:, number] * unit, residuals)
+        for number, (name, unit) in enumerate(zip(NAMES, units, strict=True))
+    }
+
+
+def _units(residuals: Residuals) -> tuple[float, ...]:
+    """From coefficients to pixels at the edge, and to shares of the contrast."""
+    edge = residuals.images.shape[2] / 2
+    return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30)
+
+
+def _fields(residuals: Residuals) -> list[tuple[Array, Array]]:
+    """For each tilt, the columns of the regression and what they shall explain."""
+    width = residuals.images.shape[2]
+    across, along = np.arange(width, dtype=np.float64) - (width - 1) / 2, residuals.height[:, None].astype(np.float64)
+    found = []
+    by_angle = _slope_over_tilts(residuals)
+    for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
+        down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
+        right = np.gradient(image, axis=1)
+        columns = (down, right, along * down + across * right, along * right - across * down)
+        brightness = image - image.mean()
+        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image)]
+        found.append((np.stack([part.ravel() for part in parts], 1), residual.ravel().astype(np.float64)))
+    return found
+
+
+def _slope_over_tilts(residuals: Residuals) -> Array:
+    """Change of the projections with the tilt angle, per radian; twins share one angle."""
+    angles, first, back = np.unique(np.round(residuals.tilt_angles, 3), return_index=True, return_inverse=True)
+    if len(angles) < 2:
+        return np.zeros_like(residuals.projections)
+    return np.asarray(np.gradient(residuals.projections[first], np.deg2rad(angles), axis=0)[back])
+
+
+def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
+    """Coefficients and their standard errors; nothing is claimed of what an image does not show."""
+    scale = np.sqrt((columns**2).sum(0)) + 1e-30
+    scaled = columns / scale
+    inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))
+    found = inverse @ (scaled.T @ residual)
+    left = scaled * (residual - scaled @ found)[:, None]
+    variance: Array = np.diag(inverse @ (left.T @ left) @ inverse)
+    return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
+
+
+def _over_tilts(values: Array, errors: Array, residuals: Residuals) -> Distortion:
+    weights = 1 / errors**2
+    mean = float((weights * values).sum() / weights.sum())
+    away = values - mean
+    count = len(values)
+    scatter = float(np.sqrt((away**2 * weights).sum() / max(1, count - 1)))
+    angles = residuals.tilt_angles
+    place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-9) - 1
+    basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
+    covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
+    curve = covariance @ (basis.T @ (weights * values))
+    inside = np.linalg.pinv(covariance[1:, 1:])
+    trend = float(np.sqrt(max(0.0, float(curve[1:] @ inside @ curve[1:])) / (len(curve) - 1)))
+    smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
+    left = 1.4826 * float(np.median(np.abs(away - basis @ curve + mean)))
+    rough = float(np.sqrt(max(0.0, left**2 - float(np.median(errors**2)))))
+    size = float(np.sqrt(max(0.0, np.mean(away**2 - errors**2))))
+    return Distortion(size, smooth, rough, mean, scatter, trend, mean * float(np.sqrt(weights.sum())), values)

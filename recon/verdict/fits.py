@@ -1,0 +1,40 @@
+"""Whether the fit arrived, and whether the alignment is determined by the images."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from recon.series.alignment import Alignment
+from recon.verdict.verdict import Finding
+
+_MARGIN = 2.0  # standard errors: a lead that chance gives once in forty
+_JUMP = 0.1  # nats per pixel that a fit ends above its best: later steps change the likelihood by some thousandths
+
+
+def fit_findings(result: Any, alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
+    """Evidence and findings about the held-out likelihood and the axis."""
+    evidence, findings = _history(getattr(result, "fit_result", None))
+    if alignment is None or alignment.margin is None:
+        return evidence, findings
+    evidence["axis margin"] = alignment.margin
+    if alignment.margin < _MARGIN:
+        words = f"another tilt axis explains the images nearly as well, {alignment.margin:.1f} standard errors behind"
+        advice = "give the direction with --tilt-axis"
+        findings = [*findings, Finding("axis", min(2.9, _MARGIN / max(alignment.margin, 0.1)), words, advice)]
+    return evidence, findings
+
+
+def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
+    history = [] if fit_result is None else [float(value) for value in dict(fit_result.history).values()]
+    if not history:
+        return {}, []
+    if not all(math.isfinite(value) for value in history):
+        words = "the held-out likelihood became infinite"
+        return {"held-out NLL jump": None}, [Finding("fit", 5.0, words, "report this series, or use --method sirt")]
+    jump = history[-1] - min(history)
+    evidence = {"held-out NLL jump": jump}
+    if jump < _JUMP:
+        return evidence, []
+    words = f"the held-out likelihood ended {jump:.2g} nats per pixel worse than it had been"
+    return evidence, [Finding("fit", min(3.5, 1 + jump / (5 * _JUMP)), words, "compare with --method l2 or sirt")]

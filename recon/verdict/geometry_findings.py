@@ -1,0 +1,123 @@
+"""What left-out gaps say about axis, angles, thickness and specimen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from recon.verdict.distortions import Distortion
+from recon.verdict.gap_fit import Unexplained
+from recon.verdict.geometry import Gain, Geometry
+from recon.verdict.residuals import neighbours
+from recon.verdict.verdict import Finding
+
+_AXIS, _AXIS_SCORE = 0.02, 1.8  # of the error of left-out tilts; standard scenes gain 0.006 at most
+_ANGLES, _ANGLES_SCORE = 0.055, 3.0  # smaller angles make any object smoother: standard scenes gain up to 0.04
+_OBJECTS, _OBJECTS_SCORE = 0.06, 1.0  # halves know less and lose 0.07 to 0.13 where they show one object
+_THICKER, _THICKER_SCORE = 0.05, 2.0
+_SLACK, _TIMES = 0.06, 3.0  # share of structure; times what the volume's own projections leave
+_EDGE = 0.4  # line integral at the sides over the mean: beyond, the object goes on there
+_STRUCTURE = 8.0  # standard errors of what neighbouring rows share
+_BLUNT = 0.1  # share of structure that noise can feign: beyond, no test below sees a spoilt series
+
+
+def geometry_findings(
+    geometry: Geometry, gap: Unexplained, expected: Unexplained, found: dict[str, Distortion]
+) -> tuple[dict[str, Any], list[Finding]]:
+    """Evidence and findings of the coarse series."""
+    tolerable = _TIMES * max(expected.share, 0.0) + _SLACK
+    beyond = float((gap.share - 2 * gap.error) / tolerable)
+    axis, objects = geometry.axis(), geometry.two_objects()
+    angles, thicker = geometry.angles(), geometry.thicker()
+    edge, structure = _edge(geometry), _structure(geometry)
+    evidence = {
+        "gap": {"unexplained": gap.share, "error": gap.error, "expected": expected.share},
+        "structure over chance": structure,
+        "other axis": _as_dict(axis),
+        "other angles": _as_dict(angles),
+        "two objects": _as_dict(objects),
+        "thicker": _as_dict(thicker),
+        "signal at the sides": edge,
+    }
+    if structure < _STRUCTURE:
+        words = "neighbouring pixels of the images share nothing beyond chance: there is no object to see"
+        return evidence, [Finding("noise", 10.0, words, "use a longer exposure, or check the file")]
+    findings = [*_axis(axis), *_angles(angles), *_objects(objects), *_thicker(thicker)]
+    if edge > _EDGE and beyond > 0.5:
+        words = f"the object goes on beyond the sides of the images, with {edge:.0%} of the mean signal there"
+        findings.append(
+            Finding("field", min(3.5, max(1.0, 2 * beyond)), words, "use a larger field of view, or a smaller object")
+        )
+    if beyond >= 1:
+        words = (
+            f"{gap.share:.0%} of the structure of tilts left out in gaps is not explained by the others, where a right volume "
+            f"would leave {expected.share:.0%}"
+        )
+        findings.append(
+            Finding("consistency", min(beyond, 3.5), words, "check axis, shifts and angles of the series", "general")
+        )
+    if gap.error > _BLUNT:
+        words = (
+            f"noise hides how much of the left-out tilts is explained, {gap.error:.0%} of their structure either way"
+        )
+        findings.append(
+            Finding("noise", min(2.9, gap.error / _BLUNT), words, "average exposures, or bin the images", "general")
+        )
+    return evidence, findings
+
+
+def _axis(gain: Gain) -> list[Finding]:
+    if gain.share < _AXIS or gain.score < _AXIS_SCORE:
+        return []
+    words = f"images {gain.what} explain each other better: left-out tilts lose {gain.share:.0%} of their error"
+    return [Finding("axis", min(6.0, 1 + gain.share / _AXIS), words, "give --tilt-axis, or use --refine-alignment")]
+
+
+def _angles(gain: Gain) -> list[Finding]:
+    if gain.share < _ANGLES or gain.score < _ANGLES_SCORE:
+        return []
+    words = f"tilt angles {gain.what} explain left-out tilts better by {gain.share:.0%} of their error"
+    return [Finding("angles", min(6.0, 1 + gain.share / _ANGLES), words, "check the list of tilt angles")]
+
+
+def _objects(gain: Gain) -> list[Finding]:
+    if gain.share < _OBJECTS or gain.score < _OBJECTS_SCORE:
+        return []
+    words = f"two parts of the series contradict each other ({gain.what}): each alone is explained better, by {gain.share:.0%}"
+    return [
+        Finding(
+            "specimen",
+            min(6.0, 1 + gain.share / _OBJECTS),
+            words,
+            "reconstruct the parts apart; the specimen moved or changed between them",
+        )
+    ]
+
+
+def _thicker(gain: Gain) -> list[Finding]:
+    if gain.share < _THICKER or gain.score < _THICKER_SCORE:
+        return []
+    words = f"the volume is too thin: one {gain.what} explains left-out tilts better by {gain.share:.0%}"
+    return [
+        Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "leave out --thickness, or give a larger one")
+    ]
+
+
+def _edge(geometry: Geometry) -> float:
+    """Line integral of the outer columns over the mean of all, averaged over tilts and rows, above the emptiest column."""
+    profile = geometry.coarse.images.mean((0, 1))
+    raised = profile - profile.min()
+    return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
+
+
+def _structure(geometry: Geometry) -> float:
+    """What neighbouring pixels share, in standard errors of chance: along y or u, whichever is more."""
+    images = geometry.coarse.images
+    flat = images - images.mean((1, 2), keepdims=True)
+    chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
+    return max(neighbours(flat, axis) for axis in (1, 2)) / chance
+
+
+def _as_dict(gain: Gain) -> dict[str, Any]:
+    return {"what": gain.what, "share": gain.share, "score": gain.score}

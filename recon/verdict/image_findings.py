@@ -1,0 +1,116 @@
+"""What the residuals of the volume say about shifts, angles, beam and fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from recon.verdict.distortions import Distortion
+from recon.verdict.gap_fit import Unexplained
+from recon.verdict.residuals import Residuals
+from recon.verdict.verdict import Finding
+
+_SCATTER, _TREND, _OFFSET = 1.4, 2.1, 2.8  # standard errors: by chance 1 ± 0.1, 1 ± 0.3 and 0 ± 1 for some forty tilts
+_PIXELS, _SMOOTH_PIXELS = 0.25, 0.13  # rms; a volume takes part of every shift into itself, so more was there
+_MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for a trend, reach 0.11 where there is one
+_AT_ANGLES = (
+    0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
+)
+_TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.046
+_BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
+_RESIDUAL = 0.06  # share of the structure that the volume leaves
+
+
+def image_findings(
+    residuals: Residuals, found: dict[str, Distortion], gap: Unexplained
+) -> tuple[dict[str, Any], list[Finding]]:
+    """Evidence and findings of the residuals at full resolution."""
+    (share, error), white = residuals.unexplained(), residuals.whiteness()
+    evidence = {
+        "residual structure": share,
+        "residual structure error": error,
+        "whiteness": white,
+        "noise over contrast": residuals.noise / max(residuals.contrast, 1e-30),
+        "distortions": {name: _as_dict(one) for name, one in found.items()},
+    }
+    findings = [*_shifts(found), *_geometry(found), *_turned(found), *_beam(found)]
+    if share - 3 * error > _RESIDUAL:
+        words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
+        findings.append(
+            Finding(
+                "residuals",
+                min(3.5, (share - 3 * error) / _RESIDUAL),
+                words,
+                "look at the residuals in the report for what moves",
+                "general",
+            )
+        )
+    return evidence, findings
+
+
+def _strength(one: Distortion, least: float, smooth: float) -> float:
+    """How far a distortion is beyond chance and beyond what matters."""
+    whole = one.size / least if one.scatter > _SCATTER else 0.0
+    curve = one.smooth / smooth if one.trend > _TREND else 0.0
+    return max(whole, curve)
+
+
+def _shifts(found: dict[str, Distortion]) -> list[Finding]:
+    across, along = found["shift across"], found["shift along y"]
+    strengths = {
+        "across the axis": _strength(across, _PIXELS, _SMOOTH_PIXELS),
+        "along the axis": _strength(along, _PIXELS, _SMOOTH_PIXELS),
+    }
+    if abs(across.offset) > _OFFSET and abs(across.mean) > _TURN:
+        strengths["across the axis"] = max(strengths["across the axis"], abs(across.mean) / _TURN)
+    where = max(strengths, key=lambda name: strengths[name])
+    if strengths[where] < 1:
+        return []
+    size = max((across if "across" in where else along).size, (across if "across" in where else along).smooth)
+    words = f"the images are shifted {where} against the volume, by {size:.2f} pixels rms and more where the volume followed them"
+    return [Finding("alignment", strengths[where], words, "align the series first, or use --refine-alignment")]
+
+
+def _geometry(found: dict[str, Distortion]) -> list[Finding]:
+    magnified, angle = found["magnification"], found["tilt angle"]
+    strengths = {
+        "grow and shrink": _strength(magnified, 2 * _PIXELS, _MAGNIFIED),
+        "seem taken at other angles": angle.rough / _AT_ANGLES if angle.scatter > _SCATTER else 0.0,
+    }
+    what = max(strengths, key=lambda each: strengths[each])
+    if strengths[what] < 1:
+        return []
+    words = (
+        f"along the series the images {what} against the volume: tilt angles are wrong, the tilt axis is turned, or the specimen "
+        "or its magnification changes"
+    )
+    return [
+        Finding("geometry", strengths[what], words, "check the angle file and --tilt-axis, or use --refine-alignment")
+    ]
+
+
+def _turned(found: dict[str, Distortion]) -> list[Finding]:
+    turn = found["rotation"]
+    strength = max(
+        _strength(turn, 2 * _PIXELS, 2 * _SMOOTH_PIXELS),
+        abs(turn.mean) / _TURN if abs(turn.offset) > _OFFSET else 0.0,
+    )
+    if strength < 1:
+        return []
+    size = max(abs(turn.mean), turn.smooth)
+    words = f"the images are turned against the volume, by {size:.2f} pixels at their edge and more: the tilt axis is another"
+    return [Finding("axis", strength, words, "give --tilt-axis, or use --refine-alignment")]
+
+
+def _beam(found: dict[str, Distortion]) -> list[Finding]:
+    strengths = {name: _strength(found[name], _BRIGHT, _BRIGHT) for name in ("brightness", "background")}
+    name = max(strengths, key=lambda each: strengths[each])
+    if strengths[name] < 1:
+        return []
+    size = max(found[name].size, found[name].smooth)
+    words = f"the {name} changes from tilt to tilt by {size:.0%} of the contrast against the volume"
+    return [Finding("beam", strengths[name], words, "normalise the images by their incident beam, or check the mode")]
+
+
+def _as_dict(one: Distortion) -> dict[str, float]:
+    names = ("size", "smooth", "rough", "mean", "scatter", "trend", "offset")
+    return {name: float(getattr(one, name)) for name in names}

@@ -1,0 +1,111 @@
+"""The verdict on a reconstruction, from its tilt series, its volume and what the volume predicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.series.alignment import Alignment
+from recon.series.contrast import explained, invert_contrast
+from recon.series.screening import Screening
+from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means
+from recon.verdict.coarse import Coarse, coarse_series, line_integrals
+from recon.verdict.distortions import distortions
+from recon.verdict.expected import expected_images
+from recon.verdict.fits import fit_findings
+from recon.verdict.gap_fit import Unexplained, unexplained
+from recon.verdict.geometry import Geometry
+from recon.verdict.geometry_findings import geometry_findings
+from recon.verdict.image_findings import image_findings
+from recon.verdict.pixels import pixel_findings
+from recon.verdict.residuals import Residuals
+from recon.verdict.tilts import tilt_findings
+from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
+
+Array = NDArray[Any]
+_CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
+
+
+def judge(
+    tilt_series: TiltSeries,
+    result: Result,
+    *,
+    screening: Screening | None = None,
+    alignment: Alignment | None = None,
+) -> Verdict:
+    """Judge a volume by what its projections leave of the images, and by tilts left out in contiguous gaps.
+
+    Args:
+        tilt_series: what was reconstructed: aligned, and without the tilts that were thrown out.
+        result: volume, projections (tilt, y, u) in detector units, and noise model and history of the fit where there are any.
+        screening: of the tilts before some were thrown out.
+        alignment: of the raw images, where they were aligned.
+
+    Raises:
+        ValueError: projections of another shape than the images.
+    """
+    if result.projections.shape != tilt_series.images.shape:
+        raise ValueError(
+            f"projections {result.projections.shape} do not belong to images {tilt_series.images.shape}; judge a volume "
+            "with the tilt series that it was made from"
+        )
+    shape = np.shape(result.volume.attenuation)
+    grid = VolumeGrid(shape[0], shape[1], shape[2])
+    expected = expected_images(result)
+    residuals = Residuals.of(tilt_series, expected)
+    coarse = coarse_series(tilt_series, grid)
+    geometry = Geometry(coarse)
+    gap, own = _gaps(tilt_series, expected, coarse, geometry)
+    found = distortions(residuals)
+    parts = [
+        geometry_findings(geometry, gap, own, found),
+        image_findings(residuals, found, gap),
+        tilt_findings(tilt_series, coarse, geometry.errors, screening),
+        pixel_findings(tilt_series, residuals),
+        fit_findings(result, alignment),
+        _contrast(tilt_series),
+    ]
+    evidence: dict[str, Any] = {}
+    findings: list[Finding] = []
+    for part, finding in parts:
+        evidence |= part
+        findings += finding
+    return verdict_of(findings, evidence, good=_good(gap, residuals))
+
+
+def _gaps(
+    tilt_series: TiltSeries, expected: Array, coarse: Coarse, geometry: Geometry
+) -> tuple[Unexplained, Unexplained]:
+    """What left-out gaps leave of the images, and what they leave of the volume's own projections, which are consistent."""
+    some = tilt_series.select(coarse.tilts)
+    own = line_integrals(some, expected[coarse.tilts], coarse.binning)
+    return unexplained(coarse.images, geometry.errors), unexplained(own, geometry.fit.errors(own))
+
+
+def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
+    """Whether a coarse non-negative volume explains the images better with bright and dark swapped."""
+    height, width = tilt_series.images.shape[1:]
+    small = replace(tilt_series, images=block_means(tilt_series.images, -(-height // 16), -(-width // 32)), mask=None)
+    as_given, swapped = explained(small), explained(invert_contrast(small))
+    evidence = {"contrast": {"as given": as_given, "swapped": swapped}}
+    if swapped < as_given + _CONTRAST:
+        return evidence, []
+    other = "--mode transmission" if tilt_series.mode == "linear" else "--mode linear"
+    words = (
+        f"the contrast looks inverted: a volume explains {max(as_given, 0):.0%} of the images, and {swapped:.0%} with bright and "
+        "dark swapped"
+    )
+    return evidence, [
+        Finding("mode", 3.0 + (swapped - as_given) / _CONTRAST, words, f"give {other}, or --invert-contrast")
+    ]
+
+
+def _good(gap: Unexplained, residuals: Residuals) -> str:
+    white = max(abs(value) for value in residuals.whiteness().values())
+    return (
+        f"tilts left out in gaps are explained to {min(1.0, 1 - gap.share):.1%} of their structure, and neighbouring residuals "
+        f"correlate by {white:.2f} at most; the sign of the tilt angles and their zero cannot be told from images"
+    )

@@ -1,0 +1,108 @@
+"""What the pixels say by themselves: limits reached, dead lines, spikes, and a pattern that stays with the detector."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.series.tilt_series import TiltSeries
+from recon.verdict.residuals import Residuals
+from recon.verdict.verdict import Finding
+
+Array = NDArray[Any]
+_SATURATED = (
+    0.005  # share of pixels amid a full neighbourhood at a limit; noise about a limit fills nine with chance 2⁻⁹
+)
+_BLANK = 0.3  # the same at the end of vacuum, where a full neighbourhood loses nothing but weak contrast
+_SPIKE = 5.0  # ranges from the 0.5 to the 99.5 % quantile: noise with long tails reaches two
+_PATTERN, _PATTERN_CONTRAST = (
+    1.6,
+    0.02,
+)  # variance over that by chance; share of the contrast that it must reach to matter
+_DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
+
+
+def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Evidence and findings about pixel values, on the slices of most contrast."""
+    images = residuals.images
+    evidence: dict[str, Any] = {}
+    findings: list[Finding] = []
+    for check in (_saturation, _spikes, _lines, _pattern):
+        found, finding = check(tilt_series, images, residuals)
+        evidence |= found
+        findings += finding
+    return evidence, findings
+
+
+def _saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    ends = {"low": float(images.min()), "high": float(images.max())}
+    empty = "low" if tilt_series.mode == "linear" else "high"
+    shares = {name: float(np.mean(ndimage.minimum_filter(images == end, (1, 3, 3)))) for name, end in ends.items()}
+    noisy = residuals.noise > 1e-3 * (ends["high"] - ends["low"])
+    findings = []
+    for name, share in shares.items():
+        limit = _SATURATED if name != empty else _BLANK
+        if share > limit and (noisy or name != empty) and (name != empty or tilt_series.mode == "transmission"):
+            sentence = f"{share:.1%} of the pixels and all their neighbours stand at the {name} limit {ends[name]:.4g}"
+            strength = 1 + 2 * min(1.0, share / (10 * limit))
+            findings.append(
+                Finding(
+                    "saturation", strength, sentence, "use a series that is not saturated, or mask these parts", "seen"
+                )
+            )
+    return {"saturated": shares}, findings
+
+
+def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    low, high = (float(end) for end in np.quantile(images[:: max(1, len(images) // 16)], (0.005, 0.995)))
+    far = float(np.mean(np.abs(images - (low + high) / 2) > _SPIKE * max(high - low, 1e-30)))
+    if far == 0 or high <= low:
+        return {"spikes": far}, []
+    sentence = f"{far:.2%} of the pixels lie more than {_SPIKE:g} ranges away from the others"
+    strength = 1.5 + min(1.4, 500 * far)
+    return {"spikes": far}, [
+        Finding("outliers", strength, sentence, "mask the spikes with --mask FILE, or replace them", "seen")
+    ]
+
+
+def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
+    dead = {"rows": _dead(images.transpose(1, 0, 2), span), "columns": _dead(images.transpose(2, 0, 1), span)}
+    findings = []
+    for name, count in dead.items():
+        if count:
+            size = images.shape[1 if name == "rows" else 2]
+            strength = 1.5 + min(2.0, 20 * count / size)
+            sentence = f"{count} of {size} {name} hold one value in all tilts, unlike their neighbours"
+            findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
+    return {"dead lines": dead}, findings
+
+
+def _dead(lines: Array, span: float) -> int:
+    """Lines that hardly vary and stand apart from their neighbours."""
+    spread, mean = lines.std((1, 2)), lines.mean((1, 2))
+    apart = np.abs(mean - ndimage.median_filter(mean, 5, mode="nearest")) > _STEP * span
+    return int((apart & (spread < _DEAD * np.median(spread))).sum())
+
+
+def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Fine structure of the residuals' mean over the tilts, against what independent tilts would leave."""
+    fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
+    steady = float(np.var(fine.mean(0)))
+    ratio = steady * len(fine) / max(float(np.var(fine)), 1e-30)
+    evidence = {
+        "fixed pattern": {
+            "over chance": ratio,
+            "share of contrast": float(np.sqrt(steady)) / max(residuals.contrast, 1e-30),
+        }
+    }
+    size = evidence["fixed pattern"]["share of contrast"]
+    if ratio < _PATTERN or size < _PATTERN_CONTRAST:
+        return evidence, []
+    sentence = f"the residuals hold a pattern of the detector's pixels, {size:.1%} of the contrast and {ratio:.1f} times chance"
+    return evidence, [
+        Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")
+    ]

@@ -1,0 +1,147 @@
+"""What the list of tilts says: range, gaps, steps, images given twice, images that do not belong to their angle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.series.screening import Screening
+from recon.series.tilt_series import TiltSeries
+from recon.verdict.coarse import Coarse
+from recon.verdict.verdict import Finding
+
+Array = NDArray[Any]
+_WEDGE, _GAP, _FEWEST = 90.0, 15.0, 20  # degrees without data: with more, most directions are guessed; tilts
+_LEFT_OUT = 0.1  # of the tilts: so many are no exceptions
+_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of a tilt's own structure that the others predict; of the tilts
+_TWINS = 0.2  # of the structure: twins show the same object but for noise
+_RADIANS = 1.6
+_DRIFT = 0.2  # of the beam: the fit follows a drift, but not exactly
+
+
+def tilt_findings(
+    tilt_series: TiltSeries, coarse: Coarse, errors: Array, screening: Screening | None
+) -> tuple[dict[str, Any], list[Finding]]:
+    """Evidence and findings about the tilts; `errors` are of left-out gaps, as `Geometry.errors`."""
+    evidence: dict[str, Any] = {}
+    findings: list[Finding] = []
+    for found, finding in (
+        _coverage(tilt_series.tilt_angles),
+        _repeats(tilt_series),
+        _twins(coarse),
+        _foreign(coarse, errors),
+        _screened(screening),
+    ):
+        evidence |= found
+        findings += finding
+    return evidence, findings
+
+
+def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
+    directions = np.unique(np.round(np.mod(angles, 180), 3))
+    gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
+    wedge, inner = float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0
+    steps = np.diff(np.unique(angles))
+    evidence = {
+        "tilts": len(angles),
+        "degrees without data": wedge,
+        "largest gap inside": inner,
+        "median step": float(np.median(steps)),
+        "in order": bool((np.diff(angles) > 0).all() or (np.diff(angles) < 0).all()),
+    }
+    findings = []
+    if np.abs(angles).max() < _RADIANS:
+        words = f"all tilt angles lie within ±{np.abs(angles).max():.2f}°, as if they were radians"
+        findings.append(Finding("angles", 10.0, words, "give the tilt angles in degrees", "seen"))
+    if wedge > _WEDGE:
+        words = f"{wedge:.0f}° of 180° have no tilt, so most directions of the volume are guessed"
+        findings.append(Finding("range", wedge / _WEDGE, words, "add tilts, or trust only what faces the beam", "seen"))
+    if inner > _GAP and len(directions) >= _FEWEST:
+        words = f"the tilts leave a gap of {inner:.0f}° inside their range"
+        findings.append(
+            Finding("range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks across it", "seen")
+        )
+    if len(directions) < _FEWEST:
+        words = f"{len(directions)} different tilt angles are too few for fine detail"
+        findings.append(Finding("range", min(2.9, _FEWEST / len(directions)), words, "take more tilts", "seen"))
+    return evidence, findings
+
+
+def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
+    """Images that are equal to the last pixel: no two exposures are, if there is any noise."""
+    groups: dict[bytes, int] = {}
+    for image in tilt_series.images:
+        key = np.ascontiguousarray(image).tobytes()
+        groups[key] = groups.get(key, 0) + 1
+    repeated = sum(count - 1 for count in groups.values())
+    if repeated == 0:
+        return {"repeated images": 0}, []
+    share = repeated / tilt_series.num_tilts
+    words = f"{repeated} of {tilt_series.num_tilts} images are copies of another one, to the last pixel"
+    finding = Finding("repeats", min(2.9, 1 + 3 * share), words, "leave the copies out", "seen")
+    return {"repeated images": repeated}, [finding]
+
+
+def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
+    """Images at one angle must differ by noise alone, which neighbouring rows do not share."""
+    order = coarse.order
+    close = np.diff(coarse.tilt_angles[order]) < 0.02
+    if not close.any() or coarse.images.shape[1] < 2:
+        return {}, []
+    difference = (coarse.images[order][1:] - coarse.images[order][:-1])[close]
+    whole = coarse.images - coarse.images.mean()
+    share = float(
+        np.mean(difference[:, 1:] * difference[:, :-1]) / 2 / max(float(np.mean(whole[:, 1:] * whole[:, :-1])), 1e-30)
+    )
+    evidence = {"twins differ by": share}
+    if share < _TWINS:
+        return evidence, []
+    words = f"images of the same angle differ by {share:.0%} of their structure"
+    return evidence, [
+        Finding("angles", min(6.0, 3 * share / _TWINS), words, "check the list of tilt angles and its signs", "seen")
+    ]
+
+
+def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
+    """Tilts of which the others predict far less than of the rest, by what predicted and measured rows share."""
+    if coarse.images.shape[1] < 2:
+        return {}, []
+    measured, predicted = (each - each.mean((1, 2), keepdims=True) for each in (coarse.images, coarse.images - errors))
+    agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
+    chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
+    own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
+    foreign = agreement + 3 * chance < _FOREIGN * own
+    share = float(foreign.mean())
+    evidence = {"tilts unlike the others": int(foreign.sum())}
+    if share <= _FOREIGN_SHARE:
+        return evidence, []
+    named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[foreign][:5])
+    words = f"{int(foreign.sum())} of {len(foreign)} tilts hardly resemble what the others predict ({named} …)"
+    advice = "look at these images and their angles, or leave them out"
+    return evidence, [Finding("tilts", min(4.0, 1 + share / _LEFT_OUT), words, advice)]
+
+
+def _screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding]]:
+    if screening is None:
+        return {}, []
+    share, drift = float(screening.bad.mean()), screening.drift
+    evidence = {"tilts thrown out": int(screening.bad.sum()), "beam drift": drift}
+    findings = []
+    if share > _LEFT_OUT:
+        words = (
+            f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were left out because they do not fit the others"
+        )
+        findings.append(
+            Finding(
+                "tilts",
+                min(3.5, 1 + (share - _LEFT_OUT) / _LEFT_OUT),
+                words,
+                "align the series, or check the list of angles",
+            )
+        )
+    if drift > _DRIFT:
+        words = f"the beam changes by {drift:.0%} from tilt to tilt"
+        findings.append(Finding("beam", min(2.9, drift / _DRIFT), words, "normalise the images by their incident beam"))
+    return evidence, findings

@@ -1,0 +1,216 @@
+"""What is wrong with a series is named; what is right is called good; and the fast tests agree with slow obvious ones."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.benchmarks.sabotage import spoil
+from recon.benchmarks.scenes import make_scene
+from recon.benchmarks.spoiling import WAYS
+from recon.methods import reconstruct
+from recon.projection.projector import SliceProjector
+from recon.series.screening import screen
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.verdict.gap_fit import GapFit, unexplained
+from recon.verdict.judge import judge
+from recon.verdict.residuals import Residuals
+from recon.verdict.verdict import Finding, Verdict, verdict_of
+
+TILTS = "-60:60:3"
+
+
+@dataclass(frozen=True)
+class Told:
+    """A result that was made by hand."""
+
+    volume: Volume
+    projections: np.ndarray[Any, Any]
+    fit_result: Any = None
+    noise_model: Any = None
+
+
+@dataclass(frozen=True)
+class History:
+    history: dict[int, float]
+
+
+def scene(phantom: str = "particles", noise: str = "low-dose", seed: int = 0) -> Any:
+    return make_scene(32, phantom=phantom, noise=noise, tilts=TILTS, seed=seed)
+
+
+def larger(seed: int = 0) -> Any:
+    return make_scene(48, phantom="particles", noise="low-dose", tilts=TILTS, seed=seed)
+
+
+def judged(series: TiltSeries, thickness: int | None = None) -> Verdict:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        screening = screen(series)
+        prepared = screening.passed(series)
+        result = reconstruct(prepared, VolumeGrid.of(prepared, thickness), method="l2", weight=0.4, num_steps=120)
+        return judge(prepared, result, screening=screening)
+
+
+def oracle(noise: str = "low-dose") -> tuple[TiltSeries, Told]:
+    """A series and the truth as its reconstruction."""
+    made = scene(noise=noise)
+    return made.noisy, Told(
+        Volume(made.truth.astype(np.float32)), made.clean.images.astype(np.float32), None, made.noise_model
+    )
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_left_out_gaps_are_those_of_a_fit_without_them() -> None:
+    generator = np.random.default_rng(0)
+    angles = np.linspace(-60, 60, 21)
+    images = generator.normal(size=(21, 3, 9))
+    fit = GapFit(angles, depth=8, width=9, detector_width=9, smoothness=0.3)
+    matrix, prior = _dense(angles, 8, 9), None
+    errors = fit.errors(images)
+    for gap in fit.gaps:
+        rest = np.setdiff1d(np.arange(len(angles)), gap)
+        prior = _prior(angles, 8, 9, 0.3) if prior is None else prior
+        some = matrix[(rest[:, None] * 9 + np.arange(9)).ravel()]
+        here = matrix[(gap[:, None] * 9 + np.arange(9)).ravel()]
+        rays = images[rest].transpose(0, 2, 1).reshape(-1, 3)
+        found = here @ np.linalg.solve(some.T @ some + prior, some.T @ rays)
+        slow = images[gap] - found.reshape(len(gap), 9, 3).transpose(0, 2, 1)
+        np.testing.assert_allclose(errors[gap], slow, atol=2e-3)
+
+
+def _dense(angles: Any, depth: int, width: int) -> Any:
+    """Column by column from the projector, and the constant that all pixels share."""
+    projector = SliceProjector(tilt_angles=angles, depth=depth, width=width)
+    columns = []
+    for voxel in range(depth * width):
+        volume = np.zeros((depth, 1, width), np.float32)
+        volume[voxel // width, 0, voxel % width] = 1
+        columns.append(np.asarray(projector(volume)).ravel())
+    matrix = np.stack(columns, 1).astype(np.float64)
+    constant = np.full((len(matrix), 1), np.sqrt(np.mean(matrix.sum(1) ** 2)))
+    return np.hstack([matrix, constant])
+
+
+def _prior(angles: Any, depth: int, width: int, smoothness: float) -> Any:
+    from recon.verdict.gap_fit import _roughness
+
+    matrix, rough = _dense(angles, depth, width)[:, :-1], _roughness(depth, width).astype(np.float64)
+    prior = np.zeros((depth * width + 1,) * 2)
+    prior[:-1, :-1] = smoothness * np.trace(matrix.T @ matrix) / np.trace(rough) * rough
+    return prior
+
+
+def test_white_noise_is_no_structure_and_structure_is() -> None:
+    generator = np.random.default_rng(1)
+    images = np.repeat(generator.normal(size=(20, 8, 16)), 2, axis=1)
+    noise = generator.normal(size=images.shape)
+    assert abs(unexplained(images, noise).share) < 5 * unexplained(images, noise).error
+    assert unexplained(images, images).share == pytest.approx(1, abs=0.05)
+
+
+def test_residuals_follow_the_order_of_the_angles() -> None:
+    series, told = oracle()
+    mixed = np.random.default_rng(2).permutation(series.num_tilts)
+    given, same = Residuals.of(series, told.projections), Residuals.of(series.select(mixed), told.projections[mixed])
+    np.testing.assert_array_equal(given.residual, same.residual)
+
+
+@pytest.mark.parametrize("noise", ["low-dose", "8-bit", "clipped"])
+@pytest.mark.usefixtures("one_thread")
+def test_a_good_series_with_its_truth_is_good(noise: str) -> None:
+    verdict = judge(*oracle(noise))
+    assert verdict.grade == "good", verdict.reasons
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_good_reconstruction_is_good() -> None:
+    verdict = judged(scene().noisy)
+    assert verdict.grade == "good", verdict.reasons
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "axis wrong by 90°",
+        "axis wrong by 45°",
+        "shifts of 5 pixels",
+        "shifts along the axis alone",
+        "angles without their sign",
+        "contrast inverted",
+        "a quarter of the thickness",
+        "every other tilt of another object",
+        "half of the tilt range",
+        "nine tilts",
+        "pure noise",
+        "missing rows",
+        "one image repeated over a third of the tilts",
+    ],
+)
+@pytest.mark.usefixtures("one_thread")
+def test_what_spoils_a_series_is_named(name: str) -> None:
+    spoilt = spoil(scene(), name, other=scene(seed=9), seed=5)
+    verdict = judged(spoilt.series, spoilt.thickness)
+    assert verdict.grade != "good"
+    assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["angles shuffled", "two series spliced", "axis wrong by 5°", "axis 5 pixels off the middle"]
+)
+@pytest.mark.usefixtures("one_thread")
+def test_what_spoils_a_larger_series_is_named(name: str) -> None:
+    spoilt = spoil(larger(), name, other=larger(seed=9), seed=5)
+    verdict = judged(spoilt.series, spoilt.thickness)
+    assert verdict.grade != "good"
+    assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_projections_moved_by_a_pixel_are_seen() -> None:
+    series, told = oracle()
+    moved = np.roll(told.projections, 1, axis=2)
+    moved[::2] = told.projections[::2]
+    verdict = judge(series, replace(told, projections=moved))
+    assert verdict.subjects[0] == "alignment"
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_fit_that_got_worse_is_doubtful() -> None:
+    series, told = oracle()
+    verdict = judge(series, replace(told, fit_result=History({0: 6.0, 10: 5.5, 20: 8.7})))
+    assert "fit" in verdict.subjects
+    assert judge(series, replace(told, fit_result=History({0: 6.0, 10: 5.6, 20: 5.5}))).grade == "good"
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_order_of_the_tilts_changes_nothing() -> None:
+    series, told = oracle()
+    mixed = np.random.default_rng(3).permutation(series.num_tilts)
+    first = judge(series, told).evidence["gap"]
+    second = judge(series.select(mixed), replace(told, projections=told.projections[mixed])).evidence["gap"]
+    assert first == pytest.approx(second, rel=1e-3, abs=1e-5)
+
+
+def test_foreign_projections_are_refused() -> None:
+    series, told = oracle()
+    with pytest.raises(ValueError, match="do not belong"):
+        judge(series, replace(told, projections=told.projections[1:]))
+
+
+def test_bad_says_first_what_to_try() -> None:
+    findings = [
+        Finding("axis", 4.0, "the axis is wrong", "give --tilt-axis"),
+        Finding("range", 1.2, "few tilts", "add some", "seen"),
+    ]
+    verdict = verdict_of(findings, {}, good="fine")
+    assert verdict.grade == "bad"
+    assert verdict.subjects == ("range", "axis")
+    assert verdict.reasons[0].startswith("Give --tilt-axis")
+    assert verdict_of([], {}, good="fine").reasons == ("fine",)
+    assert verdict_of([replace(findings[0], strength=0.9)], {}, good="fine").grade == "good"
