@@ -21,8 +21,8 @@ def doctor(json: JsonOption = False) -> None:
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
     out.line(f"noiseflow {version('noiseflow')}, {python}\n")
     folders = _folders(list(packages))
-    rows = [(name, found or "missing", folders[name]) for name, found in packages.items()]
-    out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *rows])
+    packed = [(name, found or "missing", folders[name]) for name, found in packages.items()]
+    out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *packed])
     problems = [*(f"shadow: {line}" for line in shadows(list(packages))), *_broken_plugins()]
     for problem in problems:
         out.line(f"\nwarning: {problem}")
