@@ -13,6 +13,8 @@ from noiseflow.commands.console import JsonOption, Output
 from noiseflow.commands.locations import OWN, folder_of, modules_of, shadows
 from noiseflow.plugins import GROUPS, load_plugin, plugins
 
+_LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
+
 
 def doctor(json: JsonOption = False) -> None:
     """Check the installation: versions, devices, extras, and a self-test of a few seconds."""
@@ -31,7 +33,7 @@ def doctor(json: JsonOption = False) -> None:
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
     rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
     for name, advice in rows:
-        out.line(f"extra [{name}]: {advice}")
+        out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
     tests = run_self_tests()
     out.line("")
     for name, result in tests.items():
