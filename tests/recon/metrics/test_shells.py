@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-
 from skimage.metrics import structural_similarity
 
 from recon.metrics.metrics import compare, fourier_shell_correlation
