@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import copy
 import importlib.util
 import json
@@ -209,10 +210,8 @@ def survives(tests: list[str], mutant: Mutant | None, seconds: float) -> bool:
         finally:
             os._exit(code)
     _, status = os.waitpid(process, 0)
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(process, signal.SIGKILL)  # whatever a test left running
-    except ProcessLookupError:
-        pass
     return status == 0
 
 

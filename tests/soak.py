@@ -2,9 +2,9 @@
 
     python -m tests.soak --seconds 3600 --report soak.md
 
-After every round: a file of the user's that lay there is still there to the last byte; outputs are whole or absent; nothing else is
-left once a clean run has followed a fault; a resumed run ends in the volume of an unbroken one; and the memory of one process that
-runs the commands again and again stays flat. Exits with 1 where any of that fails.
+After every round: a user's file that lay there is unchanged; outputs are whole or absent; nothing else is left once a clean run
+has followed a fault; a resumed run ends in the volume of an unbroken one; and the memory of one process that runs the commands
+again and again stays flat. Exits with 1 where any of that fails.
 """
 
 from __future__ import annotations
@@ -178,7 +178,8 @@ class Soak:
     def memory(self, seconds: float) -> str:
         """How the memory of one process grows that runs commands again and again."""
         program = (
-            "import resource, sys, time\nfrom tests.soak import MEMORY_COMMANDS, COMMANDS\nfrom noiseflow.commands.cli import main\n"
+            "import resource, sys, time\nfrom tests.soak import MEMORY_COMMANDS, COMMANDS\n"
+            "from noiseflow.commands.cli import main\n"
             "end, out = time.monotonic() + float(sys.argv[3]), []\n"
             "while len(out) < 6 or time.monotonic() < end:\n"
             "    for name in MEMORY_COMMANDS:\n"
@@ -224,7 +225,7 @@ def main() -> None:
             print(f"{sum(soak.rounds.values())} rounds, {len(soak.faults)} faults", file=sys.stderr, flush=True)
         memory = soak.memory(0.2 * asked.seconds)
     lines = [
-        f"{sum(soak.rounds.values())} rounds in {time.monotonic() - started:.0f} s, seed {asked.seed}, noiseflow {noiseflow.__version__}",
+        f"{sum(soak.rounds.values())} rounds in {time.monotonic() - started:.0f} s, seed {asked.seed}",
         f"memory of one process: {memory}",
         *(f"- {name}: {count}" for name, count in sorted(soak.rounds.items())),
         f"faults: {len(soak.faults)}",

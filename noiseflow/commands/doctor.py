@@ -13,6 +13,8 @@ from noiseflow.commands.console import JsonOption, Output
 from noiseflow.commands.locations import OWN, folder_of, modules_of, shadows
 from noiseflow.plugins import GROUPS, load_plugin, plugins
 
+_LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
+
 
 def doctor(json: JsonOption = False) -> None:
     """Check the installation: versions, devices, extras, and a self-test of a few seconds."""
@@ -21,8 +23,8 @@ def doctor(json: JsonOption = False) -> None:
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
     out.line(f"noiseflow {version('noiseflow')}, {python}\n")
     folders = _folders(list(packages))
-    rows = [(name, found or "missing", folders[name]) for name, found in packages.items()]
-    out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *rows])
+    packed = [(name, found or "missing", folders[name]) for name, found in packages.items()]
+    out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *packed])
     problems = [*(f"shadow: {line}" for line in shadows(list(packages))), *_broken_plugins()]
     for problem in problems:
         out.line(f"\nwarning: {problem}")
@@ -31,7 +33,7 @@ def doctor(json: JsonOption = False) -> None:
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
     rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
     for name, advice in rows:
-        out.line(f"extra [{name}]: {advice}")
+        out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
     tests = run_self_tests()
     out.line("")
     for name, result in tests.items():

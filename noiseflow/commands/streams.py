@@ -64,7 +64,7 @@ def steady_streams() -> Iterator[SteadyStream]:
     _open_standard_files()
     before = sys.stdout, sys.stderr
     out, err = (SteadyStream(stream) for stream in before)
-    sys.stdout, sys.stderr = out, err  # type: ignore[assignment]
+    sys.stdout, sys.stderr = out, err
     try:
         yield out
     finally:

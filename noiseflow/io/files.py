@@ -125,7 +125,7 @@ def require_whole(path: Path, num_bytes: int) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A name for a temporary file, renamed onto `path` when the block succeeds; a link's target is written, and it stays a link."""
+    """A name for a temporary file, renamed onto `path` when the block succeeds; of a link, onto its target."""
     with partial_folder(path) as folder:
         partial = folder / Path(path).name
         yield partial

@@ -25,6 +25,7 @@ from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.io import atomic_path
 from recon.joint.stages import Stage
+from recon.joint.state_files import discard_states
 from recon.joint.state_files import read_state as read_state
 from recon.joint.state_files import write_state as write_state
 
@@ -171,10 +172,7 @@ class Journal:
 
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
-        for file in (*self.folder.glob("*.safetensors"), *self.folder.glob("*run*.json")):  # half-written ones too
-            file.unlink(missing_ok=True)
-        if self.folder.is_dir() and not any(self.folder.iterdir()):
-            self.folder.rmdir()
+        discard_states(self.folder, _RUN)
 
     def _finished(self, name: str) -> Path:
         digest = hashlib.blake2b(name.encode(), digest_size=4).hexdigest()

@@ -12,7 +12,7 @@ from noiseflow.io.ownership import is_own, require_own
 from noiseflow.io.partials import clear_all_leftovers
 from noiseflow.io.tensor_files import save_tensors
 
-FORMAT = "noiseflow checkpoint 1"
+FORMAT = "noiseflow state 1"
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:

@@ -24,10 +24,14 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("identity")
     finish(["simulate", folder / "new", "--size", 16, "--tilts=-60:60:10"], folder / "log")
     process = start(command(folder), folder / "log")
-    wait_for((folder / "volume.npy.checkpoint" / "fit-001.safetensors").exists, process)
+    wait_for(lambda: states(folder), process)
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     return folder
+
+
+def states(folder: Path) -> list[Path]:
+    return list((folder / "volume.npy.checkpoint").glob("*.safetensors"))
 
 
 def command(folder: Path) -> list[object]:
@@ -62,7 +66,7 @@ def test_a_state_of_other_data_or_another_version_is_refused(stopped: Path, chan
     change(stopped)
     try:
         assert words in refused(*command(stopped), "--resume")
-        assert (stopped / "volume.npy.checkpoint" / "fit-001.safetensors").exists()
+        assert states(stopped)
     finally:
         for name, content in before.items():
             (stopped / name).write_bytes(content)
@@ -81,7 +85,7 @@ def test_what_comes_after_a_finished_fit_draws_on_where_that_fit_ended(tmp_path:
         for number, model in enumerate(models):
             if number == 1 and stop:
                 return None
-            journal.fit(model, signal, observation, num_steps=12, batch_size=64, generator=draws)
+            journal.fit(f"fit {number}", model, signal, observation, num_steps=12, batch_size=64, generator=draws)
         left = [torch.rand(3, generator=draws), torch.rand(3)]
         return torch.cat([*(p.detach().flatten() for p in models[1].parameters()), *left])
 

@@ -103,3 +103,20 @@ def test_a_resumed_fit_draws_the_pixels_that_an_unbroken_one_would_have() -> Non
     whole, states = fitted(1)
     assert not torch.equal(fitted(2)[0], whole)
     torch.testing.assert_close(fitted(2, states[2])[0], whole, rtol=0, atol=0)
+
+
+def test_batches_are_as_large_as_asked_for_and_half_a_line_trains() -> None:
+    observation, use, generator = drawn(0, (2, 12, 10), 2.0)
+    assert FitPixels.choose(observation, use, 0.2, generator).batch(50).shape == (50,)
+    half = torch.zeros(observation.shape, dtype=torch.bool)
+    half[0, 3, :5] = half[0, 4, :6] = True
+    lines = FitPixels.choose_lines(observation, use, half, generator, axis=-1)
+    assert lines.judge.tolist() == [list(range(40, 50))]
+    assert lines.batch(50).shape == (5, 10)
+
+
+@pytest.mark.parametrize("held_out", [[False] * 12, [True] * 11 + [False]])
+def test_too_few_pixels_to_train_or_to_judge_are_refused(held_out: list[bool]) -> None:
+    observation, use, generator = drawn(0, (12,), 2.0)
+    with pytest.raises(ValueError, match="too few"):
+        FitPixels.choose(observation, use, torch.tensor(held_out), generator)

@@ -1,11 +1,12 @@
-"""Fourier shells against a slow sum, frequency by frequency."""
+"""Fourier shells against a slow sum, frequency by frequency; structural dissimilarity slice by slice."""
 
 import itertools
 
 import numpy as np
 import pytest
+from skimage.metrics import structural_similarity
 
-from recon.metrics.metrics import fourier_shell_correlation
+from recon.metrics.metrics import compare, fourier_shell_correlation
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 8), (7, 9, 7), (11, 6)])
@@ -26,3 +27,11 @@ def test_every_frequency_is_in_its_nearest_shell(shape):
     frequency, correlation = fourier_shell_correlation(first, second)
     np.testing.assert_allclose(frequency, np.arange(shells + 1) / (2 * shells))
     np.testing.assert_allclose(correlation, cross / np.sqrt(one * other), atol=1e-12)
+
+
+def test_dissimilarity_is_the_mean_over_slices_and_an_image_is_one_slice():
+    volume, other = np.random.default_rng(0).random((2, 5, 12, 14))
+    span = other.max() - other.min()
+    slices = [structural_similarity(a, b, data_range=span, win_size=7) for a, b in zip(volume, other, strict=True)]
+    assert compare(volume, other).dssim == pytest.approx((1 - np.mean(slices)) / 2)
+    assert compare(volume[0], other[0]).dssim == pytest.approx(compare(volume[:1], other[:1]).dssim)
