@@ -16,10 +16,10 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("noiseflow")
-    if name == "adapters":
+    if name in _MOVED and name not in __all__:
         from importlib import import_module
 
-        return import_module("noiseflow.adapters")
+        return import_module(f"noiseflow.{name}")
     return _load(name)
 
 

@@ -101,3 +101,52 @@ def check_intervals(distribution, draws: Tensor) -> None:
     masses = torch.stack([distribution.log_interval_prob(a, b).exp() for a, b in itertools.pairwise(edges)])
     assert torch.allclose(masses.sum(0), torch.ones_like(masses[0]), atol=1e-6)
     assert torch.allclose(masses[0], distribution.cdf(inner[0]), atol=1e-6)
+
+
+def check_traits(model, signals: Tensor, observation: Tensor) -> None:
+    """The traits of a noise model agree with one another and with what it does; signals and observations of one image."""
+    from noiseflow import NoiseModelBase
+    from noiseflow.distributions import NoiseDistribution
+
+    assert isinstance(model, NoiseModelBase)
+    for name in (
+        "needs_image",
+        "describes_single_readings",
+        "standardises_by_level",
+        "starts_most_likely",
+        "starts_anew",
+    ):
+        assert isinstance(getattr(model, name), bool), name
+    assert model.learning_rate > 0
+    assert model.joint_learning_rate > 0
+    assert model.num_steps >= 1
+    assert model.most_joint_steps is None or model.most_joint_steps >= 1
+    assert model.neighbourhood % 2 == 1
+    assert model.shared_axis in (None, -1, -2)
+    assert model.needs_image or (model.neighbourhood == 1 and model.shared_axis is None)
+    assert model.step >= 0
+    assert model.low < model.high
+    free = model.without_rails()
+    assert (free.low, free.high, free.step) == (-math.inf, math.inf, model.step)
+    bare = model.one_pixel
+    assert not bare.needs_image or bare.neighbourhood > 1
+    assert (bare.step, bare.low, bare.high) == (0.0, -math.inf, math.inf)
+    assert bare.without_converter() is bare
+    assert model.learns == any(parameter.requires_grad for parameter in model.parameters())
+    assert isinstance(model(signals), NoiseDistribution)
+    try:
+        model(signals.reshape(-1))
+        assert not model.needs_image
+    except ValueError:
+        assert model.needs_image
+    check_fixed_part(model, signals.reshape(-1), observation.reshape(-1))
+
+
+def check_fixed_part(model, signal: Tensor, observation: Tensor) -> None:
+    """The likelihood from what does not change is the likelihood."""
+    if model.needs_image:
+        return
+    fixed = model.fixed_part(signal, observation)
+    if fixed is not None:
+        found = model.log_prob_from(signal, fixed)
+        assert torch.allclose(found, model(signal).log_prob(observation), atol=1e-5)

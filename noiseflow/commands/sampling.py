@@ -13,7 +13,6 @@ from noiseflow.commands.console import (
     JsonOption,
     Output,
     OverwriteOption,
-    Progress,
     SeedOption,
     StepReport,
     choose_device,
@@ -24,7 +23,6 @@ from noiseflow.commands.console import (
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-_PIECE = 2**20  # pixels sampled at once
 _BASELINE_STEPS = 500
 
 
@@ -35,33 +33,40 @@ def sample(
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
+    dtype: Annotated[
+        str,
+        typer.Option(
+            help="Number type to write: auto (the clean file's, where it holds the noisy values exactly; else float32), "
+            "float32, float64, uint8, uint16 or int16."
+        ),
+    ] = "auto",
     json: JsonOption = False,
 ) -> None:
-    """Put realistic noise on a clean image or stack."""
+    """Put realistic noise on a clean image, stack or array of any number of axes (4D as .npy)."""
     import noiseflow
     from noiseflow import io
+    from noiseflow.commands import sample_files
+    from noiseflow.models.around import as_noise_model
 
     io.require_other(output, clean)
     io.check_output(output, overwrite=overwrite)
-    image = io.read(clean)
-    io.require_finite(image.data, clean)
-    noise_model = noiseflow.load(model).to(choose_device(device))
-    num_pieces = max(1, -(-image.data.size // _PIECE))
-    with progress_bar("Sampling", num_pieces, json_mode=json) as progress:
-        noisy = _sample(noise_model, _tensor(image.data), seed, progress)
-    io.write(output, noisy.numpy(), voxel_size=image.voxel_size)
+    sample_files.check_dtype(dtype)
+    data, voxel_size = sample_files.read_any(clean)
+    io.require_finite(data, clean)
+    noise_model = as_noise_model(noiseflow.load(model).to(choose_device(device)))
+    pieces = sample_files.pieces(noise_model, _tensor(data))
+    with progress_bar("Sampling", len(pieces), json_mode=json) as progress:
+        noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
+    stored = sample_files.stored(noisy.numpy(), dtype, data.dtype)
+    io.write(output, stored, voxel_size=voxel_size)
     out = Output(json)
-    standardisation = next((m for m in noise_model.modules() if hasattr(m, "signal_low")), None)
-    if standardisation is not None:
-        low, high = (getattr(standardisation, name).item() for name in ("signal_low", "signal_high"))
-        outside = float(((image.data < low) | (image.data > high)).mean())
-        if outside > 0.01:
-            out.line(
-                f"note: {outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
-                "they get the noise of the nearest end"
-            )
-    out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))}, mean {noisy.double().mean():.6g}")
-    out.result({"output": str(output), "shape": list(noisy.shape), "mean": float(noisy.double().mean()), "seed": seed})
+    notes = sample_files.notes(noise_model, data)
+    for note in notes:
+        out.line(f"note: {note}")
+    out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))} {stored.dtype}, mean {noisy.double().mean():.6g}")
+    mean = float(noisy.double().mean())
+    result = {"output": str(output), "shape": list(noisy.shape), "dtype": str(stored.dtype), "mean": mean, "seed": seed}
+    out.result(result | {"notes": notes})
 
 
 def evaluate(
@@ -159,18 +164,6 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
             raise ValueError(f"{paths[0]} and {paths[1]} hold the same pixels; give the noisy image as --observation")
         pairs.append((_tensor(clean), _tensor(noisy)))
     return pairs
-
-
-def _sample(noise_model: nn.Module, signal: Tensor, seed: int, progress: Progress) -> Tensor:
-    import torch
-
-    device = next(noise_model.parameters()).device
-    generator = torch.Generator(device).manual_seed(seed)
-    pieces = []
-    for piece in torch.split(signal.reshape(-1), _PIECE):
-        pieces.append(noise_model(piece.to(device)).sample(generator=generator).cpu())
-        progress(len(pieces), "")
-    return torch.cat(pieces).reshape(signal.shape)
 
 
 def _tensor(data: Any) -> Tensor:

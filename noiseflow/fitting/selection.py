@@ -28,7 +28,7 @@ LEAST_PIXEL_COST = 8.0
 parameters, of which the judging pixels tell about sixteen apart, describe nothing."""
 
 
-class Scored(Protocol):
+class _Scored(Protocol):
     """A candidate with its held-out figures."""
 
     @property
@@ -37,7 +37,7 @@ class Scored(Protocol):
     def excess_error(self) -> float: ...
 
 
-Item = TypeVar("Item", bound=Scored)
+_Item = TypeVar("_Item", bound=_Scored)
 
 
 @described(nll="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
@@ -97,7 +97,7 @@ def default_candidates() -> dict[str, nn.Module]:
     }
 
 
-def simplest_sufficient(candidates: Sequence[Item], num_judging: int) -> Item:
+def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
     """The simplest model whose held-out likelihood lies within one standard error of the best: the one rule of the library.
 
     One standard error counts as at least `NEGLIGIBLE` and at most `MOST_FOR_SIMPLICITY` nats per pixel, or `LEAST_PIXEL_COST`

@@ -2,4 +2,5 @@
 
 from .adapters import PolynomialMixture as PolynomialMixture
 from .adapters import to_deepinv as to_deepinv
+from .adapters import to_deepinv_fidelity as to_deepinv_fidelity
 from .adapters import to_pn2v_gmm as to_pn2v_gmm

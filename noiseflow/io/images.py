@@ -90,7 +90,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
     Args:
         path: target; ``.mrc``-like, ``.tif``, ``.npy`` or, with the extra ``[formats]``, ``.zarr`` (OME-Zarr). An existing
             file is replaced only once the new one is whole.
-        data: (y, x) or (z, y, x); an array or a tensor.
+        data: (y, x) or (z, y, x), in a ``.npy`` file any more axes; an array or a tensor.
         voxel_size: Å along (z, y, x).
 
     Raises:
@@ -100,11 +100,12 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
 
     path = check_output(path)
     data = as_array(data)
-    if data.dtype.kind not in "iuf" or data.ndim not in (2, 3):
-        raise ValueError(
-            f"{path}: an array of {data.dtype} and shape {data.shape} is no image; 2D or 3D numbers are needed"
-        )
     suffix = path.suffix.lower()
+    if data.dtype.kind not in "iuf" or data.ndim < 2 or (data.ndim > 3 and suffix != ".npy"):
+        raise ValueError(
+            f"{path}: an array of {data.dtype} and shape {data.shape} is no image; 2D or 3D numbers are needed "
+            "(.npy holds more axes)"
+        )
     if suffix == ".zarr":
         with atomic_folder(path) as folder:
             ome_zarr.write(folder, data, voxel_size)

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
-_BELOW = 0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
+_BELOW = (
+    0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
+)
 _LEAST = 1e-14  # density, per standard deviation, under which the transform's rounding errors rule
 _FITTED, _ITERATIONS = 16384, 60
 
 
-class ExcessNoise(ArrayModel):
+class ExcessNoise(NoiseModelBase):
     """Shot noise whose electrons are multiplied at random, plus read noise.
 
     observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with mean 1
@@ -104,7 +105,7 @@ class ExcessNoise(ArrayModel):
         self.settle(signal, observation)
 
     def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module] = lambda detector: detector
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
         """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
 
@@ -114,14 +115,16 @@ class ExcessNoise(ArrayModel):
         """
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
-        model = behind(self)
-        climber = torch.optim.LBFGS([self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9)
+        model = self if behind is None else behind(self)
+        climber = torch.optim.LBFGS(
+            [self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9
+        )
         best, kept = math.inf, self.change.detach().clone()
 
         def loss() -> Tensor:
             nonlocal best, kept
             climber.zero_grad()
-            value = -model(seen).log_prob(values).clamp(min=-60.0).mean()
+            value: Tensor = -model(seen).log_prob(values).clamp(min=-60.0).mean()
             value.backward()  # type: ignore[no-untyped-call]
             if float(value) < best:
                 best, kept = float(value), self.change.detach().clone()
@@ -131,10 +134,6 @@ class ExcessNoise(ArrayModel):
             climber.step(loss)  # type: ignore[no-untyped-call]
         with torch.no_grad():
             self.change.copy_(kept)
-
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
 
     def extra_repr(self) -> str:
         gain, offset, read_noise, more = (float(each.detach()) for each in self._now())
@@ -161,7 +160,9 @@ class ExcessNoiseDistribution(NoiseDistribution):
         gain, offset, read_noise, pulse_variance: scalars, float64; the last is F² − 1.
     """
 
-    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor) -> None:
+    def __init__(
+        self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor
+    ) -> None:
         super().__init__(signal.shape)
         self.signal, self.gain, self.offset = signal, gain, offset
         self.read_noise, self.pulse_variance = read_noise, pulse_variance
@@ -176,9 +177,13 @@ class ExcessNoiseDistribution(NoiseDistribution):
             rate = roots**2
             deviation = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2)
             width = _WIDTH
-            turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
+            turn = (
+                torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
+            )
             phase = turn / deviation[:, None]
-            pulse = torch.exp(-torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance)
+            pulse = torch.exp(
+                -torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance
+            )
             exponent = rate[:, None] * (pulse - 1) - 0.5 * (phase * self.read_noise) ** 2
             start = -_BELOW * _CELLS * width
             shift = torch.complex(torch.zeros_like(phase), -(turn * start + phase * rate[:, None]))
@@ -220,7 +225,9 @@ class ExcessNoiseDistribution(NoiseDistribution):
         ends = []
         for value, empty in ((low, 0.0), (high, 1.0)):
             finite = torch.isfinite(value)
-            ends.append(torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty))
+            ends.append(
+                torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty)
+            )
         ends[0] = torch.where(low == math.inf, torch.ones_like(ends[0]), ends[0])
         ends[1] = torch.where(high == -math.inf, torch.zeros_like(ends[1]), ends[1])
         mass = ends[1] - ends[0]

@@ -19,6 +19,7 @@ from noiseflow.models.standardisation import Standardisation
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _BISECTIONS = 60
+_FEW = 4  # components
 _SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
 
 
@@ -90,6 +91,16 @@ class Mixture(NoiseModelBase):
     def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
         self.standardisation.set_from(signal, observation, span)
+
+    # Eight components fitted to 75 000 pixels of an EMCCD lose 0.0051 nats per pixel to the true law with the usual rate and
+    # steps, 0.0033 with twice the steps, and 0.0027 with twice the rate as well.
+    @property
+    def learning_rate(self) -> float:
+        return 2e-2 if self.num_components > _FEW else 1e-2
+
+    @property
+    def num_steps(self) -> int:
+        return 1000 if self.num_components > _FEW else 500
 
     @property
     def fitted_range(self) -> tuple[float, float]:

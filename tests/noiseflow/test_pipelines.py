@@ -139,3 +139,8 @@ def test_old_names_of_the_module_still_work() -> None:
 
     with pytest.warns(DeprecationWarning, match="distributions.transforms"):
         assert transforms.Spline is noiseflow.distributions.transforms.Spline
+
+
+def test_modules_under_their_old_names_are_attributes() -> None:
+    with pytest.warns(DeprecationWarning, match=r"noiseflow\.fitting\.selection"):
+        assert noiseflow.selection.select is noiseflow.select

@@ -74,3 +74,46 @@ def test_evaluate_refuses_unequal_pairs(refused, model: Path, clean: Path, tmp_p
 def test_missing_gpu_is_explained(refused, model: Path, clean: Path, tmp_path: Path) -> None:
     message = refused("sample", model, clean, "-o", tmp_path / "n.mrc", "--device", "cuda")
     assert "--device cpu" in message
+
+
+def saved(model: torch.nn.Module, folder: Path, **options: str) -> Path:
+    return noiseflow.save(model, folder / "own.safetensors", **options)
+
+
+def test_sample_keeps_the_number_type_where_it_holds_the_noise(run, tmp_path: Path) -> None:
+    clean, noisy = tmp_path / "clean.npy", tmp_path / "noisy.npy"
+    np.save(clean, np.full((20, 30), 100, np.uint8))
+    camera = noiseflow.Digitised(noiseflow.Gaussian(5.0), 1.0, 0.0, 255.0)
+    run("sample", saved(camera, tmp_path), clean, "-o", noisy)
+    assert np.load(noisy).dtype == np.uint8
+    run("sample", saved(noiseflow.Gaussian(5.0), tmp_path), clean, "-o", noisy)
+    assert np.load(noisy).dtype == np.float32
+    run("sample", saved(noiseflow.Gaussian(5.0), tmp_path), clean, "-o", noisy, "--dtype", "float64")
+    assert np.load(noisy).dtype == np.float64
+
+
+def test_sample_refuses_a_number_type_that_cannot_hold_the_noise(refused, tmp_path: Path) -> None:
+    np.save(tmp_path / "clean.npy", np.full((20, 30), 100, np.uint8))
+    words = ("sample", saved(noiseflow.Gaussian(5.0), tmp_path), tmp_path / "clean.npy", "-o", tmp_path / "n.npy")
+    assert "not whole numbers" in refused(*words, "--dtype", "uint8")
+    assert "choose auto" in refused(*words, "--dtype", "uint7")
+
+
+def test_sample_takes_arrays_of_four_axes(run, tmp_path: Path) -> None:
+    clean, noisy = tmp_path / "clean.npy", tmp_path / "noisy.npy"
+    np.save(clean, np.full((2, 3, 20, 30), 0.5, np.float32))
+    run("sample", saved(noiseflow.ScanNoise(noiseflow.Gaussian(0.1), 0.2), tmp_path), clean, "-o", noisy)
+    found = np.load(noisy)
+    assert found.shape == (2, 3, 20, 30)
+    assert found.mean(-1).std() == pytest.approx(0.2, rel=0.3)
+
+
+def test_sample_says_that_clean_pixels_lie_beyond_clipping(run, tmp_path: Path) -> None:
+    np.save(tmp_path / "clean.npy", np.full((20, 30), 300.0, np.float32))
+    camera = noiseflow.Digitised(noiseflow.Gaussian(0.1), 0.0, 0.0, 1.0)
+    result = run(
+        "sample", saved(camera, tmp_path, units="transmission"), tmp_path / "clean.npy", "-o", tmp_path / "n.npy"
+    )
+    (note,) = result["notes"]
+    assert "100% of the clean pixels lie beyond the clipping limit 1" in note
+    assert "transmission" in note

@@ -1,0 +1,111 @@
+"""What `noiseflow sample` does to arrays: pieces that fit memory, number types, and what a user had better know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from noiseflow.commands.console import Progress
+    from noiseflow.models.base import NoiseModelBase
+
+DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
+_PIECE = 2**20  # pixels sampled at once
+_FEW = 0.01  # of the pixels, which noise alone may take outside
+
+
+def check_dtype(dtype: str) -> None:
+    """Refuse a number type that is not among `DTYPES`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if dtype not in DTYPES:
+        raise ValueError(f"--dtype {dtype} is unknown; choose {', '.join(DTYPES)}")
+
+
+def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
+    """The pixels in parts of at most a million; whole images where the model looks beyond single pixels.
+
+    Raises:
+        ValueError: an image is needed and there is none.
+    """
+    if not noise_model.needs_image:
+        return list(torch.split(signal.reshape(-1), _PIECE))
+    if signal.ndim < 2:
+        raise ValueError(
+            f"{type(noise_model).__name__} takes images, and the clean file has {signal.ndim} axis; give (y, x)"
+        )
+    images = signal.reshape(-1, *signal.shape[-2:])
+    return list(torch.split(images, max(1, _PIECE // images[0].numel())))
+
+
+def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress: Progress) -> Tensor:
+    """Noisy pixels of all parts, one after the other."""
+    generator, drawn = torch.Generator(noise_model.device).manual_seed(seed), []
+    for part in parts:
+        drawn.append(noise_model(part.to(noise_model.device)).sample(generator=generator).cpu())
+        progress(len(drawn), "")
+    return torch.cat(drawn)
+
+
+def read_any(path: Path) -> tuple[NDArray[Any], Any]:
+    """The numbers of a file and its voxel size; a NumPy file may have any number of axes."""
+    from noiseflow import io
+
+    if path.suffix.lower() == ".npy" and path.is_file():
+        data = np.load(path, mmap_mode="r", allow_pickle=False)
+        if data.ndim > 3 and data.dtype.kind in "buif":
+            return data, None
+    image = io.read(path)
+    return image.data, image.voxel_size
+
+
+def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any]) -> NDArray[Any]:
+    """The noisy values in the number type asked for.
+
+    Raises:
+        ValueError: integers that some values are not, or that cannot hold them.
+    """
+    if dtype in ("float32", "float64"):
+        return noisy.astype(dtype)
+    kind = given if dtype == "auto" else np.dtype(dtype)
+    if kind.kind not in "iu":
+        return noisy.astype(np.float64) if kind == np.float64 else noisy
+    limits = np.iinfo(kind)
+    whole = bool((noisy == np.round(noisy)).all())
+    fits = whole and limits.min <= noisy.min() and noisy.max() <= limits.max
+    if fits:
+        return noisy.astype(kind)
+    if dtype == "auto":
+        return noisy
+    raise ValueError(
+        f"--dtype {dtype} cannot hold the noisy values, {noisy.min():g} … {noisy.max():g}"
+        f"{'' if whole else ', which are not whole numbers'}; use --dtype float32, or a model that rounds and clips (Digitised)"
+    )
+
+
+def notes(noise_model: NoiseModelBase, data: NDArray[Any]) -> list[str]:
+    """What a user had better know of clean pixels that the model does not cover."""
+    found = []
+    if noise_model.fitted_range is not None:
+        low, high = noise_model.fitted_range
+        outside = float(((data < low) | (data > high)).mean())
+        if outside > _FEW:
+            found.append(
+                f"{outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
+                "they get the noise of the nearest end"
+            )
+    for limit, beyond in ((noise_model.low, data < noise_model.low), (noise_model.high, data > noise_model.high)):
+        share = float(beyond.mean())
+        if share > _FEW:
+            found.append(
+                f"{share:.0%} of the clean pixels lie beyond the clipping limit {limit:g} of the model, where its images are "
+                f"constant; is the clean image in {noise_model.measured_in}?"
+            )
+    return found

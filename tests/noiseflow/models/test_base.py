@@ -1,0 +1,112 @@
+"""The contract of noise models: abstract for real, every trait declared, and none looked up by name elsewhere."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import noiseflow
+from noiseflow.io.model_files import kinds
+from noiseflow.models.around import ForeignModel, ModelAround, as_noise_model
+from recon.methods.kniesel2022.network import PaperFlow
+from recon.simulate.noises import SkewedNoise
+from tests.contracts import check_traits
+
+ROOT = Path(noiseflow.__file__).parent
+SIGNALS = torch.linspace(0.2, 0.8, 30).reshape(5, 6)
+OBSERVATION = SIGNALS + 0.1 * torch.sin(torch.arange(30.0)).reshape(5, 6)
+MODELS = {
+    **{name: kind for name, kind in kinds().items() if not issubclass(kind, ModelAround)},
+    "neighbourhood": lambda: noiseflow.SplineFlow(neighbourhood=3),
+    "clipped flow": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(), 0.0, 0.0, 1.0),
+    "rounded": lambda: noiseflow.Digitised(noiseflow.Gaussian(), 0.1),
+    "rows": lambda: noiseflow.ScanNoise(noiseflow.Digitised(noiseflow.Gaussian(), 0.1)),
+    "columns": lambda: noiseflow.ScanNoise(noiseflow.Gaussian(), along="column"),
+    "maps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)),
+    "rounded maps": lambda: noiseflow.Digitised(noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)), 0.1),
+    "published flow": PaperFlow,
+    "skewed": SkewedNoise,
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_traits_keep_their_contract(name: str) -> None:
+    check_traits(MODELS[name](), SIGNALS, OBSERVATION)
+
+
+def test_base_is_abstract() -> None:
+    class Nothing(noiseflow.NoiseModelBase):
+        """Has no forward."""
+
+    with pytest.raises(TypeError, match="forward"):
+        Nothing()
+
+
+def test_models_around_others_share_their_traits() -> None:
+    class Own(noiseflow.Gaussian):
+        learning_rate, num_steps, joint_learning_rate, most_joint_steps = 0.2, 7, 0.3, 5
+        starts_most_likely = starts_anew = True
+
+    own = Own()
+    around = noiseflow.ScanNoise(noiseflow.Digitised(own, 1.0))
+    names = (
+        "learning_rate",
+        "num_steps",
+        "joint_learning_rate",
+        "most_joint_steps",
+        "starts_most_likely",
+        "starts_anew",
+    )
+    assert all(getattr(around, name) == getattr(own, name) for name in names)
+    around.tabulate = False
+    assert own.tabulate is False
+    assert around.describes_single_readings
+    assert around.one_pixel is own
+    assert around.shared_axis == -1
+
+
+def test_converter_is_put_inside_offsets_of_rows() -> None:
+    rows = noiseflow.ScanNoise(noiseflow.Gaussian())
+    assert rows.behind(lambda inner: noiseflow.Digitised(inner, 1.0)) is rows
+    assert isinstance(rows.model, noiseflow.Digitised)
+    with pytest.raises(ValueError, match=r"ScanNoise\(Digitised"):
+        noiseflow.Digitised(noiseflow.ScanNoise(noiseflow.Gaussian()), 1.0)
+
+
+class Plain(nn.Module):
+    """A module of another library: no trait at all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.log_scale = nn.Parameter(torch.tensor(0.0))
+
+    def forward(self, signal: Tensor) -> torch.distributions.Distribution:
+        return torch.distributions.Normal(signal, self.log_scale.exp())
+
+
+def test_plain_module_is_fitted_as_it_is() -> None:
+    model = Plain()
+    signal = torch.rand(4000, generator=torch.Generator().manual_seed(0))
+    observation = signal + 0.5 * torch.randn(4000, generator=torch.Generator().manual_seed(1))
+    result = noiseflow.fit(model, signal, observation, learning_rate=0.05, num_steps=200)
+    assert result.noise_model is model
+    assert float(model.log_scale.detach().exp()) == pytest.approx(0.5, rel=0.05)
+    assert isinstance(as_noise_model(model), ForeignModel)
+    with pytest.raises(TypeError, match="NoiseModelBase"):
+        as_noise_model("Gaussian")
+
+
+def test_no_trait_is_looked_up_by_name() -> None:
+    """A trait that is looked up by ``getattr`` or ``hasattr`` is one that the base does not declare."""
+    traits = {name for name in vars(noiseflow.NoiseModelBase) if not name.startswith("_")}
+    for folder in ("models", "fitting", "interop", "commands", "io"):
+        for file in set((ROOT / folder).glob("*.py")) - {ROOT / "fitting" / "loop.py"}:
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1
+                if named and node.func.id in ("getattr", "hasattr") and isinstance(node.args[1], ast.Constant):
+                    owner = ast.unparse(node.args[0])
+                    assert node.args[1].value not in traits or owner == "self.module", f"{file}: {ast.unparse(node)}"
