@@ -18,3 +18,4 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
+from .tilt_axis import tilt_axis_of as tilt_axis_of
