@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.ownership import signature
 from noiseflow.io.tilt_axis import axis_in_titles
 
 _HEADER_BYTES = 1024
@@ -73,6 +74,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     stored = np.ascontiguousarray(_storable(data))
     with Sectionwise(path, "w+", overwrite=True) as mrc:
         mrc.set_data(stored)
+        mrc.add_label(signature())
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]
     return stored

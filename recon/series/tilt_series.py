@@ -67,6 +67,7 @@ class TiltSeries:
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
+        _require_several_views(self.images)
         _check_angles(self.tilt_angles)
 
     def __repr__(self) -> str:
@@ -85,6 +86,10 @@ class TiltSeries:
     def used(self) -> NDArray[np.bool_]:
         """(tilt, y, u), True for the pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
+
+    def rows(self, rows: slice) -> TiltSeries:
+        """Some rows (y) of all images."""
+        return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice."""
@@ -261,7 +266,19 @@ def write_angles(path: Path, tilt_angles: NDArray[np.floating[Any]]) -> Path:
     return path
 
 
+def _require_several_views(images: NDArray[Any]) -> None:
+    shown = sum(bool(image.min() < image.max()) for image in images)
+    if shown < 2 <= len(images):
+        raise ValueError(
+            f"{len(images) - shown} of {len(images)} images are flat, every pixel of an image the same; a tilt series needs "
+            "two or more that are not: check that the right file was given"
+        )
+
+
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
+    largest = np.abs(angles).max()
+    if largest > io.LARGEST_ANGLE:
+        raise ValueError(f"a tilt angle of {largest:g}° is impossible; angles are degrees within ±{io.LARGEST_ANGLE}")
     values, counts = np.unique(np.round(angles, 6), return_counts=True)
     if len(values) < 2:
         raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")

@@ -58,13 +58,20 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
     Bright-field images keep their zero, which means something: the level is zero there.
     """
-    images = tilt_series.images
-    if tilt_series.mode != "linear":
+    images, level = tilt_series.images, level_of(tilt_series)
+    if not level:
         return replace(tilt_series, images=np.asarray(images, dtype=np.float32)), 0.0
-    step = max(1, images.size // (_SAMPLE * len(images)))
-    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in images]).astype(np.float64)
-    level = float(np.quantile(sample, 0.5, method="nearest"))
     lowered = np.empty(images.shape, dtype=np.float32)
     for image, result in zip(images, lowered, strict=True):
         result[...] = image.astype(np.float64) - level
     return replace(tilt_series, images=lowered), level
+
+
+def level_of(tilt_series: TiltSeries) -> float:
+    """The median pixel value of linear images, zero for bright field."""
+    images = tilt_series.images
+    if tilt_series.mode != "linear":
+        return 0.0
+    step = max(1, images.size // (_SAMPLE * len(images)))
+    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in images]).astype(np.float64)
+    return float(np.quantile(sample, 0.5, method="nearest"))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.methods.methods import reconstruct
+from recon.methods import reconstruct
 from recon.projection.wbp import angular_shares
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, VolumeGrid

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
+from recon.methods._registry import Finish
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp
+from recon.reconstruction import Reconstruction
+from recon.scale.blocks import Images, Solve
 from recon.series.first_guess import contrast_slab, estimate_response
-from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.series.views import every_nth_view, view_numbers, without_level
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.views import every_nth_view, level_of, view_numbers, without_level
 
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
@@ -62,6 +65,46 @@ class LineIntegralProblem:
         with torch.no_grad():
             images = self.response(self.projector(volume).transpose(1, 2)).transpose(1, 2)
             return np.asarray(images.contiguous().cpu().numpy() + np.float32(self.level))
+
+
+def classical(
+    name: str, problem: LineIntegralProblem, volume: Tensor, grid: VolumeGrid, choices: dict[str, float | str]
+) -> Reconstruction:
+    """The result of a method that fits nothing."""
+    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
+    return Reconstruction(result, problem.predict(volume), name, choices=choices)
+
+
+def in_blocks(
+    name: str,
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    device: torch.device | str,
+    solve_problem: Callable[[LineIntegralProblem], Tensor],
+    choices: dict[str, float | str],
+) -> tuple[Solve, Finish]:
+    """A method whose slices do not depend on each other, block by block, under the response of the whole series."""
+    level = level_of(tilt_series)
+    response = estimate_response(tilt_series, level=level).to(device)
+    projector = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles,
+        depth=grid.depth,
+        width=grid.width,
+        detector_width=tilt_series.images.shape[2],
+        device=device,
+    )
+
+    def solve(rows: slice) -> tuple[Images, Images]:
+        lowered = np.asarray(tilt_series.images[:, rows] - np.float64(level), dtype=np.float32)
+        images = torch.from_numpy(lowered).to(device)
+        problem = LineIntegralProblem(response.invert(images).contiguous().detach(), projector, response, level)
+        volume = solve_problem(problem)
+        return volume.cpu().numpy(), problem.predict(volume)
+
+    def finish(volume: Volume, projections: Images) -> Reconstruction:
+        return Reconstruction(volume, projections, name, choices=choices)
+
+    return solve, finish
 
 
 def best_window(
