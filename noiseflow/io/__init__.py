@@ -21,3 +21,4 @@ from .images import read_image as read_image
 from .images import write as write
 from .lock import locked as locked
 from .partials import partial_folder as partial_folder
+from .tilt_axis import tilt_axis_of as tilt_axis_of

@@ -72,13 +72,14 @@ def angle_file_of(stack: str | Path) -> Path | None:
 def _candidates(stack: str | Path) -> list[Path]:
     stack = Path(str(stack).partition("::")[0])
     if not stack.is_dir():
-        return _beside(stack)
+        return beside(stack)
     stack = stack.resolve()
     inside = [file for suffix in (*RAW_FIRST, ".mdoc") for file in stack.glob(f"*{suffix}")]
-    return [*_beside(stack), *(inside if len(inside) == 1 else [])]
+    return [*beside(stack), *(inside if len(inside) == 1 else [])]
 
 
-def _beside(stack: Path) -> list[Path]:
+def beside(stack: Path) -> list[Path]:
+    """Where the angle files of a stack may be, likely ones first."""
     refined = stack.suffix.lower() == ".ali" or stack.stem.endswith("_ali")
     stem = stack.with_name(stack.name.removesuffix(stack.suffix).removesuffix("_ali") + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]

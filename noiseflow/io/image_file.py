@@ -26,11 +26,13 @@ class ImageFile:
         data: the pixels in the file's own number type, (y, x) or (section, y, x).
         voxel_size: Å along each axis of ``data``'s (z, y, x), or None where the file does not say.
         tilt_angles: (section,) degrees, or None where the file does not say.
+        tilt_axis: its direction in the images, degrees from y towards −x, or None where the file does not say.
     """
 
     data: NDArray[Any]
     voxel_size: VoxelSize | None = None
     tilt_angles: NDArray[np.float64] | None = None
+    tilt_axis: float | None = None
 
     def __repr__(self) -> str:
         size = "unknown" if self.voxel_size is None else " x ".join(f"{edge:.5g}" for edge in self.voxel_size) + " Å"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
+from noiseflow.io.tilt_axis import recorded_axis
 from noiseflow.io.units import in_angstrom
 from noiseflow.io.velox import stage_angles
 
@@ -52,7 +53,8 @@ def read(path: Path, member: str | None = None) -> ImageFile:
     angles = _tilt_angles(signal, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = stage_angles(path, len(data))
-    return ImageFile(data, _voxel_size(axes), angles)
+    trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
+    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)))
 
 
 def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.ownership import signature
+from noiseflow.io.tilt_axis import axis_in_titles
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -25,6 +26,8 @@ _REFUSED = {
 _IMOD_STAMP = 1146047817
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 """Bytes that each kind of SerialEM's short data takes per section, by its flag."""
+
+_OLD_FEI_REALS, _OLD_FEI_AXIS = 32, 10
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
@@ -48,7 +51,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
     angles = _tilt_angles(header, extended, len(data))
     if int(header["ispg"]) == 0 and len(data) == 1:
         data = data[0]
-    return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles)
+    return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles, _tilt_axis(header, extended))
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -180,3 +183,22 @@ def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.flo
     angles: NDArray[np.float64] = np.frombuffer(b"".join(records), item).astype(np.float64) * unit
     told = np.isfinite(angles).all() and np.abs(angles).max() <= 180 and (count == 1 or np.ptp(angles) > 0)
     return angles if told else None
+
+
+def _tilt_axis(header: np.void, extended: bytes) -> float | None:
+    """Degrees, from a title such as SerialEM writes, or from the first record of FEI's extended headers, where zero is unset."""
+    import mrcfile.dtypes
+
+    titles = (bytes(label).decode("latin-1", "replace") for label in header["label"])
+    if (stated := axis_in_titles(titles)) is not None:
+        return stated
+    order = ">" if _is_big_endian(header) else "<"
+    kind, num_reals = header["exttyp"].item(), int(np.frombuffer(header["extra2"].tobytes()[18:20], f"{order}i2")[0])
+    if kind in (b"FEI1", b"FEI2"):
+        item, offset = f"{order}f8", mrcfile.dtypes.get_ext_header_dtype(kind, order).fields["Tilt axis angle"][1]
+    elif kind in (b"AGAR", b"", b"\0\0\0\0") and num_reals == _OLD_FEI_REALS:
+        item, offset = f"{order}f4", 4 * _OLD_FEI_AXIS
+    else:
+        return None
+    found = np.frombuffer(extended[offset : offset + np.dtype(item).itemsize], item)
+    return float(found[0]) if found.size and 0 < abs(found[0]) <= 360 else None

@@ -49,6 +49,7 @@ def reconstruct_layer(
     import numpy as np
 
     from recon.methods._registry import reconstruct
+    from recon.series.prepare import prepare
     from recon.series.tilt_series import TiltSeries, VolumeGrid
 
     known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
@@ -58,6 +59,7 @@ def reconstruct_layer(
     pixel_size = None if size is None else float(size[-1])
     sign = -1.0 if invert_tilt else 1.0
     series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, mode)  # type: ignore[arg-type]
+    series = prepare(series).tilt_series
     grid = VolumeGrid.of(series, thickness or None)
     outcome = reconstruct(series, grid, method=method, num_steps=num_steps or None, progress=progress)
     scale = [pixel_size or 1.0] * 3

@@ -114,7 +114,7 @@ class _Search:
             if not candidates:
                 candidates = _distinct(self._first(matcher), _KEPT[0], _SPACING)
             elif matcher.size <= _SEARCHED:
-                candidates = _refined(matcher, candidates)
+                candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
                 chosen = chosen or self._decided(candidates)
                 match = match or chosen.match
@@ -151,6 +151,33 @@ class _Search:
         ]
         return [_weighed(matcher, match, known) for match, known in tried]
 
+    def _refined(self, matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
+        """Shifts and axes at a finer size, best first; rivals that are beaten, but for a few, are dropped."""
+        best, *others = _distinct([self._matched(matcher, each) for each in candidates], _KEPT[1], _SAME)
+        rivals = [each for each in others if not best.evidence.is_clear_of(each.evidence)]
+        beaten = [each for each in others if each not in rivals]
+        turned = [_turned(matcher, each) for each in (best, *rivals)]
+        found = _distinct(
+            [each if self._strayed(each) is None else old for each, old in zip(turned, (best, *rivals), strict=True)],
+            _KEPT[1],
+            _SAME,
+        )
+        compact = min(others, key=lambda each: each.evidence.occupied, default=None)
+        return found + [each for each in beaten if each.known or each is compact or len(found) == 1]
+
+    def _matched(self, matcher: Matcher, candidate: _Candidate) -> _Candidate:
+        old = candidate.match
+        found = _weighed(matcher, matcher.match(old.axis, old.shifts, rounds=_ROUNDS, free_axis=True), candidate.known)
+        if (back := self._strayed(found)) is None:
+            return found
+        return _weighed(matcher, matcher.match(back, old.shifts, rounds=_ROUNDS), candidate.known)
+
+    def _strayed(self, candidate: _Candidate) -> float | None:
+        """The stated direction, radians, where a candidate that began there has gone elsewhere."""
+        if self.known is None or not candidate.known or _between(candidate.match.degrees, self.known) < _SAME:
+            return None
+        return math.radians(self.known)
+
     def _decided(self, candidates: list[_Candidate]) -> _Candidate:
         """The candidate that stands clear of all others, or that is known beforehand.
 
@@ -174,11 +201,13 @@ class _Search:
 
 
 def _distinct(candidates: list[_Candidate], count: int, apart: float) -> list[_Candidate]:
-    """The best of those nearer than `apart` to each other, best first; what is known is among them."""
+    """The best of those nearer than `apart` to each other, best first; the known and the most compact one are among them."""
     kept: list[_Candidate] = []
+    compact = min(candidates, key=lambda candidate: candidate.evidence.occupied)
     for each in sorted(candidates, key=lambda candidate: candidate.residual):
         near = next((i for i, other in enumerate(kept) if _apart(each, other) < apart), None)
-        if near is None and (len(kept) < count or (each.known and not any(other.known for other in kept))):
+        wanted = each is compact or (each.known and not any(other.known for other in kept))
+        if near is None and (len(kept) < count or wanted):
             kept.append(each)
         elif near is not None and each.known:
             kept[near] = replace(kept[near], known=True)
@@ -186,21 +215,12 @@ def _distinct(candidates: list[_Candidate], count: int, apart: float) -> list[_C
 
 
 def _apart(one: _Candidate, other: _Candidate) -> float:
+    return _between(one.match.degrees, other.match.degrees)
+
+
+def _between(one: float, other: float) -> float:
     """Degrees between two lines."""
-    return abs((one.match.degrees - other.match.degrees + 90) % 180 - 90)
-
-
-def _refined(matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
-    """Shifts and axes at a finer size, best first; those that the best is clear of, but for one, are dropped."""
-    matched = [
-        _weighed(matcher, matcher.match(each.match.axis, each.match.shifts, rounds=_ROUNDS, free_axis=True), each.known)
-        for each in candidates
-    ]
-    best, *others = _distinct(matched, _KEPT[1], _SAME)
-    rivals = [each for each in others if not best.evidence.is_clear_of(each.evidence)]
-    beaten = [each for each in others if each not in rivals]
-    turned = _distinct([_turned(matcher, each) for each in (best, *rivals)], _KEPT[1], _SAME)
-    return turned + [each for each in beaten if each.known or len(turned) == 1][:2]
+    return abs((one - other + 90) % 180 - 90)
 
 
 def _weighed(matcher: Matcher, match: Match, known: bool) -> _Candidate:

@@ -49,7 +49,7 @@ class Evidence:
     @property
     def images_hardly_change(self) -> bool:
         """Whether images interpolated across the gaps are nearer to those left out than any volume's projections."""
-        return _standard_errors(self.unexplained - self.unchanged, self) > _DETERMINED
+        return _standard_errors(self.unexplained - self.unchanged, self) > 0
 
     def lead_over(self, other: Evidence) -> float:
         """By how many standard errors, over the gaps, this axis leaves less unexplained than another."""
@@ -144,7 +144,8 @@ class _View:
 def _gaps(angles: NDArray[np.float64]) -> NDArray[np.int64]:
     extent = float(np.ptp(angles))
     count = max(_FEWEST_GAPS, int(extent // _GAP))
-    return np.minimum((count * (angles - angles.min()) / extent).astype(np.int64), count - 1)
+    numbers: NDArray[np.int64] = (count * (angles - angles.min()) / extent).astype(np.int64)
+    return np.minimum(numbers, count - 1)
 
 
 def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArray[np.float32]:

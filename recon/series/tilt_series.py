@@ -196,14 +196,15 @@ def read_tilt_series(
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
     if transforms is not None:
         images = io.apply_transforms(images, io.read_transforms(transforms))
+    tilt_axis = io.tilt_axis_of(path, image_file) if transforms is None else None
     if mask is None:
-        return TiltSeries(images, tilt_angles, pixel_size, mode)
+        return TiltSeries(images, tilt_angles, pixel_size, mode, tilt_axis=tilt_axis)
     empty = ~mask.any((1, 2))
     if empty.any() and len(tilt_angles) == len(images):
         named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
         warnings.warn(f"{int(empty.sum())} tilts have no usable pixel and are left out: {named}", stacklevel=2)
         images, mask, tilt_angles = images[~empty], mask[~empty], tilt_angles[~empty]
-    return TiltSeries(images, tilt_angles, pixel_size, mode, mask)
+    return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis)
 
 
 def _masked(

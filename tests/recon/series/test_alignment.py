@@ -1,12 +1,15 @@
 """Raw series, rotated and shifted by known amounts, are aligned to a fraction of a pixel."""
 
 import warnings
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from recon.series.alignment import Alignment
-from recon.series.alignment_search import find_alignment
+from recon.series.alignment_search import AxisUndetermined, find_alignment
+from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, read_tilt_series
 
 ANGLES = np.arange(-60, 61, 4.0)
@@ -139,3 +142,72 @@ def test_raw_microscope_file_becomes_a_volume_in_one_command(tmp_path, run, data
     assert abs(result["alignment"]["tilt_axis_degrees"]) == pytest.approx(79.75, abs=0.7)
     aligned = read_tilt_series(raw.with_name("needle_aligned.mrc"), mode="linear")
     assert float(result["figures"]["residual rms"]) < 0.05 * aligned.images.std()
+
+
+def revolution(kind, size=32, axis=30.0):
+    """Equal images at all angles: a body of revolution about the tilt axis, or a ball, shifted from tilt to tilt."""
+    generator = np.random.default_rng(0)
+    y, x = np.meshgrid(*(np.arange(size) - (size - 1) / 2,) * 2, indexing="ij")
+    theta, images = np.deg2rad(axis), []
+    for down, right in generator.uniform(-0.06, 0.06, (len(ANGLES), 2)) * size:
+        along = (y - down) * np.cos(theta) - (x - right) * np.sin(theta)
+        across = (y - down) * np.sin(theta) + (x - right) * np.cos(theta)
+        length, radius = {"rod": (0.35, 0.12), "ball": (0.3, 0.3)}[kind]
+        ends = 0 if kind == "rod" else (along / length / size) ** 2
+        thickness = np.sqrt(np.maximum(1 - (across / radius / size) ** 2 - ends, 0))
+        images.append(thickness * (np.abs(along) <= length * size) * size * radius)
+    images = np.stack(images) + 0.02 * np.max(images) * generator.normal(size=(len(ANGLES), size, size))
+    return TiltSeries(images.astype(np.float32), ANGLES, None, "linear")
+
+
+@pytest.mark.parametrize("kind", ["rod", "ball"])
+def test_images_that_fit_any_axis_are_no_answer(kind):
+    series = revolution(kind)
+    with pytest.raises(AxisUndetermined, match="--tilt-axis") as caught:
+        find_alignment(series)
+    first, second = caught.value.candidates[:2]
+    assert abs((first.axis - second.axis + 90) % 180 - 90) >= 20
+    for named in (first, second):
+        assert f"--tilt-axis {named.axis:.0f}" in str(caught.value)
+
+
+def test_a_stated_axis_decides_where_the_images_do_not():
+    found = find_alignment(replace(revolution("rod"), tilt_axis=27.0))
+    assert found.tilt_axis == pytest.approx(30, abs=6)
+    with pytest.raises(ValueError, match="determine"):
+        prepare(revolution("rod"), refine_alignment=True)
+
+
+def test_a_wrong_axis_is_contradicted_by_the_images():
+    shifts = random_shifts(2.0)
+    raw = blobs(10.0, shifts, shape=(28, 28))
+    with pytest.warns(UserWarning, match="the given direction is kept"):
+        kept = find_alignment(raw, tilt_axis=100.0)
+    assert kept.tilt_axis == pytest.approx(100, abs=20)
+    assert kept.margin < 0
+    with pytest.warns(UserWarning, match="the images are believed"):
+        found = find_alignment(replace(raw, tilt_axis=100.0))
+    assert (found.tilt_axis - 10 + 90) % 180 - 90 == pytest.approx(0, abs=2.5)
+    assert found.margin > 4
+    assert max(shift_errors(found, 10.0, shifts)) < 0.3
+
+
+def test_masked_pixels_do_not_mislead_the_alignment():
+    shifts = random_shifts(2.0)
+    raw = blobs(2.0, shifts, shape=(28, 28))
+    images, mask = raw.images.copy(), np.ones(raw.images.shape, dtype=bool)
+    images[:, 10:13, 5:9], mask[:, 10:13, 5:9] = images.max() * 3, False
+    found = find_alignment(replace(raw, images=images, mask=mask), tilt_axis=0.0)
+    assert max(shift_errors(found, 2.0, shifts)) < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hint", [None, 90.0])
+def test_raw_needle_is_aligned_or_its_axis_asked_for(hint):
+    raw = Path(__file__).parents[4] / "shared" / "data" / "tilt_needle_256" / "needle_256_raw.mrc"
+    if not raw.exists():
+        pytest.skip("the raw series is not at hand")
+    series = replace(read_tilt_series(raw, mode="linear"), tilt_axis=None)
+    found = find_alignment(series, tilt_axis=hint)
+    assert (found.tilt_axis - 92.8 + 90) % 180 - 90 == pytest.approx(0, abs=2)
+    assert found.residual < 0.01
