@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import LatentDistribution, normal_quadrature
 from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
@@ -248,9 +247,16 @@ def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, T
 class FlowDistribution(LatentDistribution):
     """The distribution that a `ConditionalFlow` returns; its parameters are computed when first needed."""
 
+    per_pixel = ("_signal", "_windows")
+
     def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
-        super().__init__(signal.shape)
-        self._flow, self._signal, self._windows = flow, signal, windows
+        super().__init__(signal.shape, like=signal)
+        self._flow, self._signal, self._windows = flow, self.working(signal), windows
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The flow and the signal; none where pixels look at their neighbours."""
+        return (self._flow, self._signal) if self._windows is None else None
 
     @cached_property
     def _parameters(self) -> tuple[Tensor, Tensor, list[Transform]]:
@@ -268,21 +274,6 @@ class FlowDistribution(LatentDistribution):
     def from_latent(self, latent: Tensor) -> Tensor:
         location, log_scale, transforms = self._parameters
         return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        found = tabulated.automatic_log_prob(self._flow, self._signal, value)
-        return super().log_prob(value) if found is None else found
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        signal = self._signal.expand((*sample_shape, *self.batch_shape))
-        if self._flow.tabulate and self._windows is None and signal.numel() >= tabulated.LARGE:
-            found = tabulated.sample(self._flow, signal, generator)
-            if found is not None:
-                return found
-        return super().sample(sample_shape, generator)
-
-    def _like(self) -> Tensor:
-        return self._signal
 
 
 class RadialFlow(ConditionalFlow):

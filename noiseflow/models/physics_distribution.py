@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import (
     NoiseDistribution,
     log_normal_cdf,
@@ -32,13 +32,26 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     Args:
         base: the detector's distribution.
-        transforms: increasing maps from the detector's latent to this model's, in order.
+        maps: gives at a signal the increasing maps from the detector's latent to this model's, in order.
         model: the `PhysicsFlow` it comes from, for the tables of large inputs.
     """
 
-    def __init__(self, base: PoissonGaussianDistribution, transforms: Sequence[Transform], *, model: nn.Module) -> None:
-        super().__init__(base.batch_shape)
-        self.base, self._transforms, self._model = base, transforms, model
+    per_pixel = ()
+
+    def __init__(
+        self, base: PoissonGaussianDistribution, maps: Callable[[Tensor], Sequence[Transform]], *, model: nn.Module
+    ) -> None:
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base, self._maps, self._model = base, maps, model
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The model and the signal."""
+        return self._model, self.base.signal
+
+    @cached_property
+    def _transforms(self) -> Sequence[Transform]:
+        return self._maps(self.base.signal)
 
     def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """The mapped latent, and the log-density of this model over that of the detector."""
@@ -82,8 +95,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return density + self.correct(latent)[1]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        found = tabulated.automatic_log_prob(self._model, self.base.signal, value)
-        return self._log_prob(value).to(value.dtype) if found is None else found
+        return self._log_prob(value)
 
     def cdf(self, value: Tensor) -> Tensor:
         probability: Tensor = torch.special.ndtr(self._mapped_bound(self._detector_latent(value)))

@@ -113,8 +113,11 @@ class ScanDistribution(NoiseDistribution):
         axis: the axis along which they are shared, −1 or −2.
     """
 
+    independent = False
+    per_pixel = ()
+
     def __init__(self, base: NoiseDistribution, scale: Tensor, axis: int) -> None:
-        super().__init__(base.batch_shape)
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
         self.base, self.scale, self.axis = base, scale, axis
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -1,0 +1,112 @@
+"""The distribution of shot plus read noise, in detector units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
+from noiseflow.distributions.pixelwise import pixelwise
+
+
+def _electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    return (value - signal) / gain, ((signal - offset).clamp(min=0) / gain).expand_as(value)
+
+
+def _log_density(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_density(*_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
+
+
+def _log_interval(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    finite = torch.isfinite(low), torch.isfinite(high)
+    (bottom, rate), (top, _) = (
+        _electrons(torch.where(known, value, torch.zeros_like(value)), signal, gain, offset)
+        for known, value in zip(finite, (low, high), strict=True)
+    )
+    # an infinite bound moves to where nothing is left beyond it, without a gradient
+    end = (40 * torch.sqrt(rate + read_noise**2) + 100).detach()
+    least = torch.where(finite[1], torch.minimum(top.detach() - end, -end), -end)
+    most = torch.where(finite[0], torch.maximum(bottom.detach() + end, end), end)
+    bottom = torch.where(finite[0], bottom, torch.where(low > 0, most, least))
+    top = torch.where(finite[1], top, torch.where(high > 0, most, least))
+    return log_interval(bottom, top, rate, read_noise, twice=twice)
+
+
+def _log_below(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_both_tails(*_electrons(value, signal, gain, offset), read_noise)[0]
+
+
+def _log_above(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_both_tails(*_electrons(value, signal, gain, offset), read_noise)[1]
+
+
+class PoissonGaussianDistribution(NoiseDistribution):
+    """Distribution of gain·(k + read_noise·n) + offset, k Poisson of rate (signal − offset)/gain, n standard normal.
+
+    Args:
+        signal: clean pixel values, detector units, any shape.
+        gain, offset, read_noise: scalars, float64: counts per electron, counts, electrons rms.
+    """
+
+    light = True
+
+    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
+        super().__init__(signal.shape, like=signal)
+        self.signal, self.gain, self.offset, self.read_noise = self.working(signal), gain, offset, read_noise
+
+    @property
+    def _law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.signal, self.gain, self.offset, self.read_noise
+
+    @property
+    def rate(self) -> Tensor:
+        """Expected electrons, float64."""
+        return (self.signal.double() - self.offset).clamp(min=0) / self.gain
+
+    def electrons(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals and rates of observations, electrons, float64."""
+        residual = (value.double() - self.signal.double()) / self.gain
+        return residual, self.rate.expand_as(residual)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return pixelwise(_log_density, value, *self._law)
+
+    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
+        return pixelwise(_log_below, value, *self._law), pixelwise(_log_above, value, *self._law)
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return pixelwise(_log_below, value, *self._law).exp()
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return pixelwise(_log_interval, low, high, *self._law)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
+        return bisect_quantile(self, value, middle - reach, middle + reach)
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        signal = self.signal
+        rate = self.rate.to(signal.dtype).expand((*sample_shape, *self.batch_shape))
+        normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
+        noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
+        return noise.add_(signal)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.given(self.signal)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.given(self.gain**2 * (self.rate + self.read_noise**2))
