@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from noiseflow.distributions.pixels import is_traced
+from noiseflow.kept_memory import kept_memory
+
 PIECE = 2**14
 """Pixels at once: a dozen float64 arrays of so many stay in the cache."""
+
+_LONG = 8 * PIECE  # beyond, giving memory back to the system and taking it again costs more than keeping it
 
 Function = Callable[..., Tensor]
 
 
-def pixelwise(function: Function, *inputs: Tensor) -> Tensor:
+def pixelwise(function: Function, *inputs: Tensor, with_slopes: Callable[..., Any] | None = None) -> Tensor:
     """`function` of tensors that broadcast, float64, elementwise.
 
     Only the inputs are kept for the gradient: the function is evaluated again, piece by piece, when it is asked for. Ordinary
@@ -32,7 +38,14 @@ def pixelwise(function: Function, *inputs: Tensor) -> Tensor:
     several = [each for each in inputs if each.ndim]
     shape = torch.broadcast_shapes(*(each.shape for each in several)) if several else torch.Size()  # type: ignore[no-untyped-call]
     full = [each.expand(shape) if each.ndim else each for each in inputs]
-    found: Tensor = _Value.apply(function, *full)  # type: ignore[no-untyped-call]
+    found: Tensor
+    if with_slopes is None or any(is_traced(each) for each in inputs):
+        found = _Value.apply(function, *full)  # type: ignore[no-untyped-call]
+    elif torch.is_grad_enabled() and any(each.requires_grad for each in full):
+        found = _Kept.apply(function, with_slopes, *full)  # type: ignore[no-untyped-call]
+    else:
+        with torch.no_grad():
+            found = _by_pieces(lambda *part: (with_slopes(*part, slopes=False)[0],), full, [True])[0]
     return found
 
 
@@ -40,7 +53,7 @@ class _Value(torch.autograd.Function):
     @staticmethod
     def forward(function: Function, *inputs: Tensor) -> Tensor:
         with torch.no_grad():
-            return _by_pieces(lambda *part: (function(*part),), inputs, 1)[0]
+            return _by_pieces(lambda *part: (function(*part),), inputs, [True])[0]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -64,12 +77,42 @@ class _Value(torch.autograd.Function):
         return pixelwise(function, *_unbatched(info.batch_size, in_dims[1:], inputs)), 0
 
 
+class _Kept(torch.autograd.Function):
+    """The value with its derivatives, computed together and kept."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Function, with_slopes: Callable[..., Any], *inputs: Tensor) -> Tensor:
+        needed = ctx.needs_input_grad[2:]
+
+        def both(*part: Tensor) -> tuple[Tensor, ...]:
+            value, slopes = with_slopes(*part, slopes=True)
+            return value, *slopes
+
+        value, *slopes = _by_pieces(both, inputs, [True, *needed])
+        ctx.function, ctx.count = function, len(inputs)
+        ctx.save_for_backward(*inputs, *slopes)
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, kept = ctx.saved_tensors[: ctx.count], iter(ctx.saved_tensors[ctx.count :])
+        if torch.is_grad_enabled():  # to be differentiated again
+            slopes = _Slopes.apply(ctx.function, *inputs)  # type: ignore[no-untyped-call]
+            return None, None, *_summed(gradient, slopes, inputs)
+        needed = ctx.needs_input_grad[2:]
+        products = [gradient * next(kept) if need else None for need in needed]
+        return None, None, *(
+            None if product is None else (product if each.ndim else product.sum()).to(each.dtype)
+            for product, each in zip(products, inputs, strict=True)
+        )
+
+
 class _Slopes(torch.autograd.Function):
     """The derivatives of the function with respect to each input, (n,) each."""
 
     @staticmethod
     def forward(function: Function, *inputs: Tensor) -> tuple[Tensor, ...]:
-        return _by_pieces(lambda *part: _slopes(function, part, twice=False), inputs, len(inputs))
+        return _by_pieces(lambda *part: _slopes(function, part, twice=False), inputs, [True] * len(inputs))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -112,7 +155,7 @@ class _Curvature(torch.autograd.Function):
                 total = sum((s * v.detach() for s, v in zip(slopes, part[half:], strict=True)), torch.zeros(()))
             return _gradients(total, at)
 
-        return _by_pieces(curved, tensors, half)
+        return _by_pieces(curved, tensors, [True] * half)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -168,14 +211,16 @@ def _vector_product(
     found = [torch.zeros(count if inputs[i].ndim else 1, dtype=torch.float64, device=flat.device) for i in wanted]
     for start in range(0, count, PIECE):
         part = [each[start : start + PIECE].double() if each.ndim else each.double() for each in flat_inputs]
+        nothing, part = _without_nan(part)
         at = [part[i].requires_grad_() for i in wanted]
         with torch.enable_grad():
-            value = function(*part)
+            value = function(*part).reshape(-1)
         if not value.requires_grad:
             continue
         good = flat[start : start + PIECE].to(value.dtype)
+        good = good if nothing is None else good.masked_fill(nothing.reshape(-1), 0.0)
         for total, i, slope in zip(
-            found, wanted, torch.autograd.grad(value.reshape(-1), at, good, allow_unused=True), strict=True
+            found, wanted, torch.autograd.grad(value, at, good, allow_unused=True), strict=True
         ):
             if slope is not None and inputs[i].ndim:
                 total[start : start + PIECE] = slope
@@ -199,17 +244,38 @@ def _directional(slopes: Sequence[Tensor], tangents: Sequence[Tensor | None]) ->
     return sum(parts[1:], parts[0])
 
 
-def _by_pieces(function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor], count: int) -> tuple[Tensor, ...]:
-    """Outputs, float64, shaped like the inputs that are not single numbers."""
+def _by_pieces(
+    function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor], wanted: Sequence[bool]
+) -> tuple[Tensor, ...]:
+    """Those of the outputs that are wanted, float64, shaped like the inputs that are not single numbers; NaN where one is NaN."""
     shape = _shape_of(inputs)
     size, device = math.prod(shape), inputs[0].device
-    found = [torch.empty(size, dtype=torch.float64, device=device) for _ in range(count)]
+    found = [torch.empty(size, dtype=torch.float64, device=device) for want in wanted if want]
     flat = [each.reshape(-1) if each.ndim else each for each in inputs]
-    for start in range(0, size, PIECE):
-        part = [each[start : start + PIECE].double() if each.ndim else each.double() for each in flat]
-        for out, value in zip(found, function(*part), strict=True):
-            out[start : start + PIECE] = value
+    with kept_memory() if size > _LONG else nullcontext():
+        _fill(found, function, flat, wanted)
     return tuple(each.reshape(shape) for each in found)
+
+
+def _fill(
+    found: list[Tensor], function: Callable[..., tuple[Tensor, ...]], flat: list[Tensor], wanted: Sequence[bool]
+) -> None:
+    for start in range(0, found[0].numel(), PIECE):
+        part = [each[start : start + PIECE].double() if each.ndim else each.double() for each in flat]
+        nothing, part = _without_nan(part)
+        values = (value for value, want in zip(function(*part), wanted, strict=True) if want)
+        for out, value in zip(found, values, strict=True):
+            out[start : start + PIECE] = value if nothing is None else value.masked_fill(nothing, math.nan)
+
+
+def _without_nan(part: list[Tensor]) -> tuple[Tensor | None, list[Tensor]]:
+    """Where some input is NaN, if anywhere, and the inputs with 1 in its place."""
+    total = sum(each if each.ndim else each.detach() for each in part)
+    nothing = torch.isnan(total)  # type: ignore[arg-type]
+    if not bool(nothing.any()):
+        return None, part
+    nothing = torch.stack(torch.broadcast_tensors(*(torch.isnan(each) for each in part))).any(0)  # type: ignore[no-untyped-call]
+    return nothing, [torch.nan_to_num(each, nan=1.0, posinf=math.inf, neginf=-math.inf) for each in part]
 
 
 def _unbatched(size: int, in_dims: Sequence[int | None], inputs: Sequence[Tensor]) -> list[Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
+from noiseflow.distributions.electrons import interval_and_slopes, log_both_tails, log_density, log_interval
 from noiseflow.distributions.pixelwise import pixelwise
 
 
@@ -25,18 +25,45 @@ def _log_density(
 def _log_interval(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
+    return log_interval(*_bounds(low, high, signal, gain, offset, read_noise), read_noise)
+
+
+def _bounds(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of the bounds and rates, electrons; an infinite bound moves to where nothing is left beyond it."""
+    (bottom, rate), (top, _) = (_electrons(value, signal, gain, offset) for value in (low, high))
     finite = torch.isfinite(low), torch.isfinite(high)
-    (bottom, rate), (top, _) = (
+    if bool((finite[0] & finite[1]).all()):
+        return bottom, top, rate
+    (bottom, _), (top, _) = (
         _electrons(torch.where(known, value, torch.zeros_like(value)), signal, gain, offset)
         for known, value in zip(finite, (low, high), strict=True)
     )
-    # an infinite bound moves to where nothing is left beyond it, without a gradient
     end = (40 * torch.sqrt(rate + read_noise**2) + 100).detach()
     least = torch.where(finite[1], torch.minimum(top.detach() - end, -end), -end)
     most = torch.where(finite[0], torch.maximum(bottom.detach() + end, end), end)
     bottom = torch.where(finite[0], bottom, torch.where(low > 0, most, least))
     top = torch.where(finite[1], top, torch.where(high > 0, most, least))
-    return log_interval(bottom, top, rate, read_noise, twice=twice)
+    return bottom, top, rate
+
+
+def _interval_and_slopes(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """By the chain rule from electrons to detector units."""
+    bottom, top, rate = _bounds(low, high, signal, gain, offset, read_noise)
+    value, found = interval_and_slopes(bottom, top, rate, read_noise, slopes=slopes)
+    if not slopes:
+        return value, ()
+    of_low, of_high, of_rate, of_noise = found
+    of_low, of_high = (
+        torch.where(torch.isfinite(bound), slope / gain, torch.zeros_like(slope))
+        for bound, slope in ((low, of_low), (high, of_high))
+    )
+    of_rate = torch.where(signal > offset, of_rate / gain, torch.zeros_like(of_rate))
+    of_gain = -(bottom * of_low + top * of_high + rate * of_rate)
+    return value, (of_low, of_high, of_rate - of_low - of_high, of_gain, -of_rate, of_noise)
 
 
 def _log_below(
@@ -90,7 +117,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return pixelwise(_log_below, value, *self._law).exp()
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return pixelwise(_log_interval, low, high, *self._law)
+        return pixelwise(_log_interval, low, high, *self._law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
