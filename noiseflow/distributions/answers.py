@@ -57,14 +57,15 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     working = torch.promote_types(answer, torch.float32)
     try:
         shapes = [tensor.shape for tensor in tensors]
-        torch.broadcast_shapes(self.batch_shape, *shapes)  # type: ignore[no-untyped-call]
+        shape = torch.broadcast_shapes(self.batch_shape, *shapes)  # type: ignore[no-untyped-call]
     except RuntimeError as error:
         given_shapes = " and ".join(str(tuple(shape)) for shape in shapes)
         raise ValueError(
             f"{name}: a value of shape {given_shapes} does not broadcast with the signal's {tuple(self.batch_shape)}; "
             "give one observation per pixel, or leading axes for several"
         ) from error
-    return [t.to(torch.promote_types(t.dtype if t.is_floating_point() else working, working)) for t in tensors], answer
+    kinds = [torch.promote_types(t.dtype if t.is_floating_point() else working, working) for t in tensors]
+    return [t.to(kind).expand(shape) for t, kind in zip(tensors, kinds, strict=True)], answer
 
 
 def _density(method: Method, name: str) -> Method:
@@ -72,7 +73,7 @@ def _density(method: Method, name: str) -> Method:
     def log_prob(self: Any, value: Any) -> Tensor:
         (tensor,), answer = _taken(self, name, [value])
         finite = torch.isfinite(tensor)
-        if not is_traced(tensor) and bool(finite.all()):
+        if self.takes_missing or (not is_traced(tensor) and bool(finite.all())):
             return _looked_up(method, self, tensor).to(answer)
         found = _looked_up(method, self, torch.where(finite, tensor, torch.zeros_like(tensor)))
         instead = torch.where(torch.isnan(tensor), math.nan, -math.inf).to(found)

@@ -1,5 +1,6 @@
 """The bases of all noise distributions, under one name."""
 
+from noiseflow.distributions import divergence as divergence  # registers kl_divergence
 from noiseflow.distributions.latent import LatentDistribution as LatentDistribution
 from noiseflow.distributions.law import NoiseDistribution as NoiseDistribution
 from noiseflow.distributions.law import RescaledDistribution as RescaledDistribution

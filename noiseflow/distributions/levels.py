@@ -26,6 +26,9 @@ class Levels(constraints.Constraint):
     def __init__(self, step: float, origin: float, low: float, high: float) -> None:
         self.step, self.origin, self.lower_bound, self.upper_bound = step, origin, low, high
 
+    def __repr__(self) -> str:
+        return f"Levels(step={self.step:g}, low={self.lower_bound:g}, high={self.upper_bound:g})"
+
     def check(self, value: Tensor) -> Tensor:
         """Where values are possible, boolean."""
         steps = (value - self.origin) / self.step

@@ -19,12 +19,14 @@ class Pixels:
 
     Attributes:
         independent: whether pixels may be evaluated apart from each other.
+        takes_missing: whether `log_prob` itself knows what an observation that is NaN means.
         light: whether a gradient keeps a few numbers per pixel only, so that nothing is gained by evaluating it in pieces.
         per_pixel: names of the attributes that hold one value or row of values per pixel; None to take all tensors whose first
             axes are the batch's.
     """
 
     independent: ClassVar[bool] = True
+    takes_missing: ClassVar[bool] = False
     per_pixel: ClassVar[tuple[str, ...] | None] = None
 
     @property
@@ -59,6 +61,13 @@ class Pixels:
     def working(self, tensor: Tensor) -> Tensor:
         """A tensor in the number type of the computation, or a wider one of its own."""
         return tensor.to(torch.promote_types(tensor.dtype, self.working_dtype))
+
+    def clean(self, signal: Tensor) -> Tensor:
+        """A signal in the number type of the computation; NaN where it is not finite, so that all its answers are NaN."""
+        signal = self.working(signal)
+        if is_traced(signal) or not bool(torch.isfinite(signal).all()):
+            return torch.where(torch.isfinite(signal), signal, torch.full_like(signal, math.nan))
+        return signal
 
     def cast(self, tensor: Tensor) -> Tensor:
         """An answer in the number type of the signal."""

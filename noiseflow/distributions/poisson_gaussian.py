@@ -86,11 +86,16 @@ class PoissonGaussianDistribution(NoiseDistribution):
         gain, offset, read_noise: scalars, float64: counts per electron, counts, electrons rms.
     """
 
-    light = True
+    per_pixel = ("signal",)
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self.gain, self.offset, self.read_noise = self.working(signal), gain, offset, read_noise
+        self.signal, self.gain, self.offset, self.read_noise = self.clean(signal), gain, offset, read_noise
+
+    @property
+    def light(self) -> bool:
+        """Yes: derivatives are kept, and no graph."""
+        return True
 
     @property
     def _law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -125,15 +130,15 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal
-        rate = self.rate.to(signal.dtype).expand((*sample_shape, *self.batch_shape))
+        rate = torch.nan_to_num(self.rate).to(signal.dtype).expand((*sample_shape, *self.batch_shape))
         normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
         noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
         return noise.add_(signal)
 
     @property
     def mean(self) -> Tensor:
-        return self.given(self.signal)
+        return self.signal
 
     @property
     def variance(self) -> Tensor:
-        return self.given(self.gain**2 * (self.rate + self.read_noise**2))
+        return self.gain**2 * (self.rate + self.read_noise**2)

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.latent import LatentDistribution
-from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.levels import Levels, between
 
 _NEAR = 1e-3  # of a level: a value computed as gain·k + offset must count as having reached k
@@ -28,7 +27,7 @@ class GaussianDistribution(LatentDistribution):
 
     def __init__(self, signal: Tensor, log_scale: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self.log_scale = self.working(signal), log_scale
+        self.signal, self.log_scale = self.clean(signal), log_scale
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = (value - self.signal) * torch.exp(-self.log_scale)
@@ -65,7 +64,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self.gain, self.offset = self.working(signal), gain, offset
+        self.signal, self.gain, self.offset = self.clean(signal), gain, offset
 
     @property
     def rate(self) -> Tensor:
@@ -94,7 +93,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def _mass_up_to(self, count: Tensor, *, beyond: bool = False) -> Tensor:
         incomplete = torch.special.gammainc if beyond else torch.special.gammaincc
-        mass = incomplete((count + 1).clamp(min=1), self.rate.expand_as(count))
+        mass = incomplete(*torch.broadcast_tensors((count + 1).clamp(min=1), self.rate))
         return torch.where(count >= 0, mass, torch.full_like(mass, float(beyond)))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
@@ -121,7 +120,12 @@ class PoissonDistribution(NoiseDistribution):
         return count * self.gain + self.offset
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        return self._value(torch.poisson(self.rate.expand((*sample_shape, *self.batch_shape)), generator=generator))
+        return self._value(self._poisson((*sample_shape, *self.batch_shape), generator))
+
+    def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+        rate = self.rate.expand(shape)
+        drawn = torch.poisson(torch.nan_to_num(rate), generator=generator)
+        return torch.where(torch.isnan(rate), rate, drawn)
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:

@@ -100,7 +100,7 @@ def signal_nodes(like: Tensor) -> Tensor:
 def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Number of the node below each signal coordinate, and the weight of the node above."""
     position = coordinate * (_NUM_NODES - 1)
-    row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
+    row = torch.nan_to_num(position.detach()).floor().clamp(0, _NUM_NODES - 2).long()
     return row, (position - row).to(dtype)
 
 
@@ -251,7 +251,7 @@ class FlowDistribution(LatentDistribution):
 
     def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
         super().__init__(signal.shape, like=signal)
-        self._flow, self._signal, self._windows = flow, self.working(signal), windows
+        self._flow, self._signal, self._windows = flow, self.clean(signal), windows
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:

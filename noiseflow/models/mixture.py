@@ -117,7 +117,7 @@ class MixtureDistribution(NoiseDistribution):
         self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: nn.Module
     ) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self._components_at, self._model = self.working(signal), components_at, model
+        self.signal, self._components_at, self._model = self.clean(signal), components_at, model
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:

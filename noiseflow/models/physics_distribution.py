@@ -63,9 +63,17 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def _detector_latent(self, value: Tensor) -> Tensor:
         finite = torch.isfinite(value)
-        residual, rate = self.base.electrons(torch.where(finite, value, torch.zeros_like(value)))
+        residual, rate, nothing = self._electrons(torch.where(finite, value, torch.zeros_like(value)))
         latent = detector_latent(residual, rate, self.base.read_noise)
+        latent = torch.where(nothing, torch.full_like(latent, math.nan), latent)
         return torch.where(finite, latent, value.to(latent))
+
+    def _electrons(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Residuals and rates, electrons, and where the signal is NaN; there they are numbers all the same."""
+        residual, rate = self.base.electrons(value)
+        nothing = torch.isnan(rate)
+        zero = torch.zeros_like(rate)
+        return torch.where(nothing, zero, residual), torch.where(nothing, zero + 1, rate), nothing
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The latent of an observation and the log-derivative, ``(z, log dz/do)``."""
@@ -81,13 +89,17 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def _invert(self, target: Tensor) -> Tensor:
         rate = self.base.rate.expand_as(target)
-        residual = invert_latent(target.flatten(), rate.flatten(), self.base.read_noise).reshape(target.shape)
+        nothing = torch.isnan(rate + target)
+        known = [torch.where(nothing, torch.zeros_like(each), each).flatten() for each in (target, rate)]
+        residual = invert_latent(*known, self.base.read_noise).reshape(target.shape)
+        residual = torch.where(nothing, torch.full_like(residual, math.nan), residual)
         return residual * self.base.gain + self.base.mean.double()
 
     def detector_part(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The detector's latent and log-density."""
-        residual, rate = self.base.electrons(value)
+        residual, rate, nothing = self._electrons(value)
         density = log_density(residual, rate, self.base.read_noise) - torch.log(self.base.gain)
+        density = torch.where(nothing, torch.full_like(density, math.nan), density)
         return self._detector_latent(value), density
 
     def _log_prob(self, value: Tensor) -> Tensor:
