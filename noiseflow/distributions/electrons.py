@@ -58,10 +58,17 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     return log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
 
 
-def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """log P(beyond the observation), on the side away from the mean: above it for residuals > 0, else below it."""
+def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """log P(beyond the observation), on the side away from the mean: above it for residuals > 0, else below it.
+
+    Args:
+        residual: observation − rate, electrons, float64.
+        rate: expected electrons, ≥ 0, float64.
+        read_noise: electrons, float64.
+        twice: take the contour in any case, because the sum needs incomplete gamma functions, which have no second derivative.
+    """
     upper = residual.detach() > 0
-    if _most(read_noise) < _RESOLVED:
+    if not twice and _most(read_noise) < _RESOLVED:
         return _lattice_log_tail(residual, rate, read_noise, upper)
     side = torch.where(upper, 1.0, -1.0).to(residual)
     saddle = saddle_point(residual, rate, read_noise)
@@ -75,18 +82,20 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     return log_contour_integral(residual, rate, read_noise, line, side / line, factor)
 
 
-def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor) -> tuple[Tensor, Tensor]:
+def log_both_tails(
+    residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> tuple[Tensor, Tensor]:
     """``(log P(≤ observation), log P(> observation))``; infinite residuals allowed."""
     finite = torch.isfinite(residual)
-    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise)
+    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
     near = torch.where(finite, near, torch.full_like(near, -math.inf))
     far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
     upper = residual > 0
     return torch.where(upper, far, near), torch.where(upper, near, far)
 
 
-def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite; differentiable twice."""
+def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite; `twice` as in `log_tail`."""
     width = high - low
     if _most(read_noise) < _RESOLVED:
         narrow = width.detach() <= 3
@@ -98,12 +107,12 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) ->
     if bool(narrow.all()):
         return direct(low, high, rate, read_noise)
     if not bool(narrow.any()):
-        return _log_difference_of_tails(low, high, rate, read_noise)
+        return _log_difference_of_tails(low, high, rate, read_noise, twice=twice)
     wide, noise = ~narrow, (read_noise, read_noise)
     if read_noise.ndim:
         noise = read_noise[narrow], read_noise[wide]
     near = direct(low[narrow], high[narrow], rate[narrow], noise[0])
-    far = _log_difference_of_tails(low[wide], high[wide], rate[wide], noise[1])
+    far = _log_difference_of_tails(low[wide], high[wide], rate[wide], noise[1], twice=twice)
     return torch.zeros_like(low).masked_scatter(narrow, near).masked_scatter(wide, far)
 
 
@@ -154,8 +163,12 @@ def _most(read_noise: Tensor) -> float:
     return float(read_noise.detach().max())
 
 
-def _log_difference_of_tails(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    (below_low, above_low), (below_high, above_high) = (log_both_tails(x, rate, read_noise) for x in (low, high))
+def _log_difference_of_tails(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    (below_low, above_low), (below_high, above_high) = (
+        log_both_tails(x, rate, read_noise, twice=twice) for x in (low, high)
+    )
     right = low > 0
     across = (low <= 0) & (high > 0)
     large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)

@@ -101,7 +101,8 @@ def _hazard_slope(x: Tensor) -> Tensor:
     return -hazard * torch.where(far, -1 / torch.where(far, x, -torch.ones_like(x)), x + hazard)
 
 
-def _hazard(x: Tensor) -> Tensor:
+def hazard_of(x: Tensor) -> Tensor:
+    """`normal_hazard`, differentiable once more."""
     found: Tensor = _Hazard.apply(x)  # type: ignore[no-untyped-call]
     return found
 
@@ -122,12 +123,12 @@ class _LogCdf(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return gradient * _hazard(x)
+        return gradient * hazard_of(x)
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return tangent * _hazard(x)
+        return tangent * hazard_of(x)
 
 
 class _LogRatio(torch.autograd.Function):
@@ -150,9 +151,9 @@ class _LogRatio(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         low, high = ctx.saved_tensors
-        return gradient * _hazard(low), -gradient * _hazard(high)
+        return gradient * hazard_of(low), -gradient * hazard_of(high)
 
     @staticmethod
     def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> Tensor:
         low, high = ctx.saved_tensors
-        return low_tangent * _hazard(low) - high_tangent * _hazard(high)
+        return low_tangent * hazard_of(low) - high_tangent * hazard_of(high)

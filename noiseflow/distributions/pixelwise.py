@@ -153,7 +153,7 @@ class _Curvature(torch.autograd.Function):
                 at = _leaves(part[:half])
                 slopes = _slopes(function, at, twice=True)
                 total = sum((s * v.detach() for s, v in zip(slopes, part[half:], strict=True)), torch.zeros(()))
-            return _gradients(total, at)
+                return _gradients(total, at)
 
         return _by_pieces(curved, tensors, [True] * half)
 

@@ -12,32 +12,32 @@ from noiseflow.distributions.electrons import interval_and_slopes, log_both_tail
 from noiseflow.distributions.pixelwise import pixelwise
 
 
-def _electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     return (value - signal) / gain, ((signal - offset).clamp(min=0) / gain).expand_as(value)
 
 
 def _log_density(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    return log_density(*_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
+    return log_density(*in_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
 
 
 def _log_interval(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    return log_interval(*_bounds(low, high, signal, gain, offset, read_noise), read_noise)
+    return log_interval(*_bounds(low, high, signal, gain, offset, read_noise), read_noise, twice=twice)
 
 
 def _bounds(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Residuals of the bounds and rates, electrons; an infinite bound moves to where nothing is left beyond it."""
-    (bottom, rate), (top, _) = (_electrons(value, signal, gain, offset) for value in (low, high))
+    (bottom, rate), (top, _) = (in_electrons(value, signal, gain, offset) for value in (low, high))
     finite = torch.isfinite(low), torch.isfinite(high)
     if bool((finite[0] & finite[1]).all()):
         return bottom, top, rate
     (bottom, _), (top, _) = (
-        _electrons(torch.where(known, value, torch.zeros_like(value)), signal, gain, offset)
+        in_electrons(torch.where(known, value, torch.zeros_like(value)), signal, gain, offset)
         for known, value in zip(finite, (low, high), strict=True)
     )
     end = (40 * torch.sqrt(rate + read_noise**2) + 100).detach()
@@ -69,13 +69,13 @@ def _interval_and_slopes(
 def _log_below(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    return log_both_tails(*_electrons(value, signal, gain, offset), read_noise)[0]
+    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[0]
 
 
 def _log_above(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    return log_both_tails(*_electrons(value, signal, gain, offset), read_noise)[1]
+    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[1]
 
 
 class PoissonGaussianDistribution(NoiseDistribution):
@@ -98,7 +98,8 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return True
 
     @property
-    def _law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What functions of single pixels take after the observation: signal, gain, offset, read noise."""
         return self.signal, self.gain, self.offset, self.read_noise
 
     @property
@@ -112,17 +113,17 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return residual, self.rate.expand_as(residual)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return pixelwise(_log_density, value, *self._law)
+        return pixelwise(_log_density, value, *self.law)
 
     def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
-        return pixelwise(_log_below, value, *self._law), pixelwise(_log_above, value, *self._law)
+        return pixelwise(_log_below, value, *self.law), pixelwise(_log_above, value, *self.law)
 
     def cdf(self, value: Tensor) -> Tensor:
-        return pixelwise(_log_below, value, *self._law).exp()
+        return pixelwise(_log_below, value, *self.law).exp()
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return pixelwise(_log_interval, low, high, *self._law, with_slopes=_interval_and_slopes)
+        return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)

@@ -15,10 +15,12 @@ from noiseflow.distributions.base import (
     log_normal_interval,
     normal_hazard,
 )
+from noiseflow.distributions.normal import hazard_of
+from noiseflow.distributions.pixelwise import pixelwise
+from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
 from noiseflow.distributions.electrons import log_density, log_tail
 from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
-from noiseflow.models.physical import PoissonGaussianDistribution
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _MAX_INVERSION_STEPS = 80
@@ -63,17 +65,8 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def _detector_latent(self, value: Tensor) -> Tensor:
         finite = torch.isfinite(value)
-        residual, rate, nothing = self._electrons(torch.where(finite, value, torch.zeros_like(value)))
-        latent = detector_latent(residual, rate, self.base.read_noise)
-        latent = torch.where(nothing, torch.full_like(latent, math.nan), latent)
+        latent = pixelwise(_latent, torch.where(finite, value, torch.zeros_like(value)), *self.base.law)
         return torch.where(finite, latent, value.to(latent))
-
-    def _electrons(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Residuals and rates, electrons, and where the signal is NaN; there they are numbers all the same."""
-        residual, rate = self.base.electrons(value)
-        nothing = torch.isnan(rate)
-        zero = torch.zeros_like(rate)
-        return torch.where(nothing, zero, residual), torch.where(nothing, zero + 1, rate), nothing
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The latent of an observation and the log-derivative, ``(z, log dz/do)``."""
@@ -97,10 +90,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def detector_part(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The detector's latent and log-density."""
-        residual, rate, nothing = self._electrons(value)
-        density = log_density(residual, rate, self.base.read_noise) - torch.log(self.base.gain)
-        density = torch.where(nothing, torch.full_like(density, math.nan), density)
-        return self._detector_latent(value), density
+        return self._detector_latent(value), self.base.log_prob(value.double())
 
     def _log_prob(self, value: Tensor) -> Tensor:
         latent, density = self.detector_part(value)
@@ -171,6 +161,13 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
 
 
+def _latent(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    residual, rate = in_electrons(value, signal, gain, offset)
+    return detector_latent(residual, rate, read_noise, twice=twice)
+
+
 @torch.no_grad()
 def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
     """Residuals, electrons, that cover the readings of signals (G, 1) as finely as the read noise asks, and their latents.
@@ -192,10 +189,10 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
     return residual, detector_latent(residual, rate[:, None].expand_as(residual), base.read_noise)
 
 
-def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
     """Φ⁻¹(P(reading ≤ residual)), of residuals in electrons."""
     side = torch.where(residual.detach() > 0, -1.0, 1.0).to(residual)
-    return side * ndtri_exp(log_tail(residual, rate, read_noise))
+    return side * ndtri_exp(log_tail(residual, rate, read_noise, twice=twice), twice=twice)
 
 
 @torch.no_grad()
@@ -222,13 +219,17 @@ def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     return result
 
 
-def ndtri_exp(log_probability: Tensor) -> Tensor:
-    """Φ⁻¹(exp(log_probability)), accurate and differentiable however small the probability."""
+def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
+    """Φ⁻¹(exp(log_probability)), accurate and differentiable however small the probability; twice only if asked for."""
     with torch.no_grad():
         deep = log_probability < -200
         far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
         start = torch.special.ndtri(torch.exp(torch.where(deep, -1.0, log_probability)))
         z = torch.where(deep, -torch.sqrt(far - torch.log(2 * math.pi * far)), start)
         z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
-        hazard = normal_hazard(z)
-    return z - (log_normal_cdf(z) - log_probability) / hazard
+        if not twice:
+            hazard = normal_hazard(z)
+    if not twice:
+        return z - (log_normal_cdf(z) - log_probability) / hazard
+    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)  # the first step has the slope, the second the curvature
+    return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)
