@@ -49,7 +49,7 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     tensors = [
         v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=self.working_dtype, device=self.device) for v in values
     ]
-    answer = self.dtype if self._given_dtype is not None else None
+    answer: torch.dtype | None = self.dtype
     for given, tensor in zip(values, tensors, strict=True):
         if isinstance(given, Tensor) and tensor.is_floating_point():
             answer = tensor.dtype if answer is None else torch.promote_types(answer, tensor.dtype)

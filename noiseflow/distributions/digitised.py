@@ -125,8 +125,7 @@ class DigitisedDistribution(NoiseDistribution):
         rounding = _ROUNDINGS * torch.finfo(value.dtype).eps
         slack = [max(self.step / 2, rounding * abs(limit)) for limit in (self.low, self.high)]
         possible = (value >= self.low - slack[0]) & (value <= self.high + slack[1])
-        top = self.high - (1e-3 * self.step if math.isfinite(self.high) else 0.0)
-        return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= top, possible
+        return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= self._top, possible
 
     def _fine(self, value: Tensor) -> Tensor:
         """Values in double precision where single precision would move the edges of their cells."""
@@ -156,7 +155,12 @@ class DigitisedDistribution(NoiseDistribution):
         edge = self._level(safe, torch.floor) + self.step / 2 if self.step > 0 else safe
         edge = torch.where(finite, edge, value)
         edge = torch.where(value < self.low, torch.full_like(edge, -math.inf), edge)
-        return torch.where(value >= self.high, torch.full_like(edge, math.inf), edge)
+        return torch.where(value >= self._top, torch.full_like(edge, math.inf), edge)
+
+    @property
+    def _top(self) -> float:
+        """What is on the high limit, though it may have been rounded in another number type."""
+        return self.high - 1e-3 * self.step if math.isfinite(self.high) else self.high
 
     def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
         steps = (value - self._origin) / self.step

@@ -42,6 +42,15 @@ def as_noise_distribution(distribution: Any) -> NoiseDistribution:
     return NumericalDistribution(distribution)
 
 
+def _unchecked(distribution: Distribution) -> Distribution:
+    """A copy that answers outside its support too, where nothing of the answer is used."""
+    other = copy.copy(distribution)
+    other._validate_args = False
+    if isinstance(getattr(other, "base_dist", None), Distribution):
+        other.base_dist = _unchecked(other.base_dist)  # type: ignore[attr-defined]
+    return other
+
+
 class NumericalDistribution(NoiseDistribution):
     """A torch distribution with a CDF, quantiles and masses of intervals, by Gauss–Legendre's rule where it has none.
 
@@ -56,8 +65,7 @@ class NumericalDistribution(NoiseDistribution):
     def __init__(self, base: Distribution) -> None:
         like = base.mean if base.mean.is_floating_point() else None
         super().__init__(base.batch_shape, like=like)
-        self.base = copy.copy(base)
-        self.base._validate_args = False
+        self.base = _unchecked(base)
         self._known_mean, self._known_variance = self._moments(base)
         self._spread = torch.sqrt(self._known_variance.detach()).clamp(min=torch.finfo(self._known_mean.dtype).tiny)
 

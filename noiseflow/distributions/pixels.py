@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+Kept = TypeVar("Kept")
 Taking = Callable[[Tensor, tuple[int, ...]], Tensor]
 
 
@@ -42,16 +42,36 @@ class Pixels:
         floating = like is not None and like.is_floating_point()
         self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
         self._given_device = None if like is None else like.device
+        self._kept: dict[bool, Any] = {}
+
+    def once(self, compute: Callable[[], Kept]) -> Kept:
+        """What `compute` gives, computed once with gradients and once without."""
+        key = torch.is_grad_enabled()
+        if key not in self._kept:
+            self._kept[key] = compute()
+        kept: Kept = self._kept[key]
+        return kept
+
+    def _pixels(self) -> Tensor | None:
+        """Some tensor of the batch's shape, of a subclass that has not said what its answers are like."""
+        held = (value for value in vars(self).values() if isinstance(value, Tensor) and value.is_floating_point())
+        return next((value for value in held if value.shape == self.batch_shape), None)
 
     @property
     def dtype(self) -> torch.dtype:
         """Number type of samples, means and variances."""
-        return self._given_dtype or torch.get_default_dtype()
+        if self._given_dtype is not None:
+            return self._given_dtype
+        pixels = self._pixels()
+        return torch.get_default_dtype() if pixels is None else pixels.dtype
 
     @property
     def device(self) -> torch.device:
         """Where samples are."""
-        return self._given_device or torch.get_default_device()
+        if self._given_device is not None:
+            return self._given_device
+        pixels = self._pixels()
+        return torch.get_default_device() if pixels is None else pixels.device
 
     @property
     def working_dtype(self) -> torch.dtype:
@@ -107,12 +127,10 @@ class Pixels:
     def mapped(self, take: Taking, shape: torch.Size) -> Self:
         """A copy with every tensor of pixels replaced by ``take(tensor, shape of the axes after the batch's)``."""
         other = copy.copy(self)
-        other._batch_shape = shape  # type: ignore[attr-defined]
+        other._batch_shape, other._kept = shape, {}  # type: ignore[attr-defined]
         size = len(self.batch_shape)
         for name, value in vars(self).items():
-            if isinstance(vars(type(self)).get(name, getattr(type(self), name, None)), cached_property):
-                del other.__dict__[name]
-            elif isinstance(value, Pixels):
+            if isinstance(value, Pixels):
                 setattr(other, name, value.mapped(take, shape))
             elif isinstance(value, Tensor) and self._is_per_pixel(name, value):
                 setattr(other, name, take(value, tuple(value.shape[size:])))

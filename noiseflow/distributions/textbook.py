@@ -27,7 +27,7 @@ class GaussianDistribution(LatentDistribution):
 
     def __init__(self, signal: Tensor, log_scale: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self.log_scale = self.clean(signal), log_scale
+        self.signal, self.log_scale = self.clean(signal), self.working(log_scale)
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = (value - self.signal) * torch.exp(-self.log_scale)
@@ -42,7 +42,7 @@ class GaussianDistribution(LatentDistribution):
 
     @property
     def variance(self) -> Tensor:
-        return self.working(torch.exp(2 * self.log_scale)).expand_as(self.signal)
+        return torch.exp(2 * self.log_scale).expand_as(self.signal)
 
     @property
     def mode(self) -> Tensor:
@@ -64,7 +64,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self.gain, self.offset = self.clean(signal), gain, offset
+        self.signal, self.gain, self.offset = self.clean(signal), self.working(gain), self.working(offset)
 
     @property
     def rate(self) -> Tensor:
@@ -72,10 +72,10 @@ class PoissonDistribution(NoiseDistribution):
         return ((self.signal - self.offset) / self.gain).clamp(min=0)
 
     def _count(self, value: Tensor) -> Tensor:
-        return (value - self.offset) / self.gain
+        return ((value - self.offset) / self.gain).detach()
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return self._log_mass(torch.round(self._count(value).detach())) - torch.log(self.gain)
+        return self._log_mass(torch.round(self._count(value))) - torch.log(self.gain)
 
     def _log_mass(self, count: Tensor) -> Tensor:
         rate = self.rate

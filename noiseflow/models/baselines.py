@@ -59,7 +59,8 @@ class Poisson(ArrayModel):
         self.offset = nn.Parameter(torch.tensor(float(offset)))
 
     def forward(self, signal: Tensor) -> PoissonDistribution:
-        return PoissonDistribution(signal, torch.exp(self.log_gain), self.offset)
+        wide = torch.promote_types(self.log_gain.dtype, torch.float32)
+        return PoissonDistribution(signal, torch.exp(self.log_gain.to(wide)), self.offset)
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -258,9 +257,9 @@ class FlowDistribution(LatentDistribution):
         """The flow and the signal; none where pixels look at their neighbours."""
         return (self._flow, self._signal) if self._windows is None else None
 
-    @cached_property
+    @property
     def _parameters(self) -> tuple[Tensor, Tensor, list[Transform]]:
-        return self._flow.parameters_at(self._signal, self._windows)
+        return self.once(lambda: self._flow.parameters_at(self._signal, self._windows))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -124,9 +123,9 @@ class MixtureDistribution(NoiseDistribution):
         """The model and the signal, where the model allows tables."""
         return (self._model, self.signal) if getattr(self._model, "tabulate", False) else None
 
-    @cached_property
+    @property
     def _components(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._components_at(self.signal)
+        return self.once(lambda: self._components_at(self.signal))
 
     @property
     def log_weight(self) -> Tensor:

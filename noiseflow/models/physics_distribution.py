@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -51,9 +50,9 @@ class PhysicsFlowDistribution(NoiseDistribution):
         """The model and the signal."""
         return self._model, self.base.signal
 
-    @cached_property
+    @property
     def _transforms(self) -> Sequence[Transform]:
-        return self._maps(self.base.signal)
+        return self.once(lambda: self._maps(self.base.signal))
 
     def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """The mapped latent, and the log-density of this model over that of the detector."""
