@@ -86,7 +86,7 @@ def _interval(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def log_interval_prob(self: Any, low: Any, high: Any) -> Tensor:
         bounds, answer = _taken(self, name, [low, high])
-        below, above = torch.broadcast_tensors(*bounds)
+        below, above = bounds
         proper = below < above
         if not is_traced(below) and bool(proper.all()):
             return _in_pieces(method, self, below, above).to(answer)
@@ -145,7 +145,9 @@ def _draw(method: Method, name: str) -> Method:
             if not (self.independent and whole.numel() > MOST) or torch.compiler.is_compiling():
                 return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
             parts = self.expand(whole).flat().parts(MOST)
-            return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(whole)
+            return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
+                whole
+            )
 
     return sample
 
@@ -163,7 +165,7 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """From a table where there is an accurate one, else computed."""
     if value.numel() >= automatic.LARGE and self.source is not None:
-        found = automatic.automatic_log_prob(*self.source, value)
+        found = automatic.automatic_log_prob(self.source[0], self.source[1], value)
         if found is not None:
             return found
     return _in_pieces(method, self, value)
@@ -175,7 +177,7 @@ def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
     if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]):
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)
-    split = [value.expand(shape).reshape(-1).split(MOST) for value in values]
+    split = [torch.split(value.expand(shape).reshape(-1), MOST) for value in values]
     found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(MOST), *split, strict=True)]
     return torch.cat(found).reshape(shape)
 

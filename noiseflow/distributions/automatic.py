@@ -58,7 +58,9 @@ def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tens
 
 
 @torch.no_grad()
-def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE) -> Tensor | None:
+def log_prob(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE
+) -> Tensor | None:
     """Log-likelihood of many pixels to `tolerance` nats each, shaped like `observation`; None where no table is accurate.
 
     Args:
@@ -88,7 +90,9 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tol
     def place(scale: RootScale, some: Tensor, seen: Tensor) -> Tensor:
         return scale.observation(seen) - scale.observation(some)
 
-    kept = _table_of(noise_model, ("log_prob", tolerance), s, judged, columns, lambda scale, at: place(scale, s[at], o[at]))
+    kept = _table_of(
+        noise_model, ("log_prob", tolerance), s, judged, columns, lambda scale, at: place(scale, s[at], o[at])
+    )
     if kept is None:
         return None
     found = kept.look_up(s, lambda part: place(kept.scale, s[part], o[part]))
@@ -189,11 +193,15 @@ def _table_of(
     kept = _tables.setdefault(noise_model, {})
 
     def share_missing(table: Table) -> float:
-        return float(torch.isnan(table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])).float().mean())
+        return float(
+            torch.isnan(table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])).float().mean()
+        )
 
     table = kept.get(key)
     if table is not None:
-        across, values = columns(table.scale, table.columns.numel() if kind[0] == "log_prob" else 2 * table.columns.numel())
+        across, values = columns(
+            table.scale, table.columns.numel() if kind[0] == "log_prob" else 2 * table.columns.numel()
+        )
         if table.cover(low, high, values, unit):
             return table if share_missing(table) <= _MANY else None
     found = None
@@ -217,6 +225,6 @@ def _table_of(
 
 def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Tensor:
     missing = torch.nonzero(torch.isnan(found))[:, 0]
-    for at in missing.split(LARGE // 2):
+    for at in torch.split(missing, LARGE // 2):
         found[at] = exact(at).to(found)
     return found

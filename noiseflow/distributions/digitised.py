@@ -61,7 +61,11 @@ class DigitisedDistribution(NoiseDistribution):
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
         """The detector and the signal."""
-        return None if self._signal is None or not isinstance(self._detector, nn.Module) else (self._detector, self._signal)
+        return (
+            None
+            if self._signal is None or not isinstance(self._detector, nn.Module)
+            else (self._detector, self._signal)
+        )
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
@@ -197,7 +201,7 @@ class DigitisedDistribution(NoiseDistribution):
         """The levels; without rounding, all values between the limits."""
         if self.step > 0:
             return Levels(self.step, self._origin, self.low, self.high)
-        return constraints.interval(self.low, self.high)
+        return constraints.interval(self.low, self.high)  # type: ignore[no-untyped-call]
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         if self.step == 0:

@@ -10,7 +10,6 @@ from noiseflow.distributions.law import NoiseDistribution
 from noiseflow.distributions.numerical import as_noise_distribution
 
 
-@register_kl(NoiseDistribution, NoiseDistribution)
 def _of_two(p: NoiseDistribution, q: NoiseDistribution) -> Tensor:
     """E_p[log p − log q], nats, by the quadrature of `p`."""
     if p.discrete != q.discrete:
@@ -27,11 +26,17 @@ def _of_two(p: NoiseDistribution, q: NoiseDistribution) -> Tensor:
     return p.cast(p.expectation(difference))
 
 
-@register_kl(NoiseDistribution, Distribution)
 def _of_ours(p: NoiseDistribution, q: Distribution) -> Tensor:
     return _of_two(p, as_noise_distribution(q))
 
 
-@register_kl(Distribution, NoiseDistribution)
 def _of_theirs(p: Distribution, q: NoiseDistribution) -> Tensor:
     return _of_two(as_noise_distribution(p), q)
+
+
+for _kinds, _divergence in (
+    ((NoiseDistribution, NoiseDistribution), _of_two),
+    ((NoiseDistribution, Distribution), _of_ours),
+    ((Distribution, NoiseDistribution), _of_theirs),
+):
+    register_kl(*_kinds)(_divergence)  # type: ignore[no-untyped-call]

@@ -24,7 +24,10 @@ from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_pois
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 WIDEST = 4.0  # read noises: beyond, exponents of the outer nodes would grow to e¹⁷ and the nodes to many
 STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
-LEAST_READ_NOISE, MOST_READ_NOISE = 0.05, 6.0  # electrons: exponents overflow below, the contour integral is cheaper above
+LEAST_READ_NOISE, MOST_READ_NOISE = (
+    0.05,
+    6.0,
+)  # electrons: exponents overflow below, the contour integral is cheaper above
 
 
 @functools.cache
@@ -37,7 +40,9 @@ def _nodes(count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     """The likeliest electrons given that the residual is at the middle of a cell; 0 for unbounded cells."""
     middle = ((low + high) / 2).detach()
-    return lattice_mode(torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2)
+    return lattice_mode(
+        torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
+    )
 
 
 def is_narrow(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, mode: Tensor) -> Tensor:
@@ -76,7 +81,9 @@ def cell_and_slopes(
     if not slopes:
         return value, ()
     density = scale[inner:] * total[inner:] / (mass * 2 * half)
-    steepness = -(scale[inner:] * ((gap + offset[inner:]) * total[inner:] - first[inner:]) / variance) / (mass * 2 * half)
+    steepness = -(scale[inner:] * ((gap + offset[inner:]) * total[inner:] - first[inner:]) / variance) / (
+        mass * 2 * half
+    )
     excess = (weight * scale[:inner] * first[:inner]).sum(0) / mass
     positive, safe = positive_rate(rate)
     of_rate = (mode - rate + excess) / safe

@@ -82,9 +82,7 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
     return log_contour_integral(residual, rate, read_noise, line, side / line, factor)
 
 
-def log_both_tails(
-    residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
-) -> tuple[Tensor, Tensor]:
+def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
     """``(log P(≤ observation), log P(> observation))``; infinite residuals allowed."""
     finite = torch.isfinite(residual)
     near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)

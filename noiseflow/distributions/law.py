@@ -119,10 +119,11 @@ class NoiseDistribution(Pixels, Distribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights (Q, *batch) of expectations: Gauss–Legendre's rule on panels between far quantiles."""
-        ends = self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())), self.icdf(
-            torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)
+        ends = (
+            self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())),
+            self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)),
         )
-        return self.panels(*(end.double() for end in ends), _PANELS)
+        return self.panels(ends[0].double(), ends[1].double(), _PANELS)
 
     def panels(self, low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Nodes and weights (4·count, *batch) of the integral over the density between two bounds."""
@@ -209,7 +210,9 @@ class RescaledDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         leading = self.batch_shape[: len(self.batch_shape) - len(self.base.batch_shape)]
-        return self.base.sample((*sample_shape, *leading), generator=generator) * self.scale.detach() + self.shift.detach()
+        return (
+            self.base.sample((*sample_shape, *leading), generator=generator) * self.scale.detach() + self.shift.detach()
+        )
 
     @property
     def mean(self) -> Tensor:

@@ -87,7 +87,7 @@ class NumericalDistribution(NoiseDistribution):
     @property
     def discrete(self) -> bool:  # type: ignore[override]
         """Whether observations are whole numbers."""
-        return bool(self.base.support.is_discrete)
+        return bool(self.support.is_discrete)
 
     @property
     def has_rsample(self) -> bool:  # type: ignore[override]
@@ -96,12 +96,13 @@ class NumericalDistribution(NoiseDistribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        return self.base.support  # type: ignore[no-any-return]
+        found: Any = self.base.support
+        return constraints.real if found is None else found  # type: ignore[no-any-return]
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
         """The bounds of the support, which may be infinite."""
-        inner = self.base.support
+        inner: Any = self.support
         if isinstance(inner, constraints.independent):
             inner = inner.base_constraint
         like = self._known_mean.detach()
@@ -148,7 +149,9 @@ class NumericalDistribution(NoiseDistribution):
     def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
         """P(k ≤ count), or P(k > count) where `beyond`, by adding up; the count may be infinite."""
         numbers = self._numbers()
-        masses = torch.exp(self.log_masses(numbers)).reshape(numbers.shape[0], *(1,) * (count.ndim - self._known_mean.ndim), *numbers.shape[1:])
+        masses = torch.exp(self.log_masses(numbers)).reshape(
+            numbers.shape[0], *(1,) * (count.ndim - self._known_mean.ndim), *numbers.shape[1:]
+        )
         numbers = numbers.reshape(masses.shape)
         chosen = (numbers > count) if beyond else (numbers <= count)
         return torch.where(chosen, masses, torch.zeros_like(masses)).sum(0)
@@ -212,10 +215,13 @@ class NumericalDistribution(NoiseDistribution):
 
     def icdf(self, value: Tensor) -> Tensor:
         try:
-            return self.base.icdf(value)  # type: ignore[no-any-return]
+            return self.base.icdf(value)
         except NotImplementedError:
             low, high = (
-                torch.minimum(torch.maximum(self._known_mean.detach() + side * _FAR * 5 * self._spread, self.limits[0]), self.limits[1])
+                torch.minimum(
+                    torch.maximum(self._known_mean.detach() + side * _FAR * 5 * self._spread, self.limits[0]),
+                    self.limits[1],
+                )
                 for side in (-1, 1)
             )
             found = bisect_quantile(self, value, low - self.discrete, high)
@@ -236,7 +242,9 @@ class NumericalDistribution(NoiseDistribution):
             nodes = self._numbers()
             return nodes, torch.exp(self.log_masses(nodes))
         centre, spread, (least, most) = self._known_mean.detach(), self._spread, self.limits
-        ends = [torch.minimum(torch.maximum(centre + side * math.sinh(_REACH) * spread, least), most) for side in (-1, 1)]
+        ends = [
+            torch.minimum(torch.maximum(centre + side * math.sinh(_REACH) * spread, least), most) for side in (-1, 1)
+        ]
         start, stop = (torch.asinh((end - centre) / spread) for end in ends)
         nodes, weights = panels(start, stop, 4 * _PANELS)
         at = centre + spread * torch.sinh(nodes)

@@ -118,7 +118,7 @@ class Pixels:
         split: dict[int, tuple[Tensor, ...]] = {}
 
         def part(index: int) -> Taking:
-            return lambda tensor, rest: split.setdefault(id(tensor), tensor.split(size))[index]
+            return lambda tensor, rest: split.setdefault(id(tensor), torch.split(tensor, size))[index]
 
         count = self.batch_shape[0]
         starts = range(0, count, size)

@@ -101,9 +101,13 @@ class _Kept(torch.autograd.Function):
             return None, None, *_summed(gradient, slopes, inputs)
         needed = ctx.needs_input_grad[2:]
         products = [gradient * next(kept) if need else None for need in needed]
-        return None, None, *(
-            None if product is None else (product if each.ndim else product.sum()).to(each.dtype)
-            for product, each in zip(products, inputs, strict=True)
+        return (
+            None,
+            None,
+            *(
+                None if product is None else (product if each.ndim else product.sum()).to(each.dtype)
+                for product, each in zip(products, inputs, strict=True)
+            ),
         )
 
 
@@ -219,9 +223,7 @@ def _vector_product(
             continue
         good = flat[start : start + PIECE].to(value.dtype)
         good = good if nothing is None else good.masked_fill(nothing.reshape(-1), 0.0)
-        for total, i, slope in zip(
-            found, wanted, torch.autograd.grad(value, at, good, allow_unused=True), strict=True
-        ):
+        for total, i, slope in zip(found, wanted, torch.autograd.grad(value, at, good, allow_unused=True), strict=True):
             if slope is not None and inputs[i].ndim:
                 total[start : start + PIECE] = slope
             elif slope is not None:

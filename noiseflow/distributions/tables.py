@@ -68,7 +68,7 @@ class Table:
     def _made(self, start: int, stop: int, values: Values) -> Tensor:
         places = self.first + self.step * torch.arange(start, stop, dtype=torch.float64, device=self.columns.device)
         signals = self.scale.inverse(places)[:, None]
-        parts = [values(some) for some in signals.split(_ROWS_AT_ONCE)]
+        parts = [values(some) for some in torch.split(signals, _ROWS_AT_ONCE)]
         return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
 
     def _check(self, unit: Values | None) -> Tensor:
@@ -94,7 +94,8 @@ class Table:
         table = self._beside[key]
         assert self.rows is not None
         ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
-        table.cover(*self.scale.inverse(ends).tolist(), values)
+        at = self.scale.inverse(ends)
+        table.cover(float(at[0]), float(at[1]), values)
         return table
 
     def look_up(self, signal: Tensor, column: Callable[[slice], Tensor] | None) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -58,8 +59,8 @@ class PoissonDistribution(NoiseDistribution):
         gain, offset: numbers: counts per electron, and counts at zero dose.
     """
 
-    has_rsample = False
-    discrete = True
+    has_rsample: ClassVar[bool] = False  # type: ignore[misc]
+    discrete: ClassVar[bool] = True
     per_pixel = ("signal",)
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor) -> None:
@@ -93,7 +94,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def _mass_up_to(self, count: Tensor, *, beyond: bool = False) -> Tensor:
         incomplete = torch.special.gammainc if beyond else torch.special.gammaincc
-        mass = incomplete(*torch.broadcast_tensors((count + 1).clamp(min=1), self.rate))
+        mass = incomplete((count + 1).clamp(min=1) + 0 * self.rate.detach(), self.rate + 0 * count)
         return torch.where(count >= 0, mass, torch.full_like(mass, float(beyond)))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:

@@ -144,7 +144,9 @@ def evaluate(
 def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) -> Given:
     """Log-likelihood of each pixel, float64, (N,), computed piece by piece."""
     pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
-    return alike(torch.cat([as_noise_distribution(noise_model(s)).log_prob(o).double().cpu() for s, o in pieces]), signal)
+    return alike(
+        torch.cat([as_noise_distribution(noise_model(s)).log_prob(o).double().cpu() for s, o in pieces]), signal
+    )
 
 
 def divergence(
@@ -178,7 +180,9 @@ def residual_masses(
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
     bounds = level[:, None] + edges.to(signal)[None, :]
     parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
-    log_mass = torch.cat([as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts])
+    log_mass = torch.cat(
+        [as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts]
+    )
     mass = torch.exp(log_mass.double()).cpu().T @ (weight / weight.sum())
     return (mass / mass.sum()).numpy()
 

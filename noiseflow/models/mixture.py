@@ -197,7 +197,9 @@ class MixtureDistribution(NoiseDistribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         shape = (-1, *(1,) * self.means.ndim)
-        nodes, weights = (each.to(self.means).view(shape) for each in normal_quadrature(torch.float64, count=_COMPONENT_NODES))
+        nodes, weights = (
+            each.to(self.means).view(shape) for each in normal_quadrature(torch.float64, count=_COMPONENT_NODES)
+        )
         places = self.means + torch.exp(self.log_scale) * nodes
         share = torch.exp(self.log_weight) * weights
         return places.movedim(-1, 1).flatten(0, 1), share.movedim(-1, 1).flatten(0, 1)

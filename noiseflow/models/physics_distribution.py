@@ -83,7 +83,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         rate = self.base.rate.expand_as(target)
         nothing = torch.isnan(rate + target)
         known = [torch.where(nothing, torch.zeros_like(each), each).flatten() for each in (target, rate)]
-        residual = invert_latent(*known, self.base.read_noise).reshape(target.shape)
+        residual = invert_latent(known[0], known[1], self.base.read_noise).reshape(target.shape)
         residual = torch.where(nothing, torch.full_like(residual, math.nan), residual)
         return residual * self.base.gain + self.base.mean.double()
 
@@ -230,5 +230,7 @@ def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
             hazard = normal_hazard(z)
     if not twice:
         return z - (log_normal_cdf(z) - log_probability) / hazard
-    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)  # the first step has the slope, the second the curvature
+    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(
+        z
+    )  # the first step has the slope, the second the curvature
     return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)

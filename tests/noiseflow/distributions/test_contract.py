@@ -20,7 +20,9 @@ class Skewed(torch.nn.Module):
     """A plain torch distribution: all but the density, the draws and the moments is made numerically."""
 
     def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
-        return torch.distributions.Gumbel(signal - 0.05 * 0.5772156649015329, torch.full_like(signal, 0.05), validate_args=False)
+        return torch.distributions.Gumbel(
+            signal - 0.05 * 0.5772156649015329, torch.full_like(signal, 0.05), validate_args=False
+        )
 
 
 def detector(read_noise: float) -> noiseflow.PoissonGaussian:

@@ -87,7 +87,9 @@ def test_table_follows_the_parameters(how: str) -> None:
         else:
             model.bias += change
         after = model(signal).log_prob(observation)
-        exact = torch.cat([model(s).log_prob(o) for s, o in zip(signal.split(9999), observation.split(9999), strict=True)])
+        exact = torch.cat(
+            [model(s).log_prob(o) for s, o in zip(signal.split(9999), observation.split(9999), strict=True)]
+        )
     assert float(after.mean()) < before - 0.05
     assert float((after - exact).abs().max()) < 1.5e-3
 
@@ -121,7 +123,8 @@ def test_a_table_grows_with_the_range_and_keeps_its_error() -> None:
         found = model(wider).log_prob(moved)
         exact = torch.cat([model(s).log_prob(o) for s, o in zip(wider.split(9999), moved.split(9999), strict=True)])
     (same,) = automatic._tables[model].values()
-    assert same is table and same.columns is columns
+    assert same is table
+    assert same.columns is columns
     assert same.rows.shape[0] > before.shape[0]
     assert float((found - exact).abs().max()) < 1.5e-3
 
