@@ -18,17 +18,22 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    short: Annotated[
-        list[Path], typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
-    ],
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
+    short: Annotated[
+        list[Path] | None, typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
+    ] = None,
     long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short one, or one for all.")] = None,
     dark: Annotated[
         list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")
     ] = None,
-    flat: Annotated[list[Path] | None, typer.Option(help="Two or more equal frames of even illumination.")] = None,
+    flat: Annotated[
+        list[Path] | None,
+        typer.Option(help="Equal frames of even illumination; without --short a stack for each level of light (EMVA 1288)."),
+    ] = None,
+    flat_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each level of --flat, s.")] = None,
+    dark_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each stack of --dark, s.")] = None,
     kind: Annotated[
-        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, signal-gaussian, mixture, flow, spline.")
+        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow.")
     ] = "auto",
     exposure_ratio: Annotated[
         float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
@@ -41,7 +46,8 @@ def calibrate(
     """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
-    from calibration.detector.models import require_kind
+    from calibration.detector.models import SIMPLE, require_kind
+    from calibration.pipeline import saved_model
     from calibration.report.page import write_report
     from noiseflow.io import check_folder, check_output
     from noiseflow.io.model_files import MODEL_SUFFIXES
@@ -51,32 +57,73 @@ def calibrate(
         check_folder(report)
     require_kind(kind)
     chosen_device = _device(device)
+    if not short:
+        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, output, report, seed, Output(json))
+        return
+    if flat_time or dark_time:
+        raise ValueError("--flat-time and --dark-time belong to flats without exposures of a scene; leave --short out")
     if not long and exposure_ratio is not None:
         raise ValueError("--exposure-ratio is given without --long; a burst of equal exposures has none")
     exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
     findings = calibrate_exposures(
         exposures,
-        dark=read_burst(dark, name="the dark frames") if dark else None,
-        flat=read_burst(flat, name="the flat frames") if flat else None,
+        dark=read_burst(dark, name="the dark frames", calibration=True) if dark else None,
+        flat=read_burst(flat, name="the flat frames", calibration=True) if flat else None,
+        kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
         seed=seed,
         device=chosen_device,
         bar=partial(progress_bar, json_mode=json),
     )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
+    model = saved_model(best.model, findings)
     inputs = [*short, *(long or []), *(dark or []), *(flat or [])]
     page = None if report is None else write_report(report, findings, inputs=inputs, seed=seed)
     provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
-    noiseflow.save(best.model, output, units="counts", provenance=provenance)
+    noiseflow.save(model, output, units="counts", provenance=provenance)
     out = Output(json)
-    _tell(out, findings)
+    _report(out, findings)
     out.line(f"Noise model ({best.name}): {output}" + (f"\nReport: {page}" if page else ""))
     out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
+
+
+def _calibrate_camera(
+    flat: list[Path],
+    dark: list[Path],
+    flat_time: list[float] | None,
+    dark_time: list[float] | None,
+    output: Path,
+    report: Path | None,
+    seed: int,
+    out: Output,
+) -> None:
+    """From flats and darks alone: figures as EMVA 1288 reports them, maps beside the model file."""
+    import noiseflow
+    from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
+    from calibration.exposures.frames import read_burst, read_levels
+    from calibration.report.camera_page import describe_camera_verdict, write_camera_report
+
+    if not flat:
+        raise ValueError("neither --short nor --flat was given; give exposures of a scene, or flat frames at several levels of light")
+    darks = []
+    if dark:
+        darks = read_levels(dark, name="the dark frames") if dark_time else [read_burst(dark, name="the dark frames", calibration=True)]
+    camera = calibrate_camera(read_levels(flat), darks, flat_times=flat_time or None, dark_times=dark_time or None)
+    page = None if report is None else write_camera_report(report, camera, inputs=[*flat, *dark], seed=seed)
+    found = summary_of(camera)
+    noiseflow.save(camera.model, output, units="counts", provenance={"flat": flat, "dark": dark, "camera": found["camera"]})
+    maps = write_maps(camera, output)
+    out.table(("figure", "value"), rows_of(camera))
+    out.line("\n" + "\n".join(describe_camera_verdict(camera)))
+    out.line(f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else ""))
+    out.result({"model": output, "maps": maps, "report": page} | found)
 
 
 def summary(findings: Findings) -> dict[str, Any]:
     """What the findings hold, as plain values: ``detector``, ``registration``, ``models``."""
     found: dict[str, Any] = {
+        "verdict": findings.verdict.grade,
+        "reasons": [vars(reason) for reason in findings.verdict.reasons],
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score) for score in findings.scores},
@@ -96,7 +143,7 @@ def _device(name: str) -> Any:
     return chosen
 
 
-def _tell(out: Output, findings: Findings) -> None:
+def _report(out: Output, findings: Findings) -> None:
     from calibration.report.page import (
         TABLE_HEADER,
         describe_burst,
@@ -110,35 +157,37 @@ def _tell(out: Output, findings: Findings) -> None:
         out.line(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"Pair {number}: {describe_registration(pair)}")
-    detector = findings.detector
-    out.line("\nDetector: " + (describe_detector(detector) if detector else f"not measured: {findings.no_detector}"))
+    out.line("\nDetector: " + describe_detector(findings))
     out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
     out.table(TABLE_HEADER, table_rows(findings.scores))
-    out.line("\n" + " ".join(judge(findings)))
+    out.line("\n" + "\n".join(judge(findings)))
 
 
 def _detector(findings: Findings) -> dict[str, Any] | None:
     from calibration.detector.measure import EXCESS_NOISE
     from calibration.report.page import unknown_read_noise
 
-    detector = findings.detector
-    if detector is None:
+    detector, figures = findings.detector, findings.figures
+    if detector is None or figures is None:
         return None
 
-    def interval(value: Interval) -> dict[str, float]:
-        return {"median": value.median, "q05": value.q05, "q95": value.q95}
+    def interval(value: Interval | None) -> dict[str, float] | None:
+        return None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
 
     found = detector.posterior
     return {
-        "gain": interval(found.gain),
-        "offset": interval(found.offset),
-        "read_noise": interval(found.read_noise),
+        "gain": interval(figures.gain),
+        "offset": interval(figures.offset),
+        "read_noise": interval(figures.read_noise),
+        "source": figures.source,
+        "correlation_factor": figures.factor,
         "rhat": found.rhat,
         "autocorrelation_time": found.autocorrelation_time,
         "num_steps": found.num_steps,
         "misfit": detector.misfit,
+        "photon_transfer_gain": detector.line.gain,
         "offset_measured": detector.offset is not None,
-        "read_noise_identifiable": not unknown_read_noise(detector),
+        "read_noise_identifiable": not unknown_read_noise(figures),
         "caveat": EXCESS_NOISE,
     }
 

@@ -9,15 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.detector.correlation import Correlation, correlation_of
+from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
-from calibration.detector.models import KINDS, NUM_STEPS, ModelScore, Pixels, collect_pixels, fit_models
+from calibration.detector.models import KINDS, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
+from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image
+from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
+from calibration.verdict import Reason, Verdict, judge_calibration, verdict_of
 from noiseflow.described import described
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from noiseflow.commands.console import Progress
 
 Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
@@ -36,14 +43,24 @@ class Findings:
         detector: None where no gain shows.
         no_detector: why not.
         burst: what moved or faded; None for pairs.
+        figures: gain, offset and read noise as reported; None where no gain shows.
+        verdict: how far they can be believed.
+        correlation: between the residuals of neighbouring pixels.
+        repairs: what of the exposures was modelled before the detector was measured.
+        pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None: none was.
     """
 
     pairs: Sequence[AlignedPair]
-    pixels: Pixels
-    scores: Sequence[ModelScore]
+    pixels: Pixels | None = None
+    scores: Sequence[ModelScore] = ()
     detector: Detector | None = None
     no_detector: str = ""
     burst: BurstReport | None = None
+    figures: Figures | None = None
+    verdict: Verdict = Verdict("bad", ())
+    correlation: Correlation | None = None
+    repairs: Repairs = Repairs()
+    pattern: Image | None = None
 
 
 def calibrate_exposures(
@@ -51,6 +68,7 @@ def calibrate_exposures(
     *,
     dark: Burst | None = None,
     flat: Burst | None = None,
+    kinds: Sequence[str] | None = None,
     seed: int = 0,
     device: Any = "cpu",
     bar: Bar = lambda title, total: nullcontext(),
@@ -61,6 +79,7 @@ def calibrate_exposures(
         exposures: pairs, or one burst.
         dark: frames without light.
         flat: equal frames of even illumination.
+        kinds: noise models to fit; see `fit_models`.
         seed: of every random choice.
         device: torch device of the fits.
         bar: makes progress bars.
@@ -68,47 +87,100 @@ def calibrate_exposures(
     Raises:
         ValueError: exposures that cannot be aligned, or a posterior that does not converge.
     """
+    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, bar=bar)
+    pixels = collect_pixels(measured.pairs, seed=seed)
+    physical = measured.figures is not None and measured.figures.source == "posterior"
+    likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
+    with bar("Fitting noise models", len(KINDS)) as progress:
+        scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
+    return replace(measured, pixels=pixels, scores=scores)
+
+
+def measure_exposures(
+    exposures: Sequence[ExposurePair] | Burst,
+    *,
+    dark: Burst | None = None,
+    flat: Burst | None = None,
+    seed: int = 0,
+    bar: Bar = lambda title, total: nullcontext(),
+) -> Findings:
+    """Align exposures, measure the detector and judge its figures, without fitting noise models. As `calibrate_exposures`."""
+    pattern = None
     if dark is not None:
-        exposures = without_pattern(exposures, dark)
+        pattern = dark_pattern(exposures, dark)
+        exposures = exposures if pattern is None else without_pattern(exposures, pattern)
     burst = None
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
     else:
         pairs = [align_pair(pair) for pair in exposures]
-    detector, reason = None, ""
+    pairs, repairs = repaired(pairs)
+    correlation = correlation_of(pairs)
+    if correlation.found and not repairs.refitted:
+        pairs = [_own_noise_by_scale(pair) for pair in pairs]
+    detector, figures, reason = None, None, ""
+    verdict = Verdict("bad", ())
     try:
         with bar("Sampling the detector's posterior", 16000) as progress:
             detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+        figures = figures_of(detector, correlation, repairs)
+        verdict = judge_calibration(pairs, detector, figures, correlation, repairs)
     except NotMeasurable as error:
         reason = str(error)
-    pixels = collect_pixels(pairs, seed=seed)
-    with bar("Fitting noise models", NUM_STEPS * len(KINDS)) as progress:
-        scores = fit_models(pixels, seed=seed, device=device, progress=progress)
-    return Findings(pairs, pixels, scores, detector, reason, burst)
+        verdict = verdict_of([Reason("not measurable", "bad", f"the detector was not measured: {reason}.")])
+    return Findings(
+        pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern
+    )
 
 
-def without_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Sequence[ExposurePair] | Burst:
-    """Exposures less the dark frames' fixed pattern, where the mean dark frame knows it better than its own noise.
+def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
+    """The pair with the signal's own noise from the exposures' scale: a filter has taken it out of the finest band."""
+    if pair.frames > 1 or not 0 < pair.scaling.slope < 1:
+        return pair
+    share = pair.scaling.slope / (1 + pair.scaling.slope)
+    total = pair.total_variance
+    return replace(pair, signal_variance=VarianceLine(share * total.floor, share * total.rate))
 
-    The pattern's mean stays in, so that the offset does.
+
+def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Image | None:
+    """The dark frames' fixed pattern, (y, x) counts of mean 0, where the mean dark frame knows it better than its own noise;
+    else None.
+
+    The pattern's mean stays in the exposures, so that the offset does.
 
     Raises:
-        ValueError: dark frames of another size.
+        ValueError: dark frames of another size, or brighter than the exposures.
     """
-    pattern = dark.frames.mean(0)
+    mean = dark.frames.mean(0)
     first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
-    if pattern.shape != first.shape:
+    if mean.shape != first.shape:
         raise ValueError(
-            f"{dark.name} is {pattern.shape} and the exposures are {first.shape} pixels; take dark frames with the same "
+            f"{dark.name} is {mean.shape} and the exposures are {first.shape} pixels; take dark frames with the same "
             "binning and region"
         )
+    if mean.mean() >= first.mean():
+        raise ValueError(
+            f"{dark.name} has the mean {mean.mean():.5g} and the exposure {first.mean():.5g} counts; dark frames cannot be the "
+            "brighter ones: swap them, or take them at the same offset setting"
+        )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
-    if np.var(pattern) < 2 * noise:
-        return exposures
-    pattern = pattern - pattern.mean()
+    return None if np.var(mean) < 2 * noise else np.asarray(mean - mean.mean())
+
+
+def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
+    """Exposures less a fixed pattern, (y, x) counts."""
     if isinstance(exposures, Burst):
         return replace(exposures, frames=exposures.frames - pattern)
     return [_less(pair, pattern) for pair in exposures]
+
+
+def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
+    """The model as it applies to raw frames: with the dark frames' pattern, where that was subtracted before it was fitted."""
+    if findings.pattern is None:
+        return model
+    import noiseflow
+
+    return noiseflow.WithMaps(model, offset=findings.pattern)
 
 
 def _less(pair: ExposurePair, pattern: Image) -> ExposurePair:

@@ -16,7 +16,7 @@ from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, 
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
-from calibration.exposures.scaling import ring_mean
+from calibration.exposures.scaling import ring_mean, spread_by_level
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
@@ -46,6 +46,8 @@ class Detector:
         levels: the histograms.
         offset: offset measured by dark frames and its standard error, counts; None without.
         misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector.
+        uneven: relative deviation of the pixels' own variances, at equal signal, in a burst of four frames or more; 0: none.
+        dark_deviation: of the dark frames over time, counts rms, without rounding; None without dark frames.
     """
 
     posterior: DetectorPosterior
@@ -53,6 +55,8 @@ class Detector:
     levels: Sequence[Levels]
     offset: tuple[float, float] | None
     misfit: float
+    uneven: float = 0.0
+    dark_deviation: float | None = None
 
 
 def measure_detector(
@@ -97,7 +101,8 @@ def measure_detector(
             "the noise grows so little with the signal that the gain cannot be told from none; give the exposure ratio, "
             "dark frames, or exposures of more electrons"
         )
-    return Detector(posterior, fit_photon_transfer(levels), levels, offset, misfit(levels, posterior.most_likely))
+    line, chi_squared = fit_photon_transfer(levels), misfit(levels, posterior.most_likely)
+    return Detector(posterior, line, levels, offset, chi_squared, unevenness(pairs), dark_deviation(dark))
 
 
 def _with_cells(
@@ -218,6 +223,37 @@ def dark_offset(dark: Burst) -> tuple[float, float]:
     means = dark.frames.mean(axis=(1, 2))
     scatter = float(np.std(dark.frames - dark.frames.mean(0), ddof=0)) / np.sqrt(dark.frames.size)
     return float(means.mean()), float(np.hypot(scatter, means.std(ddof=1) / np.sqrt(len(means))))
+
+
+def dark_deviation(dark: Burst | None) -> float | None:
+    """Deviation of dark frames over time, counts rms, without that of rounding; None without frames."""
+    if dark is None:
+        return None
+    rounding = rounding_step(dark.frames[0]) ** 2 / 12
+    return float(np.sqrt(max(float(dark.frames.var(axis=0, ddof=1).mean()) - rounding, 0.0)))
+
+
+def unevenness(pairs: Sequence[AlignedPair]) -> float:
+    """Relative deviation of the pixels' variances at equal signal, from disjoint frame differences of a burst.
+
+    Squares of independent differences correlate over the pixels only where some pixels are noisier than others.
+
+    Returns:
+        0 for fewer than four frames, or where nothing stands out of five standard errors.
+    """
+    if len(pairs) < 4 or pairs[0].frames == 1:
+        return 0.0
+    mask = np.logical_and.reduce([pair.mask for pair in pairs])
+    level = np.mean([pair.short[mask] for pair in pairs], axis=0)
+    squares = []
+    for first, second in zip(pairs[::2], pairs[1::2], strict=False):
+        difference = (first.short - second.short)[mask]
+        standard = np.clip(difference / spread_by_level(level, difference), -5, 5) ** 2
+        squares.append(standard / standard.mean() - 1)
+    products = np.array([np.mean(a * b) for i, a in enumerate(squares) for b in squares[:i]])
+    error = np.mean([np.mean(one**2) for one in squares]) / np.sqrt(mask.sum() * len(products))
+    found = float(products.mean())
+    return float(np.sqrt(found)) if found > 5 * error else 0.0
 
 
 def _burst_readings(burst: Burst, dark: bool) -> list[Readings]:

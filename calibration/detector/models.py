@@ -1,4 +1,4 @@
-"""Which noise model suffices: each is fitted on some blocks of pixels and judged on the others."""
+"""Which noise model suffices: fitted by the library's one selector on some blocks of pixels, judged on the others."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.exposures.frames import rails, rounding_step
 from calibration.registration.aligned import AlignedPair, block_split
 from noiseflow.described import described
 
@@ -22,18 +23,32 @@ KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
     "poisson": "Poisson",
     "poisson-gaussian": "PoissonGaussian",
+    "excess-noise": "ExcessNoise",
     "signal-gaussian": "SignalDependentGaussian",
     "mixture": "Mixture",
     "flow": "RadialFlow",
     "spline": "SplineFlow",
+    "physics-flow": "PhysicsFlow",
 }
 """Names of the noise models that compete, simplest first, and their classes in noiseflow."""
 
 BLOCK = 8
 """Side, in pixels, of the blocks kept apart."""
 
-NUM_STEPS = 500
+SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
+"""Those that are fitted always; the flexible ones only where these leave something to gain."""
+
+NUM_STEPS = 200
 """Optimisation steps of each model."""
+
+MOST_PIXELS = 32_768
+"""Pixels that models are fitted to, as many as the selector screens them by."""
+
+WORTH_FITTING = 1e-3
+"""Nats per pixel that a simple model must leave before flexible ones are fitted: a fifth of what the choice may lose."""
+
+GROUPS = 16
+"""Signal levels, and cells of the probability integral transform in each, that the test for flexible models compares."""
 
 
 @described(signal="counts", observation="counts")
@@ -43,7 +58,7 @@ class Pixels:
 
     Attributes:
         signal: (N,) counts.
-        observation: (N,) counts.
+        observation: (N,) counts; whole numbers where the detector rounds.
         held_out: (N,) those that judge.
         block: (N,) number of the block each belongs to.
     """
@@ -93,14 +108,33 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         apart = block_split(pair.mask.shape, np.random.default_rng(seed), block=BLOCK, fraction=fraction)
         rows, columns = np.indices(pair.mask.shape) // BLOCK
         block = rows * (columns.max() + 1) + columns + number * (rows.max() + 1) * (columns.max() + 1)
-        parts.append([image[pair.mask] for image in (pair.signal, pair.observation, apart, block)])
+        parts.append([image[pair.mask] for image in (pair.signal, whole_observation(pair), apart, block)])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:
+    """(y, x) the observation of a pair, as whole numbers if the exposure's are.
+
+    Taking the signal's own noise out moves observations off the converter's steps. They are rounded again, and shrunk a little
+    more for the twelfth of a squared step that this adds; clipped pixel values stay at their limit. Where the noise is as fine
+    as the rounding, they stay as recorded.
+    """
+    step = rounding_step(pair.short)
+    if not step:
+        return pair.observation
+    own = (1 - pair.share) * pair.total_variance(pair.signal)
+    kept = np.sqrt(np.maximum(own - step**2 / 12, 0.0) / np.maximum(pair.total_variance(pair.signal), step**2 / 12))
+    observation = np.round((pair.signal + kept * (pair.short - pair.signal)) / step) * step
+    low, high = rails(pair.short)
+    recorded = (own < step**2) | (pair.share < 1e-3) | (pair.short <= low) | (pair.short >= high)
+    return np.where(recorded, pair.short, observation.clip(low, high))
 
 
 def fit_models(
     pixels: Pixels,
     *,
-    kinds: Sequence[str] = tuple(KINDS),
+    kinds: Sequence[str] | None = None,
+    detector: tuple[float, float, float] | None = None,
     seed: int = 0,
     device: Any = "cpu",
     progress: Progress | None = None,
@@ -109,10 +143,12 @@ def fit_models(
 
     Args:
         pixels: from `collect_pixels`.
-        kinds: names in `KINDS`.
+        kinds: names in `KINDS`; by default the simple ones, and the flexible ones where the best of these leaves more than
+            `WORTH_FITTING` nats per pixel to gain.
+        detector: gain, offset and read noise as measured, for the Poisson-Gaussian model; None: fitted.
         seed: of every random choice.
         device: torch device to fit on.
-        progress: called with the steps done of ``NUM_STEPS * len(kinds)``, and a note.
+        progress: called with the models done, and a note.
 
     Returns:
         One score per kind, simplest first; models on the CPU.
@@ -120,13 +156,39 @@ def fit_models(
     Raises:
         ValueError: an unknown kind, or a model that cannot be fitted.
     """
-    models, losses = {}, {}
-    for index, name in enumerate(sorted(kinds, key=_rank)):
-        told = None if progress is None else _shifted(progress, index * NUM_STEPS, name)
-        models[name] = _fitted(name, pixels, seed, device, told)
-        losses[name] = _losses(models[name], pixels)
+    models = _fitted(sorted(kinds or SIMPLE, key=_rank), pixels, detector, seed, device)
+    if progress is not None:
+        progress(len(models), "simple models")
+    losses = {name: _losses(model, pixels) for name, model in models.items()}
     best = min(losses, key=lambda name: float(losses[name].mean()))
-    return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in models]
+    if kinds is None and attainable(models[best], pixels) > WORTH_FITTING:
+        flexible = [name for name in KINDS if name not in SIMPLE]
+        models |= _fitted(flexible, pixels, detector, seed, device)
+        losses |= {name: _losses(models[name], pixels) for name in flexible}
+        best = min(losses, key=lambda name: float(losses[name].mean()))
+    if progress is not None:
+        progress(len(KINDS), "all models")
+    return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]
+
+
+def attainable(model: nn.Module, pixels: Pixels) -> float:
+    """Nats per pixel that another model could gain; 0 where that is within two standard errors of nothing.
+
+    The divergence of the model's probability integral transform from uniform, in `GROUPS` levels of the signal.
+    """
+    from noiseflow.metrics.evaluation import probability_integral_transform
+
+    signal, observation = _tensors(pixels, np.ones_like(pixels.held_out))
+    transform = probability_integral_transform(model, signal, observation, np.random.default_rng(0))
+    cell = np.clip(np.asarray(transform) * GROUPS, 0, GROUPS - 1).astype(int)
+    total, freedom = 0.0, 0
+    for group in np.array_split(np.argsort(pixels.signal), GROUPS):
+        counts = np.bincount(cell[group], minlength=GROUPS)
+        seen = counts[counts > 0]
+        total += 2 * float(np.sum(seen * np.log(seen * GROUPS / len(group))))
+        freedom += GROUPS - 1
+    excess = total - freedom
+    return excess / (2 * len(cell)) if excess > 2 * np.sqrt(2 * freedom) else 0.0
 
 
 def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
@@ -146,32 +208,34 @@ def _rank(name: str) -> int:
     return list(KINDS).index(name)
 
 
-def _shifted(progress: Progress, start: int, name: str) -> Progress:
-    return lambda done, note: progress(start + done, f"{name}: {note}")
-
-
-def _fitted(name: str, pixels: Pixels, seed: int, device: Any, progress: Progress | None) -> nn.Module:
+def _fitted(
+    names: Sequence[str], pixels: Pixels, detector: tuple[float, float, float] | None, seed: int, device: Any
+) -> dict[str, nn.Module]:
+    """Models by name, fitted by the selector to pixels not kept apart; the Poisson-Gaussian one as measured, if it is."""
     import torch
 
     import noiseflow
+    from noiseflow.fitting.selection import select
 
     torch.manual_seed(seed)
-    options = {"mean_preserving": True} if name in ("mixture", "flow", "spline") else {}
-    model: nn.Module = getattr(noiseflow, KINDS[name])(**options).to(device)
-    signal, observation = (values.to(device) for values in _tensors(pixels, ~pixels.held_out))
-    stopping = torch.from_numpy(pixels.block[~pixels.held_out] % 10 == 0).to(device)
-    generator = torch.Generator().manual_seed(seed)
-    noiseflow.fit(
-        model,
-        signal,
-        observation,
-        held_out=stopping,
-        num_steps=NUM_STEPS,
-        digitise=False,
-        generator=generator,
-        progress=progress,
+    chosen = np.flatnonzero(~pixels.held_out)
+    chosen = np.random.default_rng(seed).permutation(chosen)[:MOST_PIXELS]
+    signal, observation = (
+        torch.from_numpy(values[chosen]).float().to(device) for values in (pixels.signal, pixels.observation)
     )
-    return model.cpu().eval()
+    found: dict[str, nn.Module] = {}
+    if detector is not None and "poisson-gaussian" in names:
+        digitisation = noiseflow.detect_digitisation(pixels.observation)
+        model: nn.Module = noiseflow.PoissonGaussian(*detector)
+        found["poisson-gaussian"] = noiseflow.Digitised(model, *digitisation) if digitisation.found else model
+    options = {name: {"mean_preserving": True} if name in ("mixture", "flow", "spline") else {} for name in names}
+    candidates = {
+        name: getattr(noiseflow, KINDS[name])(**options[name]).to(device) for name in names if name not in found
+    }
+    if candidates:
+        selection = select(signal, observation, candidates=candidates, num_steps=NUM_STEPS, seed=seed)
+        found |= {one.name: one.model for one in selection.candidates}
+    return {name: found[name].cpu().eval() for name in names}
 
 
 def _score(

@@ -9,8 +9,13 @@ import numpy as np
 
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line
+from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
+
+
+MODEL_ERROR = 0.005
+"""Relative error of a level's variance that is granted to the straight line itself, so that one level of a million dark pixels
+does not rule all others."""
 
 
 class NotMeasurable(ValueError):
@@ -18,7 +23,7 @@ class NotMeasurable(ValueError):
 
 
 @described(
-    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²"
+    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²", gain_error="counts per electron"
 )
 @dataclass(frozen=True)
 class PhotonTransfer:
@@ -32,6 +37,8 @@ class PhotonTransfer:
         clipped: (L,) share of the readings at a rail; levels with any are left out of the line where others suffice.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
+        gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.
+        chi_squared: of the points about the line per degree of freedom, with half a percent of the variance granted to the line.
     """
 
     signal: Image
@@ -40,6 +47,19 @@ class PhotonTransfer:
     clipped: Image
     gain: float
     intercept: float
+    gain_error: float = 0.0
+    chi_squared: float = 1.0
+
+    @property
+    def bent(self) -> bool:
+        """Whether the points depart from the line by more than their errors and by over 2 % of the variance anywhere."""
+        free = self.clipped < 1e-3
+        if free.sum() < 5:
+            return False
+        departure = self.variance[free] - (self.gain * self.signal[free] + self.intercept)
+        significant = np.abs(departure) > 4 * self.variance_error[free] * max(1.0, self.chi_squared**0.25)
+        large = np.abs(departure) > 0.02 * self.variance[free].max()
+        return bool(np.sum(significant & large) >= 2)
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
@@ -54,13 +74,32 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     free = clipped < 1e-3
     if free.sum() < 3:
         free = np.ones_like(free)
-    line = fit_line(signal[free], variance[free])
+    line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if not line.rate > 0:
         raise NotMeasurable(
             "the noise does not grow with the signal, so the gain cannot be measured; give exposures with more "
             "contrast, or flat frames at several levels"
         )
-    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor)
+    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
+
+
+def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[VarianceLine, float, float]:
+    """The line, the standard error of its slope, and χ² per degree of freedom.
+
+    Errors grow with the line's own level, not with the point's, which would favour points that are too low by chance.
+    """
+    relative = error / np.maximum(variance, np.finfo(float).tiny)
+    line = fit_line(signal, variance)
+    for _ in range(3):
+        level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
+        weight = 1 / (level**2 * (relative**2 + MODEL_ERROR**2))
+        middle = float(np.average(signal, weights=weight))
+        information = float(np.sum(weight * (signal - middle) ** 2))
+        rate = float(np.sum(weight * (signal - middle) * variance)) / information
+        line = VarianceLine(float(np.average(variance, weights=weight)) - rate * middle, rate)
+    departure = variance - line.floor - line.rate * signal
+    chi_squared = float(np.sum(weight * departure**2)) / max(len(signal) - 2, 1)
+    return line, float(np.sqrt(max(chi_squared, 1.0) / information)), chi_squared
 
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.detector.importance import DRAWS, ROUNDS, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.exposures.frames import Image
@@ -26,6 +27,12 @@ LARGEST_RHAT = 1.05
 
 FARTHEST = 12.0
 """Nats below the maximum beyond which a walker has gone astray."""
+
+LEAST_EVALUATIONS = DRAWS * ROUNDS
+"""Steps allowed, below which only the chain is asked for."""
+
+NUM_SAMPLES = 2000
+"""Equally weighted samples that are kept."""
 
 BURN_IN = 60
 """Steps that only find out where the posterior lies."""
@@ -49,9 +56,9 @@ class DetectorPosterior:
     Attributes:
         samples: (S, 3) gain (counts/electron), offset (counts), read noise (electrons rms).
         most_likely: (3,) maximum of the posterior.
-        autocorrelation_time: steps, the longest of the three.
-        rhat: potential scale reduction, the largest of the three.
-        num_steps: steps kept.
+        autocorrelation_time: steps per independent sample: of a chain the longest of the three parameters'.
+        rhat: potential scale reduction of the chain's walkers, or of the two halves of independent draws; the largest of three.
+        num_steps: steps kept of a chain, or draws.
         levels: as sampled, about the most likely scales of their signals.
     """
 
@@ -88,11 +95,12 @@ def sample_posterior(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DetectorPosterior:
-    """Sample the posterior of gain, offset and read noise with emcee (doi:10.1086/670067).
+    """Sample the posterior of gain, offset and read noise.
 
-    Walkers start around the maximum of the posterior and move by differential evolution, its snooker variant and
-    stretches; then also by independent draws from a Student distribution fitted to where they went. The chain is prolonged
-    until it lasts `NUM_TIMES` autocorrelation times and its halves and walkers agree.
+    Adaptive importance sampling, and where that is not worth enough samples emcee (doi:10.1086/670067): walkers start around
+    the maximum and move by differential evolution, its snooker variant and stretches; then also by independent draws from a
+    Student distribution fitted to where they went. The chain is prolonged until it lasts `NUM_TIMES` autocorrelation times
+    and its halves and walkers agree.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -107,7 +115,36 @@ def sample_posterior(
         ValueError: the chain has not converged; the message says how many steps it needs.
     """
     log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
-    walkers = _walkers(log_posterior, best, np.random.default_rng(seed))
+    likely, kept = np.concatenate(log_posterior.parameters(best)), tuple(log_posterior.levels)
+    generator = np.random.default_rng(seed)
+    walkers = _walkers(log_posterior, best, generator)
+    if len(walkers) > 3 and largest_num_steps > LEAST_EVALUATIONS:
+        spread = np.cov(walkers.T)
+        drawn = importance_sample(log_posterior, best, spread, generator, progress)
+        if drawn is not None and drawn.disagreement() < LARGEST_RHAT:
+            number, rhat = len(drawn.draws), drawn.disagreement()
+            samples = np.column_stack(log_posterior.parameters(drawn.resampled(NUM_SAMPLES, generator)))
+            return DetectorPosterior(samples, likely, number / drawn.effective, rhat, number, kept)
+    sampler, time, rhat = _chain(log_posterior, walkers, num_steps, largest_num_steps, seed, progress)
+    flat = sampler.get_chain().reshape(-1, 3)[:: max(1, int(time / 2))]
+    samples = np.column_stack(log_posterior.parameters(flat))
+    return DetectorPosterior(samples, likely, time, rhat, sampler.iteration, kept)
+
+
+def _chain(
+    log_posterior: LogPosterior,
+    walkers: Image,
+    num_steps: int,
+    largest_num_steps: int,
+    seed: int,
+    progress: Progress | None,
+) -> tuple[Any, float, float]:
+    """A converged chain, its autocorrelation time and its scale reduction factor."""
+    if len(walkers) < NUM_WALKERS:
+        raise ValueError(
+            "the posterior has no width that numbers can resolve: the pixel values contradict every Poisson-Gaussian detector; "
+            "give raw frames, neither gamma-encoded nor rescaled"
+        )
     first = _sampler(log_posterior, _local_moves(1.0), seed)
     state = first.run_mcmc(walkers[:NUM_WALKERS], BURN_IN)
     visited, value = (
@@ -125,13 +162,9 @@ def sample_posterior(
         if progress is not None:
             progress(len(chain), f"{len(chain) / time:.0f} autocorrelation times")
         if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
-            break
+            return sampler, time, rhat
         if 2 * len(chain) > largest_num_steps:
             raise ValueError(_not_converged(len(chain), time, rhat))
-    flat = chain.reshape(-1, 3)[:: max(1, int(time / 2))]
-    likely = np.concatenate(log_posterior.parameters(best))
-    samples = np.column_stack(log_posterior.parameters(flat))
-    return DetectorPosterior(samples, likely, time, rhat, len(chain), tuple(log_posterior.levels))
 
 
 def _local_moves(weight: float) -> list[Any]:

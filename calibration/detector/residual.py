@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import ndimage
 
 from calibration.exposures.frames import Image
+from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import spread_by_level
 from calibration.registration.aligned import AlignedPair
 
 _BLUR = 3.0
 _SHRINKS = 1 / (2 * np.sqrt(np.pi) * _BLUR)
 """What is left of white noise's standard deviation."""
 _LEAST_WEIGHT = 0.9
+CUT = 5.0
+"""Standard deviations at which residuals are cut, so that a few defects do not speak for all pixels."""
 
 
 def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
@@ -37,3 +43,39 @@ def structured_share(pair: AlignedPair) -> float:
     smooth, weight = smoothed_residual(pair)
     inside = smooth[weight > _LEAST_WEIGHT]
     return float(np.mean(inside**2) - 1) * _SHRINKS**2 if inside.size else float("nan")
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What a pair's short exposure leaves beside its signal, standardised.
+
+    Attributes:
+        z: (y, x) residual over the standard deviation at its level, cut at `CUT`, 0 outside the mask.
+        mask: (y, x) pixels to trust.
+        share: of the residual's variance that is the signal's own noise.
+        spread: (y, x) that standard deviation, counts.
+    """
+
+    z: Image
+    mask: Mask
+    share: float
+    spread: Image
+
+
+def residual_of(pair: AlignedPair) -> Residual:
+    """The standardised residual of a pair."""
+    difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair)[pair.mask]
+    spread = np.ones(pair.mask.shape)
+    spread[pair.mask] = spread_by_level(level, difference)
+    z = np.zeros(pair.mask.shape)
+    z[pair.mask] = np.clip((difference - np.median(difference)) / spread[pair.mask], -CUT, CUT)
+    scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
+    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, float(pair.share[pair.mask].mean()), spread * scale)
+
+
+def smooth_signal(pair: AlignedPair, *, blur: float = 1.5) -> Image:
+    """(y, x) the signal averaged over a Gaussian of `blur` pixels within the mask, counts."""
+    weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
+    inside = ndimage.gaussian_filter(np.where(pair.mask, pair.signal, 0.0), blur)
+    middle = float(pair.signal[pair.mask].mean())
+    return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))

@@ -68,6 +68,7 @@ class Burst:
     Args:
         frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
         name: how messages call the burst.
+        calibration: dark or flat frames, which need no scene.
 
     Raises:
         ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
@@ -75,30 +76,33 @@ class Burst:
 
     frames: Image
     name: str = "the burst"
+    calibration: bool = False
 
     def __post_init__(self) -> None:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
-                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give a long "
-                "exposure with it, or a burst of at least two equal exposures"
+                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give "
+                + ("at least two" if self.calibration else "a long exposure with it, or a burst of at least two equal exposures")
             )
-        checked = [checked_frame(frame, f"{self.name}, frame {i}") for i, frame in enumerate(frames)]
+        least = 1 if self.calibration else MINIMUM_SIDE
+        checked = [checked_frame(frame, f"{self.name}, frame {i}", least_side=least) for i, frame in enumerate(frames)]
         for i, (first, second) in enumerate(pairwise(checked)):
             if np.array_equal(first, second):
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} hold identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
 
 
-def checked_frame(data: NDArray[Any], name: str) -> Image:
+def checked_frame(data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SIDE) -> Image:
     """One grey frame as float64, refused where calibration could not use it.
 
     Args:
         data: (y, x), or (1, y, x); any real number type.
         name: how the message calls it.
+        least_side: pixels that each side needs.
 
     Raises:
-        ValueError: not one grey image, smaller than `MINIMUM_SIDE`, NaN, flat, or half of it saturated.
+        ValueError: not one grey image, smaller than `least_side`, NaN, flat, or half of it saturated.
     """
     data = as_array(data)
     if data.ndim == 3 and data.shape[0] == 1:
@@ -109,10 +113,8 @@ def checked_frame(data: NDArray[Any], name: str) -> Image:
         raise ValueError(
             f"{name} has shape {data.shape}; one 2D frame is needed here (a stack alone is read as a burst)"
         )
-    if min(data.shape) < MINIMUM_SIDE:
-        raise ValueError(
-            f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {MINIMUM_SIDE} per side are needed"
-        )
+    if min(data.shape) < least_side:
+        raise ValueError(f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} per side are needed")
     require_finite(data, name)
     rail = saturation_level(data)
     saturated = float(np.mean(data >= rail))
@@ -177,12 +179,13 @@ def read_pairs(
     ]
 
 
-def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst:
+def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False) -> Burst:
     """Read a burst from one stack, or from files of one frame each in the order taken.
 
     Args:
         paths: the files.
         name: how messages call it; by default the file, or "the burst".
+        calibration: dark or flat frames.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -196,7 +199,41 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None) -> Burst
         frames += list(data) if data.ndim == 3 else [data]
     for frame in frames[1:]:
         _require_same_size(frames[0], "the first frame", frame, "a later one")
-    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"))
+    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"), calibration)
+
+
+def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -> list[Burst]:
+    """Read flat frames at several levels of light: each stack is a level, and so are files of one frame each that follow one
+    another with equal means.
+
+    Args:
+        paths: the files.
+        name: how messages call them.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: a file cannot be read, or a level has one frame only.
+    """
+    levels: list[list[NDArray[Any]]] = []
+    single = False
+    for path in paths:
+        data = read(path).data
+        frames = list(data) if data.ndim == 3 else [data]
+        equal = levels and single and len(frames) == 1 and _equal_light(levels[-1][-1], frames[0])
+        if equal:
+            levels[-1] += frames
+        else:
+            levels.append(frames)
+        single = len(frames) == 1
+    return [Burst(np.stack(level), f"{name}, level {i}", True) for i, level in enumerate(levels, 1)]
+
+
+def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
+    """Whether two frames are of one level: their means differ by under 1 %, as light sources flicker."""
+    if first.shape != second.shape:
+        return False
+    one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
+    return abs(one - other) < 0.01 * abs(one + other) / 2
 
 
 def _require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:

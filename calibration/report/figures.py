@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.detector.correlation import Correlation
+from calibration.detector.figures import Figures
 from calibration.detector.measure import Detector
 from calibration.detector.models import ModelScore, Pixels
 from calibration.detector.residual import smoothed_residual
@@ -86,8 +88,8 @@ def pit_figure(scores: Sequence[ModelScore]) -> Figure:
 
 
 def photon_transfer_figure(detector: Detector) -> Figure:
-    """Variance against signal with the posterior's band of lines."""
-    figure, axes = new_figure(1, width=7.0, height=4.2)
+    """Variance against signal with the posterior's band of lines, and its departure from the fitted line."""
+    figure, axes = new_figure(2, width=11.0, height=4.2)
     axis, line = axes[0, 0], detector.line
     style = {"fmt": "o", "markersize": 3, "linewidth": 1, "color": "0.3"}
     axis.errorbar(line.signal, line.variance, line.variance_error, label="levels, ± s.e.", **style)
@@ -97,9 +99,53 @@ def photon_transfer_figure(detector: Detector) -> Figure:
     low, middle, high = np.percentile(variance, (5, 50, 95), axis=0)
     axis.fill_between(signal, low, high, alpha=0.3, label="posterior, 90 %")
     axis.plot(signal, middle, linewidth=1)
-    axis.set_xlabel("signal, counts")
+    axis.plot(signal, line.gain * signal + line.intercept, linewidth=1, linestyle="--", color="0.5", label="line")
     axis.set_ylabel("variance, counts²")
     axis.legend(fontsize=8)
+    expected = line.gain * line.signal + line.intercept
+    axes[0, 1].errorbar(line.signal, 100 * (line.variance / expected - 1), 100 * line.variance_error / expected, **style)
+    axes[0, 1].axhline(0, color="0.5", linewidth=0.8)
+    axes[0, 1].set_ylabel("departure from the line, %")
+    for one in axes[0]:
+        one.set_xlabel("signal, counts")
+    return figure
+
+
+def correlation_figure(correlation: Correlation) -> Figure:
+    """Correlation of residuals at each distance, and along the two axes with its standard error."""
+    figure, axes = new_figure(2, width=9.0, height=3.6)
+    reach = int(np.abs(correlation.lags).max())
+    image = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for (dy, dx), value in zip(correlation.lags.astype(int), correlation.value, strict=True):
+        image[reach + dy, reach + dx] = image[reach - dy, reach - dx] = value
+    limit = max(float(np.abs(image).max()), 5 * float(correlation.error.max()))
+    show_image(axes[0, 0], image, "correlation at the distance (x, y)", limits=(-limit, limit))
+    steps = np.arange(1, reach + 1)
+    for name, values in (
+        ("along x", [correlation.at(0, int(step)) for step in steps]),
+        ("along y", [correlation.at(int(step), 0) for step in steps]),
+    ):
+        axes[0, 1].plot(steps, values, marker="o", label=name)
+    error = 2 * float(correlation.error.max())
+    axes[0, 1].axhspan(-error, error, color="0.9", label="2 s.e.")
+    axes[0, 1].set_xlabel("distance, pixels")
+    axes[0, 1].set_ylabel("correlation")
+    axes[0, 1].legend(fontsize=8)
+    return figure
+
+
+def snr_figure(figures: Figures, brightest: float) -> Figure:
+    """Signal-to-noise ratio of a pixel against its electrons."""
+    figure, axes = new_figure(1, width=6.0, height=3.8)
+    offset, read = figures.offset, figures.read_noise
+    most = max((brightest - (offset.median if offset else 0.0)) / figures.gain.median, 10.0)
+    electrons = np.geomspace(0.1, most, 200)
+    noise = np.sqrt(electrons + (read.median**2 if read else 0.0))
+    axes[0, 0].loglog(electrons, electrons / noise, label="this detector")
+    axes[0, 0].loglog(electrons, np.sqrt(electrons), linestyle="--", color="0.5", label="shot noise alone")
+    axes[0, 0].set_xlabel("electrons per pixel")
+    axes[0, 0].set_ylabel("signal-to-noise ratio")
+    axes[0, 0].legend(fontsize=8)
     return figure
 
 

@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.detector.measure import EXCESS_NOISE, Detector
+from calibration.detector.figures import Figures
+from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, simplest_sufficient
-from calibration.detector.residual import structured_share
+from calibration.detector.posterior import Interval
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
 from calibration.report.figures import (
     corner_figure,
+    correlation_figure,
     histogram_figure,
     photon_transfer_figure,
     pit_figure,
     registration_figure,
     residual_figure,
+    snr_figure,
 )
 from noiseflow.report import Report, provenance
-
-LARGEST_MISFIT = 1.3
-"""χ² per degree of freedom above which the readings do not come from a Poisson-Gaussian detector."""
 
 LARGEST_MISALIGNMENT = 0.1
 """Pixels of registration error that leave no trace in the residuals."""
@@ -33,9 +33,6 @@ UNKNOWN_READ_NOISE = (
     "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it."
 )
 
-LARGEST_STRUCTURE = 0.05
-"""Share of the residual's variance that may be smooth structure: it biases the gain by as much."""
-
 LEAST_DIVERGENCE = 5e-4
 """Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
 
@@ -43,10 +40,12 @@ LABELS = {
     "gaussian": "Gaussian, one width",
     "poisson": "Poisson",
     "poisson-gaussian": "Poisson-Gaussian",
+    "excess-noise": "Poisson-Gaussian with excess noise",
     "signal-gaussian": "Gaussian, width by signal",
     "mixture": "mixture of Gaussians",
     "flow": "radial flow",
     "spline": "spline flow",
+    "physics-flow": "Poisson-Gaussian corrected by a flow",
 }
 """How the report calls the models."""
 
@@ -68,7 +67,7 @@ def _row(score: ModelScore) -> list[str]:
         *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
         *(judged.mean_jsd, judged.mean_jsd_floor),
     )
-    return [score.name, *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
+    return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
 
 
 def verdict(scores: Sequence[ModelScore]) -> str:
@@ -91,26 +90,39 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     return text
 
 
-def describe_detector(detector: Detector) -> str:
+def describe_figures(figures: Figures) -> str:
     """Gain, offset and read noise with their 90 % intervals, and what they rest on."""
-    found = detector.posterior
-    parts = [
-        f"{name} {value.median:#.4g} {unit} (90 %: {value.q05:#.4g} … {value.q95:#.4g})"
-        for name, unit, value in (
-            ("gain", "counts/e⁻", found.gain),
-            ("offset", "counts", found.offset),
-            ("read noise", "e⁻ rms", found.read_noise),
-        )
+    parts = [f"{name} {_interval(value, unit)}" for name, unit, value in _named(figures)]
+    source = "the posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
+    corrected = f", variance times {figures.factor:.3g} for the correlation of pixels" if figures.factor != 1 else ""
+    per_count = f"1 count = {1 / figures.gain.median:.4g} e⁻"
+    return f"{', '.join(parts)} ({per_count}). By {source}{corrected}."
+
+
+def _named(figures: Figures) -> list[tuple[str, str, Interval | None]]:
+    return [
+        ("gain", "counts/e⁻", figures.gain),
+        ("offset", "counts", figures.offset),
+        ("read noise", "e⁻ rms", figures.read_noise),
     ]
-    text = ", ".join(parts) + f". Chain of {found.num_steps} steps, {found.num_steps / found.autocorrelation_time:.0f} "
-    text += f"autocorrelation times, R-hat {found.rhat:.3f}. "
-    if unknown_read_noise(detector):
+
+
+def _interval(value: Interval | None, unit: str) -> str:
+    if value is None:
+        return "not determined"
+    return f"{value.median:#.4g} {unit} (90 %: {value.q05:#.4g} … {value.q95:#.4g})"
+
+
+def describe_detector(findings: Findings) -> str:
+    """The figures, what limits them, and how they were sampled."""
+    detector, figures = findings.detector, findings.figures
+    if detector is None or figures is None:
+        return f"not measured: {findings.no_detector}"
+    found = detector.posterior
+    text = describe_figures(figures) + f" {found.num_steps / found.autocorrelation_time:.0f} effective samples, "
+    text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
+    if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
-    if detector.misfit > LARGEST_MISFIT:
-        text += (
-            f"The readings depart from any Poisson-Gaussian detector (χ² per degree of freedom {detector.misfit:.2f}), so "
-            "the true errors are larger than these intervals. "
-        )
     return text + EXCESS_NOISE
 
 
@@ -181,62 +193,43 @@ def write_report(
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
-    facts = []
-    if findings.detector is not None:
-        found = findings.detector.posterior
-        for name, unit, value in (
-            ("Gain", "counts/e⁻", found.gain),
-            ("Offset", "counts", found.offset),
-            ("Read noise", "e⁻ rms", found.read_noise),
-        ):
-            facts.append((f"{name}, {unit}", f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"))
-    facts.append(("Noise model that suffices", LABELS[simplest_sufficient(findings.scores).name]))
+    facts = [("Verdict", findings.verdict.grade)]
+    if findings.figures is not None:
+        for name, unit, value in _named(findings.figures):
+            shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
+            facts.append((f"{name[0].upper()}{name[1:]}, {unit}", shown))
+    if findings.scores:
+        facts.append(("Noise model", LABELS[simplest_sufficient(findings.scores).name]))
     return facts
 
 
+def describe_verdict(findings: Findings) -> list[str]:
+    """The grade and its reasons, a sentence each."""
+    grade = findings.verdict.grade
+    if grade == "good":
+        return ["Verdict: good. Gain, offset and read noise can be believed within their intervals; no assumption fails its test."]
+    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
+    return [f"Verdict: {head}", *(f"{one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
+
+
 def judge(findings: Findings) -> list[str]:
-    """What to believe, in words: the noise model, the detector's parameters, the registration."""
-    found = [verdict(findings.scores)]
-    detector = findings.detector
-    if detector is None:
-        found.append(f"The detector was not measured: {findings.no_detector}.")
-    else:
-        apart = detector.misfit > LARGEST_MISFIT
-        found.append(
-            (
-                "The intervals of gain, offset and read noise are too narrow: the readings depart from those of one "
-                "Poisson-Gaussian detector"
-                if apart
-                else "Gain, offset and read noise can be believed: the readings are those of a Poisson-Gaussian detector"
-            )
-            + f" (χ² per degree of freedom {detector.misfit:.2f}; 1 is perfect)."
-            + (f" {UNKNOWN_READ_NOISE}" if unknown_read_noise(detector) else "")
-        )
-    if findings.burst is None:
+    """What to believe, in words: the detector's parameters, the noise model, the registration."""
+    found = describe_verdict(findings)
+    if findings.scores:
+        found.append(verdict(findings.scores))
+    if findings.burst is None and findings.pairs:
         worst = max(pair.registration.error_px for pair in findings.pairs)
         found.append(
             f"The exposures lie on each other to {worst:.3f} px"
             + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
-        shares = [share for share in map(structured_share, findings.pairs) if np.isfinite(share)]
-        found += [_judge_structure(max(shares))] if shares else []
     return found
 
 
-def _judge_structure(share: float) -> str:
-    text = f"Of the residual's variance {100 * max(share, 0.0):.1f} % is smooth structure, which is no noise"
-    if share > LARGEST_STRUCTURE:
-        return (
-            text
-            + ": scene or illumination changed between the exposures. Look at the residual map, and take them anew."
-        )
-    return text + ": too little to matter."
-
-
-def unknown_read_noise(detector: Detector) -> bool:
+def unknown_read_noise(figures: Figures) -> bool:
     """Whether the exposures leave the read noise open by more than a factor of three."""
-    interval = detector.posterior.read_noise
-    return interval.q95 > 3 * interval.q05
+    interval = figures.read_noise
+    return interval is None or interval.q95 > 3 * interval.q05
 
 
 def _add_detector(page: Report, findings: Findings) -> None:
@@ -244,12 +237,22 @@ def _add_detector(page: Report, findings: Findings) -> None:
     if findings.detector is None:
         page.text(f"Not measured: {findings.no_detector}")
         return
-    words = describe_detector(findings.detector)
+    words = describe_detector(findings)
     page.text(words[0].upper() + words[1:])
     page.figure(
         photon_transfer_figure(findings.detector),
-        caption="Photon transfer: variance against signal; band: 90 % of the posterior.",
+        caption="Photon transfer: variance against signal, and what is left of it beside the line; band: 90 % of the posterior.",
     )
+    if findings.correlation is not None:
+        page.figure(
+            correlation_figure(findings.correlation),
+            caption="Correlation of the residuals of neighbouring pixels: independent noise has none.",
+        )
+    if findings.figures is not None and findings.figures.read_noise is not None and findings.figures.offset is not None:
+        page.figure(
+            snr_figure(findings.figures, float(findings.detector.line.signal.max())),
+            caption="Signal-to-noise ratio of one pixel against its electrons, with the shot-noise limit.",
+        )
     page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
 
 
@@ -260,6 +263,8 @@ def _add_models(page: Report, findings: Findings) -> None:
         "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: what the model's own samples would give."
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
+    if findings.pixels is None:
+        return
     histograms = histogram_figure(findings.pixels, findings.scores)
     page.figure(
         histograms,

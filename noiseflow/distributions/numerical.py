@@ -32,7 +32,7 @@ def as_noise_distribution(distribution: Any) -> NoiseDistribution:
         return distribution
     if not isinstance(distribution, Distribution):
         raise TypeError(
-            f"a noise model returned {type(distribution).__name__}; return a torch.distributions.Distribution, one number per pixel"
+            f"a noise model returned {type(distribution).__name__}; return a torch Distribution of one number per pixel"
         )
     if distribution.event_shape:
         raise ValueError(
@@ -97,7 +97,7 @@ class NumericalDistribution(NoiseDistribution):
     @property
     def support(self) -> constraints.Constraint:
         found: Any = self.base.support
-        return constraints.real if found is None else found  # type: ignore[no-any-return]
+        return constraints.real if found is None else found
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:

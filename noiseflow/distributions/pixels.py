@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar, Self, TypeVar
 
 import torch
@@ -130,7 +131,9 @@ class Pixels:
         other._batch_shape, other._kept = shape, {}  # type: ignore[attr-defined]
         size = len(self.batch_shape)
         for name, value in vars(self).items():
-            if isinstance(value, Pixels):
+            if isinstance(getattr(type(self), name, None), cached_property):
+                del other.__dict__[name]
+            elif isinstance(value, Pixels):
                 setattr(other, name, value.mapped(take, shape))
             elif isinstance(value, Tensor) and self._is_per_pixel(name, value):
                 setattr(other, name, take(value, tuple(value.shape[size:])))

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.textbook import GaussianDistribution as GaussianDistribution
 from noiseflow.distributions.textbook import PoissonDistribution as PoissonDistribution
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 
-class Gaussian(ArrayModel):
+class Gaussian(NoiseModelBase):
     """Gaussian noise of one standard deviation around the signal.
 
     Args:
@@ -32,15 +31,11 @@ class Gaussian(ArrayModel):
         """Start at the root-mean-square residual of (N,) signals and observations."""
         self.log_scale.copy_(torch.log((observation.double() - signal.double()).square().mean().sqrt()))
 
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
-
     def extra_repr(self) -> str:
         return f"scale={math.exp(self.log_scale.item()):.4g}"
 
 
-class Poisson(ArrayModel):
+class Poisson(NoiseModelBase):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
     Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell: it
@@ -70,10 +65,6 @@ class Poisson(ArrayModel):
         self.log_gain.copy_(torch.log(gain))
         self.offset.copy_(offset)
         self.requires_grad_(False)
-
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
 
     def extra_repr(self) -> str:
         return f"gain={math.exp(self.log_gain.item()):.4g}, offset={self.offset.item():.4g}"

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval, normal_quadrature
 from noiseflow.distributions.transforms import between_rows
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation
 
@@ -21,7 +21,7 @@ _COMPONENT_NODES = 101  # of each Gaussian
 _SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
 
 
-class Mixture(ArrayModel):
+class Mixture(NoiseModelBase):
     """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
 
     Args:
@@ -30,12 +30,12 @@ class Mixture(ArrayModel):
         mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
         width: hidden units of the network that turns a signal into the parameters.
 
-    Attributes:
-        tabulate: as that of `ConditionalFlow`.
-
     Raises:
         ValueError: fewer than one component.
     """
+
+    standardises_by_level = True
+    joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
 
     def __init__(
         self,
@@ -50,7 +50,6 @@ class Mixture(ArrayModel):
             raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
         self.num_components, self.shared_shape = num_components, shared_shape
         self.mean_preserving, self.width = mean_preserving, width
-        self.tabulate = True
         self.standardisation = Standardisation()
         # apart from the start, or all components would stay equal: means ±½, the outer ones wider
         place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
@@ -91,6 +90,10 @@ class Mixture(ArrayModel):
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
         self.standardisation.set_from(signal, observation, span)
 
+    @property
+    def fitted_range(self) -> tuple[float, float]:
+        return self.standardisation.fitted_range
+
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""
         names = ("num_components", "shared_shape", "mean_preserving", "width")
@@ -113,7 +116,7 @@ class MixtureDistribution(NoiseDistribution):
     per_pixel = ("signal",)
 
     def __init__(
-        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: nn.Module
+        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: NoiseModelBase
     ) -> None:
         super().__init__(signal.shape, like=signal)
         self.signal, self._components_at, self._model = self.clean(signal), components_at, model

@@ -14,10 +14,10 @@ from noiseflow.distributions.base import (
     log_normal_interval,
     normal_hazard,
 )
+from noiseflow.distributions.electrons import log_density, log_tail
 from noiseflow.distributions.normal import hazard_of
 from noiseflow.distributions.pixelwise import pixelwise
 from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.electrons import log_density, log_tail
 from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
 

@@ -1,0 +1,309 @@
+"""What EMVA 1288 reports of a camera, from flat frames at several levels and dark frames, and maps of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.detector.correlation import Correlation, correlation_of_residuals
+from calibration.detector.photon_transfer import NotMeasurable
+from calibration.detector.posterior import Interval
+from calibration.detector.residual import CUT, Residual
+from calibration.exposures.frames import Burst, Image, rounding_step
+from noiseflow.described import described
+
+LINEAR_RANGE = 0.7
+"""Share of the saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
+
+LEVEL_ERROR = 0.003
+"""Relative error of a level's variance granted to the line: what steadiness of light and converter usually leave."""
+
+NINETY = 1.645
+LEAST_LEVELS = 2
+
+
+@described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
+@dataclass(frozen=True)
+class Level:
+    """Temporal and spatial moments of equal frames.
+
+    Attributes:
+        mean: counts.
+        variance: over time, averaged over pixels, counts², without rounding's.
+        variance_error: standard error.
+        third: third central moment over time, counts³; None for two frames.
+        third_error: its standard error.
+        spatial: variance of the pixels' means over the frame, without that of the temporal noise, counts².
+        image: (y, x) mean frame, counts.
+        noise: (y, x) variance of each pixel over time, counts².
+        frames: number of frames.
+        flicker: relative deviation of the frames' means beyond what their noise explains.
+        clipped: share of pixel values at the converter's end.
+    """
+
+    mean: float
+    variance: float
+    variance_error: float
+    third: float | None
+    third_error: float
+    spatial: float
+    image: Image
+    noise: Image
+    frames: int
+    flicker: float
+    clipped: float
+
+
+@described(
+    gain="counts per electron",
+    dark_noise="electrons",
+    offset="counts",
+    saturation="electrons",
+    dynamic_range="ratio",
+    dsnu="electrons",
+    prnu="of the signal",
+    dark_current="electrons per second",
+    linearity_error="of the signal",
+)
+@dataclass(frozen=True)
+class CameraFigures:
+    """A camera's figures after EMVA 1288 (release 3.1, https://www.emva.org/standards-technology/emva-1288).
+
+    Attributes:
+        gain: overall system gain K, counts per electron (its inverse is in electrons per count); times the excess-noise factor
+            of a detector that has one.
+        dark_noise: temporal noise in darkness, electrons rms; None without dark frames.
+        offset: mean of the dark frames, counts; None without.
+        saturation: electrons at the level of the largest temporal variance; the brightest level's where the variance still grows.
+        saturated: whether the variance was seen to fall, so that `saturation` is the capacity and not a lower bound.
+        dynamic_range: saturation over the electrons at which the signal equals the noise; None without dark frames.
+        snr_maximum: largest signal-to-noise ratio.
+        linearity_error: mean departure from the line through the levels' exposure times; None without times.
+        dsnu: dark signal nonuniformity, electrons rms; None without dark frames.
+        prnu: photo response nonuniformity, of the signal at half saturation; None without dark frames.
+        dark_current: electrons per second and pixel; None without darks of two exposure times.
+        excess_factor: F² by the third moment of levels of three frames or more, with its 90 % interval; None where unknown.
+        levels: of the flats, by rising mean.
+        dark: of the dark frames; None without.
+        correlation: between neighbouring pixels' temporal noise.
+        chi_squared: of the photon-transfer line per degree of freedom.
+    """
+
+    gain: Interval
+    dark_noise: Interval | None
+    offset: float | None
+    saturation: float
+    saturated: bool
+    dynamic_range: float | None
+    snr_maximum: float
+    linearity_error: float | None
+    dsnu: float | None
+    prnu: float | None
+    dark_current: float | None
+    excess_factor: Interval | None
+    levels: tuple[Level, ...]
+    dark: Level | None
+    correlation: Correlation
+    chi_squared: float
+
+    @property
+    def response(self) -> Image:
+        """(y, x) relative response of each pixel, mean 1, from all linear levels."""
+        dark = self.dark.image if self.dark else np.full(self.levels[0].image.shape, self.offset or 0.0)
+        used = _linear(self.levels, self.offset or 0.0)
+        signal = np.sum([level.image - dark for level in used], axis=0)
+        return np.asarray(signal / signal.mean())
+
+
+def measure_camera(
+    flats: Sequence[Burst],
+    darks: Sequence[Burst] = (),
+    *,
+    flat_times: Sequence[float] | None = None,
+    dark_times: Sequence[float] | None = None,
+) -> CameraFigures:
+    """Measure a camera by photon transfer on even illumination.
+
+    Args:
+        flats: one burst of two or more equal frames for each level of light; levels in any order.
+        darks: bursts without light, the one with the flats' exposure time first.
+        flat_times, dark_times: exposure time of each, s.
+
+    Raises:
+        ValueError: no levels, sizes or numbers of times that differ.
+        NotMeasurable: too few levels, or noise that does not grow with the signal.
+    """
+    _require_equal(flats, darks, flat_times, dark_times)
+    order = np.argsort([float(flat.frames.mean()) for flat in flats])
+    levels = tuple(level_of(flats[int(index)]) for index in order)
+    dark_levels = [level_of(dark) for dark in darks]
+    dark = dark_levels[0] if dark_levels else None
+    offset = dark.mean if dark else None
+    used = _linear(levels, offset or 0.0)
+    points = [*([dark] if dark else []), *used]
+    if len(points) < LEAST_LEVELS:
+        raise NotMeasurable("flats at one level tell no gain; give dark frames with them, or flats at several levels of light")
+    slope, error, intercept, chi_squared = _line(points, dark)
+    if not slope > 3 * error:
+        raise NotMeasurable(
+            "the noise of the flats does not grow with their signal, so the gain cannot be measured; give levels of light that "
+            "differ by more"
+        )
+    residuals = [one for index in order for one in _residuals(flats[int(index)])]
+    correlation = correlation_of_residuals(residuals)
+    dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
+    zero = offset if offset is not None else 0.0
+    top = levels[int(np.argmax([level.variance for level in levels]))]
+    saturation = (top.mean - zero) / slope
+    least = None if dark_noise is None else float(np.sqrt(dark_noise**2 + 0.25) + 0.5)
+    half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
+    times = None if flat_times is None else [flat_times[int(index)] for index in order]
+    return CameraFigures(
+        gain=_normal(slope, error),
+        dark_noise=None if dark_noise is None or dark is None else _normal(dark_noise, _read_error(dark, slope, error)),
+        offset=offset,
+        saturation=float(saturation),
+        saturated=bool(top.mean < levels[-1].mean or top.clipped > 0),
+        dynamic_range=None if least is None else float(saturation / least),
+        snr_maximum=max((level.mean - zero) / np.sqrt(level.variance) for level in levels if level.mean <= top.mean),
+        linearity_error=None if times is None else linearity_error(levels, times, zero, top.mean),
+        dsnu=None if dark is None else float(np.sqrt(max(dark.spatial, 0.0)) / slope),
+        prnu=None if dark is None else float(np.sqrt(max(half.spatial - dark.spatial, 0.0)) / (half.mean - dark.mean)),
+        dark_current=_dark_current(dark_levels, dark_times, slope),
+        excess_factor=_excess_factor(points, slope, intercept),
+        levels=levels,
+        dark=dark,
+        correlation=correlation,
+        chi_squared=chi_squared,
+    )
+
+
+def level_of(burst: Burst) -> Level:
+    """Moments of equal frames."""
+    frames, number = burst.frames, len(burst.frames)
+    image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
+    rounding = rounding_step(frames[0]) ** 2 / 12
+    means = frames.mean(axis=(1, 2))
+    drift = max(float(means.var(ddof=1)) - float(noise.mean()) / image.size, 0.0)  # light that changed between frames
+    variance = float(noise.mean()) - drift
+    residual = (frames - image) - (means - means.mean())[:, None, None]
+    fourth = float(np.mean(residual**4)) * (number / (number - 1)) ** 2 if number > 2 else 3 * variance**2
+    error = np.sqrt(max(fourth - variance**2, 0.5 * variance**2) / (image.size * (number - 1)))
+    third, third_error = None, 0.0
+    if number > 2:
+        scale = number**2 / ((number - 1) * (number - 2))  # unbiased third central moment
+        cubes = (residual**3).mean(axis=0) * scale
+        third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
+    spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
+    end = frames.max()
+    clipped = float(np.mean(frames == end)) if np.mean(frames == end) > 1e-3 else 0.0
+    flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
+    return Level(
+        float(image.mean()), variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker, clipped
+    )
+
+
+def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:
+    """Mean relative departure from the line of signal against exposure time, between 5 % and 95 % of the saturation.
+
+    Raises:
+        NotMeasurable: under three levels in that range.
+    """
+    signal, time = np.array([level.mean - offset for level in levels]), np.asarray(times, float)
+    used = (signal > 0.05 * (top - offset)) & (signal < 0.95 * (top - offset))
+    if used.sum() < 3:
+        raise NotMeasurable(
+            f"{int(used.sum())} levels lie between 5 % and 95 % of the brightest; linearity needs three or more: give more levels"
+        )
+    signal, time = signal[used], time[used]
+    weight = 1 / signal**2  # relative departures count (EMVA 1288, release 3.1, section 6.7)
+    design = np.stack([np.ones_like(time), time])
+    line = np.linalg.solve(design * weight @ design.T, design * weight @ signal) @ design
+    return float(np.mean(np.abs(signal - line) / line))
+
+
+def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
+    top = levels[int(np.argmax([level.variance for level in levels]))]
+    limit = offset + LINEAR_RANGE * (top.mean - offset)
+    seen = top.mean < levels[-1].mean or any(level.clipped for level in levels)
+    used = [level for level in levels if not level.clipped and (not seen or level.mean <= limit)]
+    return used or [levels[0]]
+
+
+def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
+    """Slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
+    mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error"))
+    spread = np.hypot(error, LEVEL_ERROR * np.abs(variance))
+    weight = 1 / spread**2
+    middle = float(np.average(mean, weights=weight))
+    information = float(np.sum(weight * (mean - middle) ** 2))
+    slope = float(np.sum(weight * (mean - middle) * variance)) / max(information, np.finfo(float).tiny)
+    intercept = float(np.average(variance, weights=weight)) - slope * middle
+    chi_squared = float(np.sum(weight * (variance - intercept - slope * mean) ** 2)) / max(len(points) - 2, 1)
+    return slope, float(np.sqrt(max(chi_squared, 1.0) / max(information, np.finfo(float).tiny))), intercept, chi_squared
+
+
+def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> Interval | None:
+    """F² of a gain register or a deposited energy that varies as a gamma distribution, by the third moment.
+
+    With K = g·F² the third central moment grows by K²·(2 − 1/F²) per count: by K² for Poisson noise, half more where F² = 2.
+    """
+    known = [one for one in points if one.third is not None]
+    if len(known) < LEAST_LEVELS:
+        return None
+    mean = np.array([one.mean for one in known])
+    third, error = (np.array([float(getattr(one, name) or 0.0) for one in known]) for name in ("third", "third_error"))
+    weight = 1 / np.maximum(error, np.finfo(float).tiny) ** 2
+    centred = mean - np.average(mean, weights=weight)
+    information = float(np.sum(weight * centred**2))
+    ratio = float(np.sum(weight * centred * third)) / information / slope**2
+    spread = 1 / np.sqrt(information) / slope**2
+    if spread > 0.1:  # tells 1 from 1.5 at three standard errors no more
+        return None
+    low, middle, high = (1 / (2 - np.clip(value, 1.0, 1.9)) for value in (ratio - NINETY * spread, ratio, ratio + NINETY * spread))
+    return Interval(float(middle), float(low), float(high))
+
+
+def _read_error(dark: Level, slope: float, error: float) -> float:
+    noise = np.sqrt(max(dark.variance, np.finfo(float).tiny))
+    return float(np.hypot(0.5 * dark.variance_error / noise / slope, noise / slope * error / slope))
+
+
+def _dark_current(darks: Sequence[Level], times: Sequence[float] | None, slope: float) -> float | None:
+    if times is None or len(set(times)) < 2:
+        return None
+    return float(np.polyfit(np.asarray(times, float), [one.mean for one in darks], 1)[0] / slope)
+
+
+def _residuals(burst: Burst) -> list[Residual]:
+    """Standardised differences of successive frames, one frame of each pair used once."""
+    found = []
+    mask: NDArray[np.bool_] = np.ones(burst.frames.shape[1:], bool)
+    for first, second in zip(burst.frames[::2], burst.frames[1::2], strict=False):
+        difference = first - second
+        difference = difference - difference.mean()
+        spread = float(difference.std())
+        found.append(Residual(np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT), mask, 0.0, mask * spread))
+    return found
+
+
+def _normal(middle: float, error: float) -> Interval:
+    return Interval(float(middle), float(middle - NINETY * error), float(middle + NINETY * error))
+
+
+def _require_equal(
+    flats: Sequence[Burst], darks: Sequence[Burst], flat_times: Sequence[float] | None, dark_times: Sequence[float] | None
+) -> None:
+    if not flats:
+        raise ValueError("no flat frames were given; give two or more equal frames for each level of light")
+    shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
+    if len(shapes) > 1:
+        raise ValueError(f"flat and dark frames have the sizes {sorted(shapes)}; take all with the same binning and region")
+    for name, times, bursts in (("flat", flat_times, flats), ("dark", dark_times, darks)):
+        if times is not None and len(times) != len(bursts):
+            raise ValueError(f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each")
+    if darks and min(float(flat.frames.mean()) for flat in flats) <= float(darks[0].frames.mean()):
+        raise ValueError("the dark frames are as bright as a flat level; give frames without light as dark ones")

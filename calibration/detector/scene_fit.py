@@ -1,0 +1,172 @@
+"""Does the signal fit the scene of the short exposure? What residuals owe to blur, drift, illumination and curved response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from calibration.detector.residual import residual_of, smooth_signal
+from calibration.exposures.frames import Image
+from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import VarianceLine, fit_line
+from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from noiseflow.described import described
+
+BLUR = 1.5
+"""Pixels over which the signal is smoothed before its derivatives are taken, so that its noise hardly enters them."""
+
+CLEAR = 5.0
+"""Standard deviations of the χ² of noise beyond which the scene is held to show in the residual."""
+
+KERNEL_REACH = 4
+"""Pixels either way of the kernel that may stand between the two exposures."""
+
+MOST_FITTED = 120_000
+"""Pixels that a refit uses; 100 coefficients are then known to 0.1 % of the variance in all."""
+
+PATCH_BLUR = 3.0
+"""Pixels over which residuals are averaged to find places that changed."""
+
+PATCH_DEVIATIONS = 6.0
+"""Robust standard deviations of that average that noise of 10⁷ pixels does not reach."""
+
+ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "xy": (1, 1), "yy": (2, 0)}
+
+
+@described(blur="of the residual's variance", illumination="of the residual's variance", response="of the residual's variance")
+@dataclass(frozen=True)
+class SceneFit:
+    """Shares of the residual's variance that follow the scene, zero within `error` where the signal fits.
+
+    Attributes:
+        blur: by the gradient and curvature of the scene: blur, drift, motion, another scale.
+        illumination: by position: the light or the dose changed across the field.
+        response: by the square of the signal: one exposure is not linear.
+        error: standard error of each.
+    """
+
+    blur: float
+    illumination: float
+    response: float
+    error: float
+
+    @property
+    def largest(self) -> tuple[str, float]:
+        """The largest of the shares and its name."""
+        shares = {name: getattr(self, name) for name in ("blur", "illumination", "response")}
+        name = max(shares, key=lambda key: shares[key])
+        return name, shares[name]
+
+    @property
+    def clear(self) -> bool:
+        """Whether the largest share stands out of its error."""
+        return self.largest[1] > CLEAR * self.error
+
+
+def fit_scene(pair: AlignedPair) -> SceneFit:
+    """Regress the residual on what the scene would leave in it.
+
+    The noise of the signal enters residual and regressors; its part is known from the signal's own variance and taken out.
+    """
+    residual = residual_of(pair)
+    mask, scale = pair.mask, residual.spread[pair.mask]
+    smooth = smooth_signal(pair, blur=BLUR)
+    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(mask.shape), mask.shape, strict=True))
+    centred = smooth - smooth[mask].mean()
+    base = [np.ones(mask.shape), smooth]
+    groups = {
+        "blur": [ndimage.gaussian_filter(smooth, 0.75, order=order) for order in ORDERS.values()],
+        "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
+        "response": [centred**2],
+    }
+    impulse = np.zeros((25, 25))
+    impulse[12, 12] = 1.0
+    point = ndimage.gaussian_filter(impulse, BLUR)
+    own = {"blur": [ndimage.gaussian_filter(point, 0.75, order=order)[12, 12] for order in ORDERS.values()]}
+    noise = residual.share * float(mask.sum())  # Σ own variance / variance
+    shares = {}
+    for name, columns in groups.items():
+        design = np.stack([column[mask] for column in (*base, *columns)]) / scale
+        design /= np.maximum(np.sqrt((design**2).sum(1, keepdims=True)), np.finfo(float).tiny)
+        norms = np.sqrt(np.stack([(column[mask] / scale) @ (column[mask] / scale) for column in (*base, *columns)]))
+        coupled = np.array([0.0, point[12, 12], *own.get(name, [0.0] * len(columns))]) * noise
+        moment = design @ residual.z[mask] + coupled / np.maximum(norms, np.finfo(float).tiny)
+        gram = design @ design.T + 1e-9 * np.eye(len(design))
+        whole = moment @ np.linalg.solve(gram, moment)
+        without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
+        shares[name] = (whole - without - len(columns)) / mask.sum()
+    most = max(len(columns) for columns in groups.values())
+    return SceneFit(**{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / mask.sum()))
+
+
+def changed_places(pair: AlignedPair) -> Mask:
+    """(y, x) places of the scene that changed between the exposures: there the residual's average stands out."""
+    residual = residual_of(pair)
+    weight = ndimage.gaussian_filter(pair.mask.astype(float), PATCH_BLUR)
+    average = ndimage.gaussian_filter(residual.z, PATCH_BLUR)
+    smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
+    inside = smooth[pair.mask]
+    spread = float(np.subtract(*np.percentile(inside, (84.13, 15.87))) / 2)
+    far = np.abs(smooth - np.median(inside)) > PATCH_DEVIATIONS * max(spread, np.finfo(float).tiny)
+    return np.asarray(pair.mask & ndimage.binary_dilation(far, iterations=int(2 * PATCH_BLUR)))
+
+
+def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
+    """The pair without some places, and with its variance lines as the others tell them; as it was where too few are left."""
+    mask = pair.mask & ~changed
+    if mask.sum() < MINIMUM_PIXELS or not changed.any():
+        return pair
+    total = fit_line(pair.signal[mask], ((pair.short - pair.signal) ** 2)[mask])
+    counts = replace(pair.counts, restless=pair.counts.restless + int(changed.sum()))
+    return replace(pair, mask=mask, total_variance=total, counts=counts)
+
+
+def refitted(pair: AlignedPair) -> AlignedPair:
+    """The pair with its signal made from the long exposure by a kernel, an illumination and a curved response.
+
+    The kernel of `KERNEL_REACH` pixels either way is the linear filter that predicts the short exposure best; it undoes a blur or
+    drift of the long exposure, or repeats that of the short one. The signal's own variance grows with the kernel's square.
+    """
+    mask = ndimage.binary_erosion(pair.mask, np.ones((3, 3)), border_value=0) if pair.mask.all() else pair.mask
+    chosen = np.flatnonzero(mask)
+    chosen = chosen[:: max(1, len(chosen) // MOST_FITTED)]
+    weight = 1 / residual_of(pair).spread.flat[chosen]
+    gram, moment, shapes = _normal_equations(pair, chosen, weight)
+    ridge = 1e-8 * np.trace(gram) / len(gram)
+    found = np.linalg.solve(gram + ridge * np.eye(len(gram)), moment)
+    side = 2 * KERNEL_REACH + 1
+    kernel = found[: side * side].reshape(side, side)
+    signal = np.asarray(ndimage.correlate(shapes[0], kernel, mode="nearest"))
+    for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
+        signal = signal + coefficient * shape
+    factor = _gain_of_warped(pair, kernel)
+    own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
+    squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
+    return replace(pair, signal=signal, total_variance=fit_line(signal[pair.mask], squares), signal_variance=own)
+
+
+def _normal_equations(pair: AlignedPair, chosen: Image, weight: Image) -> tuple[Image, Image, list[Image]]:
+    """Gram matrix and moments of the kernel's shifts and of the smooth terms; and the images these stand for."""
+    middle = float(pair.signal[pair.mask].mean())
+    filled = np.where(pair.mask, pair.signal, smooth_signal(pair))
+    smooth = smooth_signal(pair) - middle
+    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(smooth.shape), smooth.shape, strict=True))
+    shapes = [filled, np.ones_like(smooth), smooth**2 / max(abs(middle), 1.0)]
+    shapes += [factor * term for factor in (x, y, x * x, x * y, y * y) for term in (np.ones_like(smooth), smooth)]
+    padded = np.pad(filled, KERNEL_REACH, mode="edge")
+    height, width = filled.shape
+    columns = [
+        padded[dy : dy + height, dx : dx + width].ravel()[chosen] * weight
+        for dy in range(2 * KERNEL_REACH + 1)
+        for dx in range(2 * KERNEL_REACH + 1)
+    ]
+    design = np.stack([*columns, *(shape.ravel()[chosen] * weight for shape in shapes[1:])])
+    return design @ design.T, design @ (pair.short.ravel()[chosen] * weight), shapes
+
+
+def _gain_of_warped(pair: AlignedPair, kernel: Image) -> float:
+    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
+    warped = pair.registration.warp(noise)[0]
+    return float(np.var(ndimage.correlate(warped, kernel, mode="nearest")) / np.var(warped))

@@ -1,0 +1,221 @@
+"""How far the figures can be believed: every assumption tested, and a grade with its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from calibration.detector.correlation import Correlation
+from calibration.detector.figures import (
+    LARGEST_DISAGREEMENT,
+    LARGEST_MISFIT,
+    Figures,
+    correctable,
+    disagrees,
+)
+from calibration.detector.measure import Detector
+from calibration.detector.repair import LEAST_SHARE, Repairs
+from calibration.exposures.compression import block_compressed
+from calibration.exposures.frames import rails
+from calibration.registration.aligned import AlignedPair
+from noiseflow.described import described
+
+Grade = Literal["good", "doubtful", "bad"]
+GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
+
+LEAST_MISFIT = 0.8
+"""χ² per degree of freedom below which the histograms are more even than independent pixels can be: over the thousand cells of
+a usual calibration it scatters by 0.05. Bursts share their frames, which takes some scatter away."""
+
+WIDEST_GAIN = 0.04
+"""Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded: twice the goal."""
+
+BIAS = 0.02
+"""Relative error of the gain that may go without a warning: the goal of the calibration."""
+
+MOST_CHANGED = 0.005
+"""Share of the pixels in places that change, from which on the user should know that they were left out."""
+
+
+BINS = 32
+"""Of the upper half of a histogram that is searched for a second mode."""
+
+
+@described()
+@dataclass(frozen=True)
+class Reason:
+    """One test that did not pass.
+
+    Attributes:
+        name: short, for programs.
+        grade: ``"doubtful"`` or ``"bad"``.
+        text: a sentence: what was found, what it does to the figures, and the fix.
+    """
+
+    name: str
+    grade: Grade
+    text: str
+
+
+@described()
+@dataclass(frozen=True)
+class Verdict:
+    """How far gain, offset and read noise can be believed.
+
+    Attributes:
+        grade: ``"good"``; ``"doubtful"``: corrected or uncertain, as the reasons say; ``"bad"``: do not use.
+        reasons: what was found, worst first; empty for a good calibration.
+    """
+
+    grade: Grade
+    reasons: tuple[Reason, ...]
+
+
+def judge_calibration(
+    pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, correlation: Correlation, repairs: Repairs
+) -> Verdict:
+    """Test what the figures assume.
+
+    Args:
+        pairs: as measured, after repairs.
+        detector: measured.
+        figures: as reported.
+        correlation: of the residuals of `pairs`.
+        repairs: what was modelled before.
+    """
+    reasons = [
+        *_scene(repairs, correlation),
+        *_correlation(pairs, correlation, repairs, figures),
+        *_shape(detector, figures),
+        *_range(pairs, detector, figures),
+    ]
+    return verdict_of(reasons)
+
+
+def verdict_of(reasons: Sequence[Reason]) -> Verdict:
+    """The verdict of some reasons: as bad as the worst."""
+    ordered = sorted(reasons, key=lambda one: -GRADES.index(one.grade))
+    return Verdict(ordered[0].grade if ordered else "good", tuple(ordered))
+
+
+def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
+    found = []
+    if repairs.changed > MOST_CHANGED:
+        grade: Grade = "bad" if repairs.changed > 0.2 else "doubtful"
+        text = f"{repairs.changed:.1%} of the pixels lie in places that changed between the exposures; they were left out"
+        found.append(Reason("scene changed", grade, text + ". Check the residual map, or expose a scene that stands still."))
+    causes = {
+        "blur": "blur, drift or another focus of one exposure",
+        "illumination": "light or dose that changed across the field",
+        "response": "an exposure that is not linear in the signal",
+    }
+    before = max(repairs.scene, key=lambda one: one.largest[1], default=None)
+    after = max(repairs.scene_after, key=lambda one: one.largest[1], default=None)
+    if before is None or after is None or not (before.clear and before.largest[1] > LEAST_SHARE):
+        return found
+    name, share = before.largest
+    text = f"{share:.1%} of the residual's variance follows the scene: {causes[name]}"
+    left = after.clear and after.largest[1] > LEAST_SHARE
+    if not repairs.refitted:
+        found.append(Reason("scene misfit", "bad" if share > 5 * LEAST_SHARE else "doubtful", text + " (not modelled)."))
+    elif left or correlation.found:
+        text += ". A kernel fitted between the exposures does not explain it all: take the exposures anew"
+        found.append(Reason("scene misfit", "bad", text + "."))
+    else:
+        text += ". A kernel fitted between the exposures explains it; the figures are those after it, a few percent uncertain"
+        found.append(Reason("scene misfit", "doubtful", text + "."))
+    return found
+
+
+def _correlation(
+    pairs: Sequence[AlignedPair], correlation: Correlation, repairs: Repairs, figures: Figures
+) -> list[Reason]:
+    found = []
+    for name, deviation in (("rows", repairs.rows), ("columns", repairs.columns)):
+        if deviation:
+            text = f"{name} have offsets of their own, {deviation:.3g} counts rms; they were taken out before the measurement"
+            found.append(Reason(f"{name[:-1]} offsets", "doubtful", text + ". Model them by ScanNoise(model)."))
+    if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
+        lag = int(np.argmax(np.abs(correlation.value)))
+        distance, value = tuple(int(step) for step in correlation.lags[lag]), correlation.value[lag]
+        text = f"pixels at the distance (y, x) = {distance} correlate by {value:+.3f}: the frames were filtered, resampled, or "
+        text += "carry afterglow or interference"
+        if correctable(correlation, repairs):
+            text += (
+                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain reported is"
+                " the one before; per pixel of the recorded frame it is "
+                f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Give raw frames to be sure"
+            )
+            grade: Grade = "bad" if correlation.factor < 0.5 else "doubtful"  # a sharpened frame: its factor is hardly known
+        else:
+            grade, text = "bad", text + ", which no short filter explains. Give raw frames, or remove the interference"
+        found.append(Reason("correlated pixels", grade, text + "."))
+    if any(block_compressed(pair.short) for pair in pairs[:1]):
+        text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
+        found.append(Reason("compressed", "bad", text + ". Give raw frames."))
+    if correlation.period:
+        text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed in blocks"
+        found.append(Reason("periodic noise", "bad", text + ", so that the gain is not the camera's. Give raw frames."))
+    return found
+
+
+def _shape(detector: Detector, figures: Figures) -> list[Reason]:
+    found = []
+    line, gain = detector.line, detector.posterior.gain.median
+    by_line = " Gain is reported by photon transfer, which holds for any detector of independent events"
+    by_line += ", times its excess-noise factor" + (
+        "; without dark frames offset and read noise are not determined." if detector.offset is None else "."
+    )
+    if detector.misfit > LARGEST_MISFIT:
+        text = f"the histograms are not those of a Poisson-Gaussian detector (χ² per degree of freedom {detector.misfit:.2f})."
+        found.append(Reason("not Poisson-Gaussian", "bad" if detector.misfit > 3 else "doubtful", text + by_line))
+    if detector.misfit < LEAST_MISFIT:
+        text = f"the histograms are more even than independent pixels can be (χ² per degree of freedom {detector.misfit:.2f})"
+        found.append(Reason("too even", "doubtful", text + ": values were rescaled or filtered. Give raw frames."))
+    if disagrees(detector):
+        text = f"the shape of the noise says {gain:.4g} counts/e⁻ and its variance {line.gain:.4g}."
+        grade: Grade = "bad" if abs(gain / line.gain - 1) > 5 * LARGEST_DISAGREEMENT else "doubtful"
+        found.append(Reason("shape against variance", grade, text + by_line))
+    if detector.uneven:
+        text = f"the pixels' own variances differ by {detector.uneven:.0%} rms at equal signal (sCMOS, hot pixels)."
+        found.append(Reason("uneven pixels", "doubtful", text + " Flats and darks give per-pixel maps." + by_line))
+    if line.bent:
+        text = "the variance is no straight line in the signal: saturation, a rescaled converter, or light that changed"
+        found.append(Reason("bent line", "doubtful", text + ". Look at the photon-transfer plot."))
+    return found
+
+
+def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures) -> list[Reason]:
+    found = []
+    gain = figures.gain
+    half = (gain.q95 - gain.q05) / (2 * gain.median)
+    if half > WIDEST_GAIN:
+        text = f"the gain is known to ±{half:.0%} only; give more exposures, more contrast, or flats at several levels"
+        found.append(Reason("gain uncertain", "doubtful", text + "."))
+    shares = [full_share(pair) for pair in pairs]
+    if max(shares) > 0.001:
+        text = f"{max(shares):.1%} of the pixels pile up at the brightest values, below the converter's end: a full well"
+        found.append(Reason("saturation", "doubtful", text + ". Expose for a shorter time."))
+    return found
+
+
+def full_share(pair: AlignedPair) -> float:
+    """Share of pixels in a pile at the upper end of the histogram that no clipping limit explains.
+
+    The brightest values of a scene thin out; a full well, with read noise after it, ends the histogram in a second mode.
+    """
+    if np.isfinite(rails(pair.short)[1]):
+        return 0.0
+    values = pair.short[pair.mask]
+    low, high = np.percentile(values, (50, 99.99))
+    width = max(1.0, np.ceil((high - low) / BINS))  # whole counts, or the histogram beats with the converter's steps
+    counts, _ = np.histogram(values, low - 0.5 + width * np.arange(BINS + 1))
+    smooth = np.convolve(counts, np.ones(3) / 3, mode="same")
+    last = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
+    peak = BINS // 4 + int(np.argmax(smooth[BINS // 4 :]))
+    valley = BINS // 8 + int(np.argmin(smooth[BINS // 8 : peak + 1]))
+    second = peak > 0.6 * last and smooth[peak] > 3 * (smooth[valley] + np.sqrt(smooth[valley]) + 1)
+    return float(counts[valley:].sum() / values.size) if second else 0.0

@@ -1,0 +1,117 @@
+"""Exposures as they come: clean ones, and ones whose noise or scene breaks what a calibration assumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from . import simulators as sim
+from .simulators import RATIO, Case, both, clean, exposed, long_of, pair
+
+Maker = Callable[[int], Case]
+
+
+def _blur(sigma: float) -> Callable[[sim.Image], sim.Image]:
+    return lambda image: np.asarray(ndimage.gaussian_filter(image, sigma))
+
+
+def _emccd(seed: int, *, dark: bool) -> Case:
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator, mean=15.0)
+    setting = {"gain": 75.0, "offset": 500.0, "read": 30.0}
+    short, long = (sim.multiplied(generator, times * scene, **setting) for times in (1, RATIO))
+    darks = np.stack([sim.multiplied(generator, 0 * scene, **setting) for _ in range(4)])
+    return Case(short, long, {"dark": darks} if dark else {}, gain=150.0)
+
+
+def _gain_error(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    short, long = clean(generator, scene)
+    return short, np.round(long - 4e-6 * np.maximum(long - 100, 0) ** 2)
+
+
+def _soft_saturation(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """A full well at twice the mean signal, with read noise after it."""
+    well = 1.5 * scene.mean()
+    filled = np.minimum(generator.poisson(scene), well)
+    return np.round(100 + 2 * (filled + 3 * generator.standard_normal(scene.shape))), exposed(generator, RATIO * scene)
+
+
+def _jpeg(image: sim.Image) -> sim.Image:
+    from scipy.fft import dctn, idctn
+
+    blocks = image.reshape(len(image) // 8, 8, -1, 8).swapaxes(1, 2)
+    found = dctn(blocks, axes=(2, 3), norm="ortho")
+    weight = 4.0 * (1 + np.add.outer(np.arange(8), np.arange(8)))
+    return np.asarray(
+        idctn(np.round(found / weight) * weight, axes=(2, 3), norm="ortho").swapaxes(1, 2).reshape(image.shape)
+    )
+
+
+def _vignette_moved(generator: np.random.Generator, scene: sim.Image) -> sim.Image:
+    y, x = np.indices(scene.shape) / len(scene) - 0.5
+    return np.asarray(scene * (1 + 0.3 * x + 0.2 * y))
+
+
+def _common_mode(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """Interference: a faint sine across both frames, at another phase in each."""
+    y, x = np.indices(scene.shape)
+    wave = [12 * np.sin(0.9 * x + 0.2 * y + phase) for phase in (0.0, 2.0)]
+    return tuple(np.round(a + b) for a, b in zip(clean(generator, scene), wave, strict=True))  # type: ignore[return-value]
+
+
+CASES: dict[str, Maker] = {
+    "clean": lambda s: replace(pair(s, clean), clean=True),
+    "clean, ratio known": lambda s: replace(pair(s, clean, exposure_ratio=RATIO), clean=True),
+    "clean, low dose": lambda s: replace(pair(s, lambda g, x: clean(g, x / 20)), clean=True),
+    "clean, shifted by 3.4 pixels": lambda s: replace(
+        pair(s, lambda g, x: (exposed(g, x), exposed(g, RATIO * ndimage.shift(x, (1.3, 3.4), order=5, mode="mirror")))),
+        clean=True,
+    ),
+    "clean burst of 6": lambda s: replace(
+        pair(s, lambda g, x: (np.stack([exposed(g, x) for _ in range(6)]), None)),
+        clean=True,  # type: ignore[arg-type,return-value]
+    ),
+    "both resampled × 0.8": lambda s: pair(s, both(sim.resampled)),
+    "both resampled × 0.8, cubic": lambda s: pair(s, both(lambda image: np.asarray(ndimage.zoom(image, 0.8, order=3)))),
+    "both binned 2 × 2 (mean)": lambda s: replace(
+        pair(s, both(lambda image: image.reshape(128, 2, 128, 2).mean((1, 3)))), gain=0.5
+    ),
+    "afterglow 0.35 along x": lambda s: pair(s, both(lambda image: sim.afterglow(image, 0.35))),
+    "afterglow 0.1 along y": lambda s: pair(s, both(lambda image: sim.afterglow(image, 0.1, axis=0))),
+    "long drifted by 4 pixels": lambda s: pair(s, long_of(lambda g, x: sim.drifted(x, 4))),
+    "long drifted by 2 pixels": lambda s: pair(s, long_of(lambda g, x: sim.drifted(x, 2))),
+    "long drifted by 4 pixels, ratio known": lambda s: pair(
+        s, long_of(lambda g, x: sim.drifted(x, 4)), exposure_ratio=RATIO
+    ),
+    "long blurred, 2 pixels": lambda s: pair(s, long_of(lambda g, x: _blur(2.0)(x))),
+    "long blurred, 0.7 pixels": lambda s: pair(s, long_of(lambda g, x: _blur(0.7)(x))),
+    "short blurred by optics, 1.5 pixels": lambda s: pair(
+        s, lambda g, x: (exposed(g, _blur(1.5)(x)), exposed(g, RATIO * x))
+    ),
+    "4 % of the area moved": lambda s: pair(s, long_of(sim.moved_patch)),
+    "illumination changed across the field": lambda s: pair(s, long_of(_vignette_moved)),
+    "row offsets of 12": lambda s: pair(s, sim.row_offsets(12.0)),
+    "row offsets of 3": lambda s: pair(s, sim.row_offsets(3.0)),
+    "interference pattern": lambda s: pair(s, _common_mode),
+    "sCMOS burst": lambda s: pair(s, lambda g, x: (sim.scmos(g, x), None)),  # type: ignore[arg-type,return-value]
+    "both Gaussian-filtered, 0.8": lambda s: pair(s, both(_blur(0.8))),
+    "both Gaussian-filtered, 0.4": lambda s: pair(s, both(_blur(0.4))),
+    "both median-filtered 3 × 3": lambda s: pair(s, both(lambda image: np.asarray(ndimage.median_filter(image, 3)))),
+    "both sharpened": lambda s: pair(s, both(lambda image: 1.8 * image - 0.8 * _blur(1.0)(image))),
+    "both compressed (DCT)": lambda s: pair(s, both(_jpeg)),
+    "long not linear": lambda s: pair(s, _gain_error),
+    "full well below the converter's end": lambda s: pair(s, _soft_saturation),
+    "EMCCD, gain × F² 150": lambda s: _emccd(s, dark=False),
+    "EMCCD, gain × F² 150, darks": lambda s: _emccd(s, dark=True),
+    "averaged short (4 frames), unknown": lambda s: replace(
+        pair(s, lambda g, x: (np.round(np.mean([exposed(g, x) for _ in range(4)], 0)), exposed(g, RATIO * x))), gain=0.5
+    ),
+    "gamma-encoded": lambda s: pair(s, both(lambda image: 255 * (image.clip(0) / 4000) ** 0.45)),
+}
+
+
+def cases() -> Iterator[tuple[str, Maker]]:
+    yield from CASES.items()
