@@ -21,7 +21,7 @@ _PANELS, _TAIL = 512, 1e-10  # of the default quadrature: panels of four nodes b
 class NoiseDistribution(Pixels, Distribution):
     """p(observation | signal), one observation per pixel: ``batch_shape`` is the signal's, ``event_shape`` is ().
 
-    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf`, `sample`, `mean` and `variance`. Whatever it
+    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf`, `sample`, `mean` and `variance`. What it
     writes answers like every other noise distribution: numbers and tensors of any real type are taken, half precision is
     computed in single precision, the answer has the type that signal and observation promote to, NaN gives NaN, an infinite
     observation has log-density −inf, large inputs are evaluated in pieces of bounded memory.
