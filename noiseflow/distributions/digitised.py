@@ -80,6 +80,12 @@ class DigitisedDistribution(NoiseDistribution):
     def rescaled(self, scale: Tensor, shift: Tensor) -> DigitisedDistribution:
         return DigitisedDistribution(self._detector, self.base.rescaled(scale, shift))
 
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> DigitisedDistribution:  # type: ignore[override]
+        """The same for a larger batch."""
+        shape = torch.Size(batch_shape)
+        signal = None if self._signal is None else self._signal.expand(shape)
+        return DigitisedDistribution(self._detector, self.base.expand(shape), signal)
+
     @property
     def edges(self) -> tuple[float, float]:
         """The undigitised values below which all is on the low limit, and above which all is on the high one."""

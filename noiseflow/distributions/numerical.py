@@ -186,7 +186,8 @@ class NumericalDistribution(NoiseDistribution):
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
         narrow = bool(((high - low).detach() <= spread / 2).all())
         found = self._straight(low, high) if narrow else self._stretched(low, high, centre, spread)
-        return torch.where(empty, torch.full_like(found, -math.inf), found)
+        found = torch.where(empty, torch.full_like(found, -math.inf), found)
+        return torch.where(torch.isfinite(centre), found, torch.full_like(found, math.nan))
 
     def _straight(self, low: Tensor, high: Tensor) -> Tensor:
         nodes, weights = panels(low, high, _CELL_PANELS)
