@@ -14,9 +14,7 @@ from noiseflow.models.base import ArrayModel
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
-_BELOW = (
-    0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
-)
+_BELOW = 0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
 _LEAST = 1e-14  # density, per standard deviation, under which the transform's rounding errors rule
 _FITTED, _ITERATIONS = 16384, 60
 
@@ -117,9 +115,7 @@ class ExcessNoise(ArrayModel):
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
         model = behind(self)
-        climber = torch.optim.LBFGS(
-            [self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9
-        )
+        climber = torch.optim.LBFGS([self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9)
         best, kept = math.inf, self.change.detach().clone()
 
         def loss() -> Tensor:
@@ -165,9 +161,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         gain, offset, read_noise, pulse_variance: scalars, float64; the last is F² − 1.
     """
 
-    def __init__(
-        self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor
-    ) -> None:
+    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor) -> None:
         super().__init__(signal.shape)
         self.signal, self.gain, self.offset = signal, gain, offset
         self.read_noise, self.pulse_variance = read_noise, pulse_variance
@@ -182,13 +176,9 @@ class ExcessNoiseDistribution(NoiseDistribution):
             rate = roots**2
             deviation = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2)
             width = _WIDTH
-            turn = (
-                torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
-            )
+            turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
             phase = turn / deviation[:, None]
-            pulse = torch.exp(
-                -torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance
-            )
+            pulse = torch.exp(-torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance)
             exponent = rate[:, None] * (pulse - 1) - 0.5 * (phase * self.read_noise) ** 2
             start = -_BELOW * _CELLS * width
             shift = torch.complex(torch.zeros_like(phase), -(turn * start + phase * rate[:, None]))
@@ -230,9 +220,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         ends = []
         for value, empty in ((low, 0.0), (high, 1.0)):
             finite = torch.isfinite(value)
-            ends.append(
-                torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty)
-            )
+            ends.append(torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty))
         ends[0] = torch.where(low == math.inf, torch.ones_like(ends[0]), ends[0])
         ends[1] = torch.where(high == -math.inf, torch.zeros_like(ends[1]), ends[1])
         mass = ends[1] - ends[0]
