@@ -80,7 +80,7 @@ class DigitisedDistribution(NoiseDistribution):
     def rescaled(self, scale: Tensor, shift: Tensor) -> DigitisedDistribution:
         return DigitisedDistribution(self._detector, self.base.rescaled(scale, shift))
 
-    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> DigitisedDistribution:  # type: ignore[override]
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> DigitisedDistribution:
         """The same for a larger batch."""
         shape = torch.Size(batch_shape)
         signal = None if self._signal is None else self._signal.expand(shape)

@@ -43,14 +43,14 @@ class Pixels:
         floating = like is not None and like.is_floating_point()
         self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
         self._given_device = None if like is None else like.device
-        self._kept: dict[bool, Any] = {}
+        self._computed: dict[bool, Any] = {}
 
     def once(self, compute: Callable[[], Kept]) -> Kept:
         """What `compute` gives, computed once with gradients and once without."""
         key = torch.is_grad_enabled()
-        if key not in self._kept:
-            self._kept[key] = compute()
-        kept: Kept = self._kept[key]
+        if key not in self._computed:
+            self._computed[key] = compute()
+        kept: Kept = self._computed[key]
         return kept
 
     def _pixels(self) -> Tensor | None:
@@ -128,7 +128,7 @@ class Pixels:
     def mapped(self, take: Taking, shape: torch.Size) -> Self:
         """A copy with every tensor of pixels replaced by ``take(tensor, shape of the axes after the batch's)``."""
         other = copy.copy(self)
-        other._batch_shape, other._kept = shape, {}  # type: ignore[attr-defined]
+        other._batch_shape, other._computed = shape, {}  # type: ignore[attr-defined]
         size = len(self.batch_shape)
         for name, value in vars(self).items():
             if isinstance(getattr(type(self), name, None), cached_property):
