@@ -6,3 +6,9 @@ from .base import log_normal_cdf as log_normal_cdf
 from .base import log_normal_interval as log_normal_interval
 from .base import normal_hazard as normal_hazard
 from .base import normal_quadrature as normal_quadrature
+from .digitised import DigitisedDistribution as DigitisedDistribution
+from .numerical import NumericalDistribution as NumericalDistribution
+from .numerical import as_noise_distribution as as_noise_distribution
+from .poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
+from .textbook import GaussianDistribution as GaussianDistribution
+from .textbook import PoissonDistribution as PoissonDistribution

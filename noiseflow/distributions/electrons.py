@@ -2,7 +2,7 @@
 
 Two representations share the work; both are exact to about 1e-8 nats at any rate, and neither grows with the rate.
 
-*Lattice*, where the read noise is below 1.5 electrons: the sum over k. Given an observation, k has a posterior narrower than the
+*Sum*, where the read noise is below 1.5 electrons: the sum over k. Given an observation, k has a posterior narrower than the
 read noise, so a dozen integers around its mode carry everything; neighbouring terms differ by a factor that needs no logarithm.
 
 *Contour*, above: the inversion integral of the moment generating function (`electron_contour`), a dozen nodes or two.
@@ -19,20 +19,26 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.base import log_normal_cdf, log_normal_interval
+from noiseflow.distributions.electron_cells import (
+    LEAST_READ_NOISE,
+    MOST_READ_NOISE,
+    cell_and_slopes,
+    is_narrow,
+    posterior_mode,
+)
 from noiseflow.distributions.electron_contour import (
     contour_log_interval,
     contour_log_mass,
     log_contour_integral,
-    poisson_normal_mode,
     positive_rate,
     saddle_point,
     tilted_rate,
 )
+from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.normal import log_normal_cdf, log_normal_interval
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _RESOLVED = 1.5
-_REACH = 6.5  # standard deviations whose complement, 1e-10, is left out
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
 
@@ -45,17 +51,24 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
         rate: expected electrons, ≥ 0, float64.
         read_noise: scalar, electrons, float64.
     """
-    if float(read_noise.detach()) < _RESOLVED:
+    if _most(read_noise) < _RESOLVED:
         return _lattice_log_density(residual, rate, read_noise)
     line = saddle_point(residual, rate, read_noise)
     one = torch.ones_like(line)
     return log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
 
 
-def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """log P(beyond the observation), on the side away from the mean: above it for residuals > 0, else below it."""
+def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """log P(beyond the observation), on the side away from the mean: above it for residuals > 0, else below it.
+
+    Args:
+        residual: observation − rate, electrons, float64.
+        rate: expected electrons, ≥ 0, float64.
+        read_noise: electrons, float64.
+        twice: take the contour in any case, because the sum needs incomplete gamma functions, which have no second derivative.
+    """
     upper = residual.detach() > 0
-    if float(read_noise.detach()) < _RESOLVED:
+    if not twice and _most(read_noise) < _RESOLVED:
         return _lattice_log_tail(residual, rate, read_noise, upper)
     side = torch.where(upper, 1.0, -1.0).to(residual)
     saddle = saddle_point(residual, rate, read_noise)
@@ -69,20 +82,20 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     return log_contour_integral(residual, rate, read_noise, line, side / line, factor)
 
 
-def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor) -> tuple[Tensor, Tensor]:
+def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
     """``(log P(≤ observation), log P(> observation))``; infinite residuals allowed."""
     finite = torch.isfinite(residual)
-    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise)
+    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
     near = torch.where(finite, near, torch.full_like(near, -math.inf))
     far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
     upper = residual > 0
     return torch.where(upper, far, near), torch.where(upper, near, far)
 
 
-def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite."""
+def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite; `twice` as in `log_tail`."""
     width = high - low
-    if float(read_noise.detach()) < _RESOLVED:
+    if _most(read_noise) < _RESOLVED:
         narrow = width.detach() <= 3
         direct = _lattice_log_interval
     else:
@@ -91,15 +104,69 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) ->
         direct = contour_log_interval
     if bool(narrow.all()):
         return direct(low, high, rate, read_noise)
-    wide = _log_difference_of_tails(low, high, rate, read_noise)
     if not bool(narrow.any()):
-        return wide
-    a, b = torch.where(narrow, low, torch.zeros_like(low)), torch.where(narrow, high, torch.ones_like(high))
-    return torch.where(narrow, direct(a, b, rate, read_noise), wide)
+        return _log_difference_of_tails(low, high, rate, read_noise, twice=twice)
+    wide, noise = ~narrow, (read_noise, read_noise)
+    if read_noise.ndim:
+        noise = read_noise[narrow], read_noise[wide]
+    near = direct(low[narrow], high[narrow], rate[narrow], noise[0])
+    far = _log_difference_of_tails(low[wide], high[wide], rate[wide], noise[1], twice=twice)
+    return torch.zeros_like(low).masked_scatter(narrow, near).masked_scatter(wide, far)
 
 
-def _log_difference_of_tails(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    (below_low, above_low), (below_high, above_high) = (log_both_tails(x, rate, read_noise) for x in (low, high))
+@torch.no_grad()
+def interval_and_slopes(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """`log_interval`, several times faster where cells are narrow, and its derivatives with respect to all four arguments.
+
+    Args:
+        low, high, rate: (n,) electrons, float64.
+        read_noise: scalar, electrons, float64.
+        slopes: whether the derivatives are wanted, (n,) each.
+    """
+    if not LEAST_READ_NOISE <= float(read_noise) <= MOST_READ_NOISE:
+        return _slowly(low, high, rate, read_noise, slopes=slopes)
+    mode = posterior_mode(low, high, rate, read_noise)
+    narrow = is_narrow(low, high, rate, read_noise, mode)
+    if bool(narrow.all()):
+        return cell_and_slopes(low, high, rate, read_noise, mode, slopes=slopes)
+    others = ~narrow
+    value, slow = _slowly(low[others], high[others], rate[others], read_noise, slopes=slopes)
+    cells, fast = cell_and_slopes(low[narrow], high[narrow], rate[narrow], read_noise, mode[narrow], slopes=slopes)
+    first, *rest = (
+        torch.empty_like(low).masked_scatter_(narrow, cell).masked_scatter_(others, other)
+        for cell, other in zip((cells, *fast), (value, *slow), strict=True)
+    )
+    return first, tuple(rest)
+
+
+def _slowly(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    if not slopes or not low.numel():
+        empty = (torch.zeros_like(low),) * 4 if slopes else ()
+        return log_interval(low, high, rate, read_noise), empty
+    with torch.enable_grad():
+        noise = read_noise.expand_as(low).clone()
+        at = [each.detach().clone().requires_grad_() for each in (low, high, rate, noise)]
+        # a copy of the read noise for each pixel has a slope of its own
+        value = log_interval(*at)
+        found = torch.autograd.grad(value.sum(), at)
+    return value.detach(), found
+
+
+def _most(read_noise: Tensor) -> float:
+    """The read noise, or the largest of several."""
+    return float(read_noise.detach().max())
+
+
+def _log_difference_of_tails(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    (below_low, above_low), (below_high, above_high) = (
+        log_both_tails(x, rate, read_noise, twice=twice) for x in (low, high)
+    )
     right = low > 0
     across = (low <= 0) & (high > 0)
     large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)
@@ -115,26 +182,9 @@ def _log1mexp(value: Tensor) -> Tensor:
     return torch.log1p(-torch.exp(value))
 
 
-def _log_poisson(count: Tensor, rate: Tensor) -> Tensor:
-    """log P(k = count): Stirling's leading terms are paired with the rate so that nothing large cancels."""
-    positive, safe = positive_rate(rate)
-    shifted = count + 0.5
-    u = (shifted - safe) / safe
-    at = count.clamp(max=1e7)  # beyond, the remainder changes by less than 1e-8
-    remainder = torch.lgamma(at + 1) - (at + 0.5) * (torch.log(at + 0.5) - 1)
-    deviance = safe * ((1 + u) * torch.log1p(u) - u)
-    none = torch.where(count > 0, torch.full_like(rate, -1e300), -rate)
-    return torch.where(positive, -deviance - 0.5 * torch.log(safe) - remainder, none)
-
-
-def _lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
-    with torch.no_grad():
-        return torch.round((poisson_normal_mode(rate + residual + 0.5, rate, variance) - 0.5).clamp(min=0))
-
-
 def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     variance = read_noise**2
-    mode = _lattice_mode(residual, rate, variance)
+    mode = lattice_mode(residual, rate, variance)
     gap = residual - (mode - rate)
     positive, safe = positive_rate(rate)
     up = tilted_rate(rate, (2 * gap - 1) / (2 * variance) - torch.log(mode + 1))
@@ -145,19 +195,19 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
         inside, torch.exp(torch.where(inside, exponent, torch.zeros_like(exponent))), torch.zeros_like(gap)
     )
     total = above = below = torch.ones_like(gap)
-    for step in range(math.ceil(_REACH * float(read_noise.detach()))):
+    for step in range(math.ceil(REACH * _most(read_noise))):
         decay = torch.exp(-step / variance)
         above = above * up * decay * ((mode + 1) / (mode + 1 + step))
         below = below * down * decay * ((safe_mode - step) / safe_mode)
         total = total + above + below
-    at_mode = _log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - _LOG_SQRT_2PI
+    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - _LOG_SQRT_2PI
     return at_mode + torch.log(total)
 
 
 def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper: Tensor) -> Tensor:
-    sigma = float(read_noise.detach())
-    near, far = math.ceil(_REACH * sigma) + 1, math.ceil((_REACH + _FULL) * sigma) + 1
-    mode = _lattice_mode(residual, rate, read_noise**2)
+    sigma = _most(read_noise)
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
+    mode = lattice_mode(residual, rate, read_noise**2)
     start = torch.where(upper, mode - near, mode - far).clamp(min=0)
     side = torch.where(upper, 1.0, -1.0).to(residual)
 
@@ -169,8 +219,8 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
 
 
 def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    reach = math.ceil(_REACH * float(read_noise.detach())) + 1
-    start = (_lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
+    reach = math.ceil(REACH * _most(read_noise)) + 1
+    start = (lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
 
     def log_part(count: Tensor) -> Tensor:
         gap = count - rate
@@ -183,7 +233,7 @@ def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Te
     """log Σ P(k)·exp(log_part(k)) over `count` integers from `start` on."""
     positive, safe = positive_rate(rate)
     log_rate = torch.where(positive, torch.log(safe), torch.full_like(safe, -1e30))
-    log_mass = _log_poisson(start, rate)
+    log_mass = log_poisson(start, rate)
     total = log_mass + log_part(start)
     for step in range(1, count):
         log_mass = log_mass + log_rate - torch.log(start + step)
@@ -212,5 +262,5 @@ def _log_gamma_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
     # so far out the masses fall geometrically from the edge
     last = torch.where(upper, edge, edge - 1)
     ratio = torch.where(upper, rate / (edge + 1), last / rate).clamp(max=0.5)
-    beyond = _log_poisson(last, rate) - torch.log1p(-ratio)
+    beyond = log_poisson(last, rate) - torch.log1p(-ratio)
     return torch.where(shown, torch.log(torch.where(shown, mass, torch.ones_like(mass))), beyond)

@@ -1,4 +1,4 @@
-"""Fast lookup of likelihoods and quantiles: both are functions of two scalars, so tabulate them and interpolate.
+"""How a likelihood, a function of two scalars, is laid out as a table: a scale of signals, rows, columns.
 
 Lookups are bilinear and run as one fused pass over the pixels (``grid_sample``), at about the cost of a normal log-density.
 """
@@ -6,7 +6,6 @@ Lookups are bilinear and run as one fused pass over the pixels (``grid_sample``)
 from __future__ import annotations
 
 import math
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,16 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from noiseflow.distributions.picked import needs_image
-
-LARGE = 2**18
-"""Inputs of at least so many pixels are tabulated where no gradient is asked for."""
+from noiseflow.distributions.fingerprint import fingerprint
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
 _COARSE = 65
-_CHUNK = 2**16
-_LATENT_LIMIT = 6.5
 
 
 @dataclass(frozen=True)
@@ -182,143 +176,6 @@ def mean_error(found: Tensor, exact: Tensor) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def _apart(low: float, high: float) -> tuple[float, float]:
-    return low, max(high, low + 1e-6 * (1 + abs(low)))
-
-
-def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
-    """Whether `log_prob` may take the place of the exact likelihood: many pixels, no gradient asked for."""
-    differentiable = torch.is_grad_enabled() and (
-        signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
-    )
-    large = observation.numel() >= LARGE and signal.shape == observation.shape
-    return large and not differentiable and not needs_image(noise_model)
-
-
-# the last table of each model, or None where none was accurate enough
-_likelihoods: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Columns, Tensor] | None]] = (
-    weakref.WeakKeyDictionary()
-)
-_quantiles: weakref.WeakKeyDictionary[nn.Module, tuple[Any, tuple[Rows, Tensor] | None]] = weakref.WeakKeyDictionary()
-
-
 def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
-    """What tells whether a model, and the range of its inputs, are still those that something was computed for."""
-    tensors = [*noise_model.parameters(), *noise_model.buffers()]
-    return (*limits, *((tensor.data_ptr(), tensor._version) for tensor in tensors))
-
-
-def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
-    """`log_prob` where the input is large, the model allows it (its ``tabulate``) and a table is accurate enough; else None."""
-    if not (getattr(noise_model, "tabulate", True) and is_large(noise_model, signal, observation)):
-        return None
-    return log_prob(noise_model, signal, observation)
-
-
-@torch.no_grad()
-def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = 1e-3) -> Tensor | None:
-    """Tabulated log-likelihood of many pixels, shaped like `observation`; None where no table is accurate enough.
-
-    The table is kept for the next call with the same model and the same range of values.
-    """
-    flat_signal, flat = signal.reshape(-1), observation.reshape(-1)
-    limits = tuple(float(bound) for tensor in (flat_signal, flat) for bound in torch.aminmax(tensor))
-    state = state_of(noise_model, *limits)
-    kept = _likelihoods.get(noise_model)
-    if kept is None or kept[0] != state:
-        made = _make_likelihood(noise_model, flat_signal, flat, limits, tolerance)
-        kept = _likelihoods[noise_model] = (state, made)
-    return None if kept[1] is None else _look_up(*kept[1], flat_signal, flat).reshape(observation.shape)
-
-
-def _make_likelihood(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, limits: tuple[float, ...], tolerance: float
-) -> tuple[Rows, Columns, Tensor] | None:
-    if not all(map(math.isfinite, limits)):
-        return None
-    part = slice(None, None, max(1, observation.numel() // 2048))
-    exact = noise_model(signal[part]).log_prob(observation[part])
-    scale = RootScale.of(noise_model, *_apart(*limits[:2]), observation)
-    for num_rows, num_columns in SIZES:
-        rows = Rows(scale, num_rows)
-        columns = Columns.of(noise_model, torch.tensor(limits[2:]).to(observation), scale, num_columns)
-        signals = rows.signals(observation)
-        values = log_likelihood(noise_model, signals, columns.values(signals), between_rails=True)
-        table = values[None, None].contiguous()
-        error = mean_error(_look_up(rows, columns, table, signal[part], observation[part]), exact)
-        if error <= tolerance / 2:  # half, because a sample of the pixels measured it
-            return rows, columns, table
-    return None
-
-
-def _look_up(rows: Rows, columns: Columns, table: Tensor, signal: Tensor, observation: Tensor) -> Tensor:
-    """Tabulated values of (N,) pixels, in pieces that stay in the cache."""
-    found = torch.empty_like(observation)
-    grid = torch.empty(min(_CHUNK, observation.numel()), 2, dtype=observation.dtype, device=observation.device)
-    for start in range(0, observation.numel(), _CHUNK):
-        s, o = signal[start : start + _CHUNK], observation[start : start + _CHUNK]
-        at = grid[: o.numel()]
-        offset, rate, bounds = columns.position(o)
-        root = rows.scale.signal(s)
-        torch.addcmul(offset, root, rate, value=-1, out=at[:, 0])
-        if bounds is not None:
-            torch.clamp(at[:, 0], *bounds, out=at[:, 0])
-        rows.position(root, at[:, 1])
-        found[start : start + _CHUNK] = interpolate(table, at)[0]
-    return found
-
-
-@torch.no_grad()
-def sample(
-    flow: nn.Module, signal: Tensor, generator: torch.Generator | None, *, tolerance: float = 1e-3
-) -> Tensor | None:
-    """Draw one observation per pixel by a table of quantiles over (signal, normal latent); None where none is accurate enough.
-
-    Args:
-        flow: a noise model whose distribution has ``from_latent``.
-        signal: any shape.
-        generator: source of the random numbers.
-        tolerance: accepted mean interpolation error, in standard deviations of the noise.
-    """
-    flat = signal.reshape(-1)
-    limits = tuple(float(bound) for bound in torch.aminmax(flat))
-    state = state_of(flow, *limits)
-    kept = _quantiles.get(flow)
-    if kept is None or kept[0] != state:
-        made = _make_quantiles(flow, flat, limits, tolerance)
-        kept = _quantiles[flow] = (state, made)
-    if kept[1] is None:
-        return None
-    rows, table = kept[1]
-    drawn = torch.randn(flat.shape, generator=generator, dtype=flat.dtype, device=flat.device)
-    for start in range(0, flat.numel(), _CHUNK):
-        piece = drawn[start : start + _CHUNK]
-        piece.copy_(_quantile(rows, table, flat[start : start + _CHUNK], piece))
-    return drawn.reshape(signal.shape)
-
-
-def _make_quantiles(
-    flow: nn.Module, signal: Tensor, limits: tuple[float, ...], tolerance: float
-) -> tuple[Rows, Tensor] | None:
-    if not all(map(math.isfinite, limits)):
-        return None
-    picked = signal[:: max(1, signal.numel() // 2048)]
-    latent = torch.randn(picked.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(picked)
-    distribution = flow(picked)
-    exact, scale = distribution.from_latent(latent), distribution.stddev
-    root = RootScale.of(flow, *_apart(*limits), signal)
-    for num_rows, num_columns in ((64, 512), (128, 1024), (256, 2048)):
-        rows = Rows(root, num_rows)
-        signals = rows.signals(signal)
-        nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, num_columns, dtype=torch.float64).to(signal)
-        table = (flow(signals).from_latent(nodes.expand(num_rows, -1)) - signals)[None, None].contiguous()
-        if mean_error(_quantile(rows, table, picked, latent) / scale, exact / scale) <= tolerance:
-            return rows, table
-    return None
-
-
-def _quantile(rows: Rows, table: Tensor, signal: Tensor, latent: Tensor) -> Tensor:
-    grid = torch.empty(signal.numel(), 2, dtype=signal.dtype, device=signal.device)
-    torch.mul(latent, 1 / _LATENT_LIMIT, out=grid[:, 0])
-    rows.position(rows.scale.signal(signal), grid[:, 1])
-    return signal + interpolate(table, grid)[0]
+    """What shows whether a model, and the range of its inputs, are still those that something was computed for."""
+    return (*limits, fingerprint(noise_model))

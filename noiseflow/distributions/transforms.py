@@ -194,8 +194,7 @@ class Spline:
         inner = knots[..., 1:-1]
         if self.row is None or self.weight is None:
             return inner
-        left, right = inner[self.row], inner[self.row + 1]
-        return torch.lerp(left, right, self.weight.detach()[..., None])
+        return between_rows(inner, self.row, self.weight.detach())
 
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
         """The knots of the given numbers."""

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
+from noiseflow.distributions.numerical import as_noise_distribution
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -150,7 +151,9 @@ def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) ->
         found: Given = lazy.log_prob(observation).astype(float)
         return found
     pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
-    return alike(torch.cat([noise_model(s).log_prob(o).double().cpu() for s, o in pieces]), signal)
+    return alike(
+        torch.cat([as_noise_distribution(noise_model(s)).log_prob(o).double().cpu() for s, o in pieces]), signal
+    )
 
 
 def divergence(
@@ -184,7 +187,9 @@ def residual_masses(
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
     bounds = level[:, None] + edges.to(signal)[None, :]
     parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
-    log_mass = torch.cat([noise_model(s[:, None]).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts])
+    log_mass = torch.cat(
+        [as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts]
+    )
     mass = torch.exp(log_mass.double()).cpu().T @ (weight / weight.sum())
     return (mass / mass.sum()).numpy()
 
@@ -252,7 +257,7 @@ def probability_integral_transform(
     values = []
     pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
     for s, o in pieces:
-        distribution = noise_model(s)
+        distribution = as_noise_distribution(noise_model(s))
         values.append(torch.stack([distribution.cdf_below(o), distribution.cdf(o)]).double().cpu().numpy())
     below, at = np.concatenate(values, axis=1)
     return np.asarray(below + random.random(below.shape) * np.maximum(at - below, 0))
@@ -317,6 +322,6 @@ def kl_divergence(
     """
     signal = floating(signal)
     generator = torch.Generator(signal.device).manual_seed(seed)
-    observation = truth(signal).sample(generator=generator)
+    observation = as_noise_distribution(truth(signal)).sample(generator=generator)
     difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)
     return float(difference.mean()), float(difference.std(correction=0)) / math.sqrt(difference.numel())

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import floating
 from noiseflow.described import described
+from noiseflow.distributions.numerical import as_noise_distribution
 from noiseflow.distributions.picked import needs_image
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.scan_noise import ScanDistribution
@@ -96,7 +97,7 @@ def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDAr
     bad = ~(torch.isfinite(signal) & torch.isfinite(observation))
     random = np.random.default_rng(0)
     if needs_image(noise_model):
-        distribution = noise_model(torch.where(bad, signal[~bad].mean(), signal))
+        distribution = as_noise_distribution(noise_model(torch.where(bad, signal[~bad].mean(), signal)))
         value = torch.where(bad, observation[~bad].mean(), observation)
         both = (
             distribution.conditional_cdf(value)

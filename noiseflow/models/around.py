@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.numerical import as_noise_distribution
 from noiseflow.distributions.picked import Signal, values_of
 from noiseflow.models.base import NoiseModelBase
 
@@ -97,8 +98,7 @@ class ForeignModel(NoiseModelBase):
         self.module = module
 
     def forward(self, signal: Signal) -> NoiseDistribution:
-        found: NoiseDistribution = self.module(values_of(signal))
-        return found
+        return as_noise_distribution(self.module(values_of(signal)))
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
         """That of the module, where it has one of its own."""

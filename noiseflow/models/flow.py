@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import LatentDistribution, normal_quadrature
 from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
@@ -110,7 +109,7 @@ def signal_nodes(like: Tensor) -> Tensor:
 def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Number of the node below each signal coordinate, and the weight of the node above."""
     position = coordinate * (_NUM_NODES - 1)
-    row = position.detach().floor().clamp(0, _NUM_NODES - 2).long()
+    row = torch.nan_to_num(position.detach()).floor().clamp(0, _NUM_NODES - 2).long()
     return row, (position - row).to(dtype)
 
 
@@ -263,13 +262,20 @@ def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, T
 class FlowDistribution(LatentDistribution):
     """The distribution that a `ConditionalFlow` returns; its parameters are computed when first needed."""
 
-    def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
-        super().__init__(signal.shape)
-        self._flow, self._signal, self._windows = flow, signal, windows
+    per_pixel = ("_signal", "_windows")
 
-    @cached_property
+    def __init__(self, flow: ConditionalFlow, signal: Tensor, windows: Tensor | None = None) -> None:
+        super().__init__(signal.shape, like=signal)
+        self._flow, self._signal, self._windows = flow, self.clean(signal), windows
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The flow and the signal; none where pixels look at their neighbours."""
+        return (self._flow, self._signal) if self._windows is None else None
+
+    @property
     def _parameters(self) -> tuple[Tensor, Tensor, list[Transform]]:
-        return self._flow.parameters_at(self._signal, self._windows)
+        return self.once(lambda: self._flow.parameters_at(self._signal, self._windows))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters
@@ -283,21 +289,6 @@ class FlowDistribution(LatentDistribution):
     def from_latent(self, latent: Tensor) -> Tensor:
         location, log_scale, transforms = self._parameters
         return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        found = tabulated.automatic_log_prob(self._flow, self._signal, value)
-        return super().log_prob(value) if found is None else found
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        signal = self._signal.expand((*sample_shape, *self.batch_shape))
-        if self._flow.tabulate and self._windows is None and signal.numel() >= tabulated.LARGE:
-            found = tabulated.sample(self._flow, signal, generator)
-            if found is not None:
-                return found
-        return super().sample(sample_shape, generator)
-
-    def _like(self) -> Tensor:
-        return self._signal
 
 
 class RadialFlow(ConditionalFlow):

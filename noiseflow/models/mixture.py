@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import tabulated
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval
+from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval, normal_quadrature
 from noiseflow.distributions.transforms import between_rows
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
@@ -20,6 +18,7 @@ from noiseflow.models.standardisation import Standardisation
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _BISECTIONS = 60
 _FEW = 4  # components
+_COMPONENT_NODES = 101  # of each Gaussian
 _SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
 
 
@@ -125,15 +124,22 @@ class MixtureDistribution(NoiseDistribution):
         model: the noise model it comes from, for the tables of large inputs.
     """
 
+    per_pixel = ("signal",)
+
     def __init__(
         self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: NoiseModelBase
     ) -> None:
-        super().__init__(signal.shape)
-        self.signal, self._components_at, self._model = signal, components_at, model
+        super().__init__(signal.shape, like=signal)
+        self.signal, self._components_at, self._model = self.clean(signal), components_at, model
 
-    @cached_property
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The model and the signal, where the model allows tables."""
+        return (self._model, self.signal) if getattr(self._model, "tabulate", False) else None
+
+    @property
     def _components(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._components_at(self.signal)
+        return self.once(lambda: self._components_at(self.signal))
 
     @property
     def log_weight(self) -> Tensor:
@@ -154,9 +160,6 @@ class MixtureDistribution(NoiseDistribution):
         return (value[..., None] - self.means) * torch.exp(-self.log_scale)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        found = tabulated.automatic_log_prob(self._model, self.signal, value)
-        if found is not None:
-            return found
         z = self._standard(value)
         return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - _LOG_SQRT_2PI
 
@@ -197,19 +200,23 @@ class MixtureDistribution(NoiseDistribution):
         return found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        if self._model.tabulate and self.signal.numel() * math.prod(sample_shape) >= tabulated.LARGE:
-            found = tabulated.sample(self._model, self.signal.expand((*sample_shape, *self.batch_shape)), generator)
-            if found is not None:
-                return found
-        with torch.no_grad():
-            shape = (*sample_shape, *self.batch_shape)
-            dtype, device = self.means.dtype, self.means.device
-            uniform = torch.rand(shape, generator=generator, dtype=dtype, device=device)
-            chosen = (uniform[..., None] > self.log_weight.exp().cumsum(-1))[..., :-1].sum(-1, keepdim=True)
-            full = (*shape, self.means.shape[-1])
-            means, log_scale = (each.expand(full).gather(-1, chosen)[..., 0] for each in (self.means, self.log_scale))
-            normal = torch.randn(shape, generator=generator, dtype=dtype, device=device)
-            return means + log_scale.exp() * normal
+        shape = (*sample_shape, *self.batch_shape)
+        dtype, device = self.means.dtype, self.means.device
+        uniform = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+        chosen = (uniform[..., None] > self.log_weight.exp().cumsum(-1))[..., :-1].sum(-1, keepdim=True)
+        full = (*shape, self.means.shape[-1])
+        means, log_scale = (each.expand(full).gather(-1, chosen)[..., 0] for each in (self.means, self.log_scale))
+        normal = torch.randn(shape, generator=generator, dtype=dtype, device=device)
+        return means + log_scale.exp() * normal
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        shape = (-1, *(1,) * self.means.ndim)
+        nodes, weights = (
+            each.to(self.means).view(shape) for each in normal_quadrature(torch.float64, count=_COMPONENT_NODES)
+        )
+        places = self.means + torch.exp(self.log_scale) * nodes
+        share = torch.exp(self.log_weight) * weights
+        return places.movedim(-1, 1).flatten(0, 1), share.movedim(-1, 1).flatten(0, 1)
 
     @property
     def mean(self) -> Tensor:

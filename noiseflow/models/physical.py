@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
+from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
 from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
@@ -103,75 +102,3 @@ class PoissonGaussian(NoiseModelBase):
     def extra_repr(self) -> str:
         gain, offset, read_noise = (float(each.detach()) for each in self._parameters_now())
         return f"gain={gain:.5g}, offset={offset:.5g}, read_noise={read_noise:.4g}"
-
-
-class PoissonGaussianDistribution(NoiseDistribution):
-    """Distribution of gain·(k + read_noise·n) + offset.
-
-    Args:
-        signal: clean readings, detector units.
-        gain, offset, read_noise: scalars, float64.
-    """
-
-    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
-        super().__init__(signal.shape)
-        self.signal, self.gain, self.offset, self.read_noise = signal, gain, offset, read_noise
-        self.rate = (signal.double() - offset).clamp(min=0) / gain
-
-    def electrons(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals and rates of observations, electrons, float64."""
-        residual = (value.double() - self.signal.double()) / self.gain
-        return residual, self.rate.expand_as(residual)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        residual, rate = self.electrons(value)
-        return self._as(value, log_density(residual, rate, self.read_noise) - torch.log(self.gain))
-
-    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
-        return log_both_tails(*self.electrons(value), self.read_noise)
-
-    def cdf(self, value: Tensor) -> Tensor:
-        return self._as(value, self.log_both_tails(value)[0].exp())
-
-    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        bottom, top = self._bounds(low, high)
-        return self._as(low, log_interval(bottom, top, self.rate.expand_as(bottom), self.read_noise))
-
-    def _bounds(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals of bounds, electrons; an infinite one moves to where nothing is left beyond it, without a gradient."""
-        finite = [torch.isfinite(value) for value in (low, high)]
-        (bottom, rate), (top, _) = (
-            self.electrons(torch.where(known, value, torch.zeros_like(value)))
-            for known, value in zip(finite, (low, high), strict=True)
-        )
-        end = (40 * torch.sqrt(rate + self.read_noise**2) + 100).detach()
-        least = torch.where(finite[1], torch.minimum(top.detach() - end, -end), -end)
-        most = torch.where(finite[0], torch.maximum(bottom.detach() + end, end), end)
-        return torch.where(finite[0], bottom, torch.where(low > 0, most, least)), torch.where(
-            finite[1], top, torch.where(high > 0, most, least)
-        )
-
-    def icdf(self, value: Tensor) -> Tensor:
-        reach = 40 * self.variance.sqrt().double() + 40 * self.gain
-        middle = self.mean.double() + 0 * value
-        return self._as(value, bisect_quantile(self, value.double(), middle - reach, middle + reach))
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        with torch.no_grad():
-            rate = self._as(self.signal, self.rate).expand((*sample_shape, *self.batch_shape))
-            normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
-            gain, read_noise = (self._as(self.signal, each) for each in (self.gain, self.read_noise))
-            noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(read_noise)).mul_(gain)
-            return noise.add_(self.signal)
-
-    def _as(self, like: Tensor, result: Tensor) -> Tensor:
-        return result.to(torch.promote_types(like.dtype, self.signal.dtype))
-
-    @property
-    def mean(self) -> Tensor:
-        return self.signal
-
-    @property
-    def variance(self) -> Tensor:
-        return self._as(self.signal, self.gain**2 * (self.rate + self.read_noise**2))

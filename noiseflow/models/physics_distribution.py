@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import (
     NoiseDistribution,
     log_normal_cdf,
@@ -16,9 +15,11 @@ from noiseflow.distributions.base import (
     normal_hazard,
 )
 from noiseflow.distributions.electrons import log_density, log_tail
+from noiseflow.distributions.normal import hazard_of
+from noiseflow.distributions.pixelwise import pixelwise
+from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
 from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
-from noiseflow.models.physical import PoissonGaussianDistribution
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _MAX_INVERSION_STEPS = 80
@@ -32,13 +33,26 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     Args:
         base: the detector's distribution.
-        transforms: increasing maps from the detector's latent to this model's, in order.
+        maps: gives at a signal the increasing maps from the detector's latent to this model's, in order.
         model: the `PhysicsFlow` it comes from, for the tables of large inputs.
     """
 
-    def __init__(self, base: PoissonGaussianDistribution, transforms: Sequence[Transform], *, model: nn.Module) -> None:
-        super().__init__(base.batch_shape)
-        self.base, self._transforms, self._model = base, transforms, model
+    per_pixel = ()
+
+    def __init__(
+        self, base: PoissonGaussianDistribution, maps: Callable[[Tensor], Sequence[Transform]], *, model: nn.Module
+    ) -> None:
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base, self._maps, self._model = base, maps, model
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The model and the signal."""
+        return self._model, self.base.signal
+
+    @property
+    def _transforms(self) -> Sequence[Transform]:
+        return self.once(lambda: self._maps(self.base.signal))
 
     def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """The mapped latent, and the log-density of this model over that of the detector."""
@@ -50,8 +64,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def _detector_latent(self, value: Tensor) -> Tensor:
         finite = torch.isfinite(value)
-        residual, rate = self.base.electrons(torch.where(finite, value, torch.zeros_like(value)))
-        latent = detector_latent(residual, rate, self.base.read_noise)
+        latent = pixelwise(_latent, torch.where(finite, value, torch.zeros_like(value)), *self.base.law)
         return torch.where(finite, latent, value.to(latent))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,22 +81,22 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def _invert(self, target: Tensor) -> Tensor:
         rate = self.base.rate.expand_as(target)
-        residual = invert_latent(target.flatten(), rate.flatten(), self.base.read_noise).reshape(target.shape)
+        nothing = torch.isnan(rate + target)
+        known = [torch.where(nothing, torch.zeros_like(each), each).flatten() for each in (target, rate)]
+        residual = invert_latent(known[0], known[1], self.base.read_noise).reshape(target.shape)
+        residual = torch.where(nothing, torch.full_like(residual, math.nan), residual)
         return residual * self.base.gain + self.base.mean.double()
 
     def detector_part(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The detector's latent and log-density."""
-        residual, rate = self.base.electrons(value)
-        density = log_density(residual, rate, self.base.read_noise) - torch.log(self.base.gain)
-        return self._detector_latent(value), density
+        return self._detector_latent(value), self.base.log_prob(value.double())
 
     def _log_prob(self, value: Tensor) -> Tensor:
         latent, density = self.detector_part(value)
         return density + self.correct(latent)[1]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        found = tabulated.automatic_log_prob(self._model, self.base.signal, value)
-        return self._log_prob(value).to(value.dtype) if found is None else found
+        return self._log_prob(value)
 
     def cdf(self, value: Tensor) -> Tensor:
         probability: Tensor = torch.special.ndtr(self._mapped_bound(self._detector_latent(value)))
@@ -147,6 +160,13 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
 
 
+def _latent(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    residual, rate = in_electrons(value, signal, gain, offset)
+    return detector_latent(residual, rate, read_noise, twice=twice)
+
+
 @torch.no_grad()
 def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
     """Residuals, electrons, that cover the readings of signals (G, 1) as finely as the read noise asks, and their latents.
@@ -168,10 +188,10 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
     return residual, detector_latent(residual, rate[:, None].expand_as(residual), base.read_noise)
 
 
-def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
     """Φ⁻¹(P(reading ≤ residual)), of residuals in electrons."""
     side = torch.where(residual.detach() > 0, -1.0, 1.0).to(residual)
-    return side * ndtri_exp(log_tail(residual, rate, read_noise))
+    return side * ndtri_exp(log_tail(residual, rate, read_noise, twice=twice), twice=twice)
 
 
 @torch.no_grad()
@@ -198,13 +218,19 @@ def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     return result
 
 
-def ndtri_exp(log_probability: Tensor) -> Tensor:
-    """Φ⁻¹(exp(log_probability)), accurate and differentiable however small the probability."""
+def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
+    """Φ⁻¹(exp(log_probability)), accurate and differentiable however small the probability; twice only if asked for."""
     with torch.no_grad():
         deep = log_probability < -200
         far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
         start = torch.special.ndtri(torch.exp(torch.where(deep, -1.0, log_probability)))
         z = torch.where(deep, -torch.sqrt(far - torch.log(2 * math.pi * far)), start)
         z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
-        hazard = normal_hazard(z)
-    return z - (log_normal_cdf(z) - log_probability) / hazard
+        if not twice:
+            hazard = normal_hazard(z)
+    if not twice:
+        return z - (log_normal_cdf(z) - log_probability) / hazard
+    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(
+        z
+    )  # the first step has the slope, the second the curvature
+    return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)

@@ -53,7 +53,7 @@ class PhysicsFlow(NoiseModelBase):
 
     def forward(self, signal: Tensor) -> PhysicsFlowDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
-        return PhysicsFlowDistribution(self.detector(signal), self._maps(signal), model=self)
+        return PhysicsFlowDistribution(self.detector(signal), self._maps, model=self)
 
     def _maps(self, signal: Tensor) -> list[Transform]:
         coordinate = self.correction.standardisation.coordinate(signal)

@@ -117,8 +117,12 @@ class ScanDistribution(NoiseDistribution):
         axis: the axis along which they are shared, −1 or −2.
     """
 
+    independent = False
+    takes_missing = True
+    per_pixel = ()
+
     def __init__(self, base: NoiseDistribution, scale: Tensor, axis: int) -> None:
-        super().__init__(base.batch_shape)
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
         self.base, self.scale, self.axis = base, scale, axis
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -180,6 +184,11 @@ class ScanDistribution(NoiseDistribution):
         residual = torch.where(present, value - self.base.mean, 0.0)
         total = precision.sum(self.axis, keepdim=True) + 1 / self.scale**2
         centre, width = (precision * residual).sum(self.axis, keepdim=True) / total, total**-0.5
+        if not bool(torch.isfinite(centre).all()):
+            raise ValueError(
+                "a signal is NaN or infinite, or an observation infinite: its whole line has no likelihood; fill the signal, and "
+                "set observations that are missing to NaN"
+            )
         t = torch.linspace(-2.5, 2.5, 13, dtype=centre.dtype, device=centre.device)
         t = t.reshape(-1, *(1 for _ in centre.shape))
         for _ in range(2):  # the estimate by moments is not the mode where the noise is not Gaussian
@@ -216,12 +225,29 @@ class ScanDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Draw readings; every row (or column) of every image has an offset of its own."""
-        with torch.no_grad():
-            shape = [*sample_shape, *self.batch_shape]
-            shape[self.axis] = 1
-            like = self.scale
-            offset = self.scale * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
-            return self._shifted(offset).sample(generator=generator)
+        return self._shifted(self._draw_offsets(sample_shape, generator)).sample(generator=generator)
+
+    def _draw_offsets(self, sample_shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
+        shape = [*torch.Size(sample_shape), *self.batch_shape]
+        shape[self.axis] = 1
+        like = self.scale
+        return like * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
+
+    def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        """Differentiable draws; see `NoiseDistribution.rsample`."""
+        offset = self._draw_offsets(sample_shape, generator)
+        return self.cast(self._shifted(offset).rsample(generator=generator))
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        """Not of pixels that depend on each other.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(
+            "pixels that share an offset depend on each other: expectations, entropy and mode of single ones are those of the "
+            "model inside, model.model(signal)"
+        )
 
     @property
     def mean(self) -> Tensor:

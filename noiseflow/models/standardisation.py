@@ -117,17 +117,22 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:
     """Interpolate a (K,) table of equally spaced values linearly at coordinates in [0, 1]."""
     position = coordinate * (table.shape[0] - 1)
-    index = position.detach().floor().clamp(0, table.shape[0] - 2).long()
-    left = table[index]
-    return left + (position - index) * (table[index + 1] - left)
+    index = torch.nan_to_num(position.detach()).floor().clamp(0, table.shape[0] - 2).long()
+    left = _taken(table, index)
+    return left + (position - index) * (_taken(table, index + 1) - left)
+
+
+def _taken(table: Tensor, index: Tensor) -> Tensor:
+    """``table[index]``, which ``torch.func.vmap`` does not take for single numbers."""
+    return table.index_select(0, index.reshape(-1)).reshape(index.shape)
 
 
 def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
     """Interpolate a (K,) table of equally spaced values by local cubics (four points) at coordinates in [0, 1]."""
     position = coordinate * (table.shape[0] - 1)
-    index = position.detach().floor().clamp(1, table.shape[0] - 3).long()
+    index = torch.nan_to_num(position.detach()).floor().clamp(1, table.shape[0] - 3).long()
     p = position - index
-    a, b, c, d = (table[index + k] for k in (-1, 0, 1, 2))
+    a, b, c, d = (_taken(table, index + k) for k in (-1, 0, 1, 2))
     return (
         a * (-p * (p - 1) * (p - 2) / 6)
         + b * ((p + 1) * (p - 1) * (p - 2) / 2)

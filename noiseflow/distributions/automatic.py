@@ -1,0 +1,230 @@
+"""Likelihoods and samples of large inputs from tables that the library keeps, where no gradient is asked for.
+
+A table is found by the contents of the model's parameters (`fingerprint`), its number type and device, so that it cannot be
+stale however they were changed. It grows where signals leave it. Each pixel's error is bounded: nodes whose neighbourhood is too
+curved for linear interpolation are NaN, and pixels beside them, or beyond the table's edges, are evaluated exactly.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.fingerprint import fingerprint
+from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.tables import Table, Values
+from noiseflow.distributions.tabulated import RootScale
+
+LARGE = 2**18
+"""Inputs of at least so many pixels are tabulated where no gradient is asked for."""
+
+SIZES = ((64, 1024), (128, 2048), (256, 4096))
+TOLERANCE = 1e-3
+"""Largest interpolation error: nats of a log-likelihood, standard deviations of a sample."""
+
+_LATENT_LIMIT = 6.5  # standard normal: one draw in 10¹⁰ lies beyond, and is computed exactly
+_TAIL = 1e-6  # probability beyond the columns, each side, under the model
+_SAMPLE = 2**14  # pixels that judge a table before all are looked up
+_FEW, _MANY = 0.02, 0.3  # shares of pixels left to exact evaluation: good enough to stop refining, too many for a table
+_KEPT = 4  # tables of each model: number types, and likelihood and quantiles
+
+_tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
+
+
+def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
+    """Whether a table may take the place of the exact likelihood: many pixels, no gradient asked for, the model allows it."""
+    if observation.numel() < LARGE or signal.shape != observation.shape or is_traced(observation):
+        return False
+    differentiable = torch.is_grad_enabled() and (
+        signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
+    )
+    return not differentiable and may_tabulate(noise_model)
+
+
+def may_tabulate(noise_model: nn.Module) -> bool:
+    """Whether all parts of the model allow tables, and none looks beyond single pixels."""
+    return all(getattr(module, "tabulate", True) for module in noise_model.modules()) and not needs_image(noise_model)
+
+
+def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
+    """`log_prob` from a table where the input is large enough and a table is accurate; else None."""
+    return log_prob(noise_model, signal, observation) if is_large(noise_model, signal, observation) else None
+
+
+@torch.no_grad()
+def log_prob(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE
+) -> Tensor | None:
+    """Log-likelihood of many pixels to `tolerance` nats each, shaped like `observation`; None where no table is accurate.
+
+    Args:
+        noise_model: the model.
+        signal, observation: equal shapes, detector units.
+        tolerance: bound of each pixel's interpolation error, nats.
+    """
+    s, o = signal.reshape(-1), observation.reshape(-1)
+    free, low, high = _without_limits(noise_model)
+    clipped = math.isfinite(low) or math.isfinite(high)
+    slack = _slack(noise_model, o.dtype)
+    inner = (o > low + slack) & (o < high - slack) if clipped else None
+    judged = _spread(torch.nonzero(inner)[:, 0] if inner is not None else torch.arange(o.numel(), device=o.device))
+    if judged.numel() == 0:
+        return None
+
+    def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
+        start, stop = _residuals(free, scale, s)
+        across = torch.linspace(start, stop, count, dtype=torch.float64, device=s.device)
+
+        def values(signals: Tensor) -> Tensor:
+            found: Tensor = free(signals).log_prob(scale.inverse(scale.observation(signals) + across))
+            return found
+
+        return across, values
+
+    def place(scale: RootScale, some: Tensor, seen: Tensor) -> Tensor:
+        return scale.observation(seen) - scale.observation(some)
+
+    kept = _table_of(
+        noise_model, ("log_prob", tolerance), s, judged, columns, lambda scale, at: place(scale, s[at], o[at])
+    )
+    if kept is None:
+        return None
+    found = kept.look_up(s, lambda part: place(kept.scale, s[part], o[part]))
+    if inner is not None:
+        found = torch.where(inner, found, torch.full_like(found, math.nan))
+        for limit in (low, high):
+            _on_limit(noise_model, kept, s, torch.nonzero((o - limit).abs() <= slack)[:, 0], limit, found)
+    exact = _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at]))
+    return exact.reshape(observation.shape)
+
+
+def _slack(noise_model: nn.Module, dtype: torch.dtype) -> float:
+    """How near to a clipping limit an observation is on it; see `DigitisedDistribution`."""
+    limits = [abs(getattr(noise_model, name, 0.0)) for name in ("low", "high")]
+    largest = max((limit for limit in limits if math.isfinite(limit)), default=0.0)
+    return max(1e-3 * float(getattr(noise_model, "step", 0.0)), 8 * torch.finfo(dtype).eps * largest)
+
+
+def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit: float, found: Tensor) -> None:
+    """There the likelihood is a function of the signal alone."""
+    if not (math.isfinite(limit) and on.numel()):
+        return
+    beside = table.beside(limit, lambda at: noise_model(at).log_prob(torch.full_like(at, limit)))
+    found[on] = beside.look_up(s[on], None)
+
+
+def _without_limits(noise_model: nn.Module) -> tuple[nn.Module, float, float]:
+    """The model without clipping, whose likelihood is smooth, and the limits."""
+    low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
+    free = noise_model.without_rails() if hasattr(noise_model, "without_rails") else noise_model  # type: ignore[operator]
+    return free, low, high
+
+
+def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
+    """Range of residuals on the scale between far quantiles of the model."""
+    signals = torch.linspace(scale.low, scale.high, 65, dtype=torch.float64).to(like)
+    distribution = free(signals)
+    tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
+    low, high = (scale.observation(tail.double()) - scale.observation(signals.double()) for tail in tails)
+    return float(low.min()), float(high.max())
+
+
+@torch.no_grad()
+def sample(
+    noise_model: nn.Module, signal: Tensor, generator: torch.Generator | None, *, tolerance: float = TOLERANCE
+) -> Tensor | None:
+    """Draw one observation per pixel by a table of quantiles over (signal, normal latent); None where none is accurate.
+
+    Args:
+        noise_model: its distribution has ``from_latent``.
+        signal: any shape.
+        generator: source of the random numbers.
+        tolerance: bound of the interpolation error of each draw, in standard deviations of the noise.
+    """
+    flat = signal.reshape(-1)
+    judged = _spread(torch.arange(flat.numel(), device=flat.device))
+    tried = torch.randn(judged.shape, generator=torch.Generator().manual_seed(0)).to(flat)
+
+    def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
+        nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, count // 2, dtype=torch.float64, device=flat.device)
+
+        def values(signals: Tensor) -> Tensor:
+            found: Tensor = noise_model(signals).from_latent(nodes.expand(signals.shape[0], -1)) - signals
+            return found
+
+        return nodes, values
+
+    def unit(signals: Tensor) -> Tensor:
+        width: Tensor = noise_model(signals).stddev
+        return width
+
+    kept = _table_of(noise_model, ("sample", tolerance), flat, judged, columns, lambda scale, at: tried, unit)
+    if kept is None:
+        return None
+    latent = torch.randn(flat.shape, generator=generator, dtype=flat.dtype, device=flat.device)
+    drawn = kept.look_up(flat, lambda part: latent[part]).add_(flat)
+    return _exact_where_missing(drawn, lambda at: noise_model(flat[at]).from_latent(latent[at])).reshape(signal.shape)
+
+
+def _spread(index: Tensor) -> Tensor:
+    return index[:: max(1, index.numel() // _SAMPLE)]
+
+
+def _table_of(
+    noise_model: nn.Module,
+    kind: tuple[Any, ...],
+    signal: Tensor,
+    judged: Tensor,
+    columns: Callable[[RootScale, int], tuple[Tensor, Values]],
+    place: Callable[[RootScale, Tensor], Tensor],
+    unit: Values | None = None,
+) -> Table | None:
+    """The kept table, grown to the signals, or a new one; None where none leaves few enough pixels to exact evaluation."""
+    low, high = (float(bound) for bound in torch.aminmax(signal))
+    if not math.isfinite(low + high):
+        return None
+    key = (*kind, fingerprint(noise_model), signal.dtype, signal.device)
+    kept = _tables.setdefault(noise_model, {})
+
+    def share_missing(table: Table) -> float:
+        return float(
+            torch.isnan(table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])).float().mean()
+        )
+
+    table = kept.get(key)
+    if table is not None:
+        across, values = columns(
+            table.scale, table.columns.numel() if kind[0] == "log_prob" else 2 * table.columns.numel()
+        )
+        if table.cover(low, high, values, unit):
+            return table if share_missing(table) <= _MANY else None
+    found = None
+    for num_rows, num_columns in SIZES:
+        if num_rows * num_columns > max(LARGE, signal.numel()):
+            break
+        scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())
+        across, values = columns(scale, num_columns)
+        table = Table(scale, num_rows, across, tolerance=kind[1])
+        table.cover(low, high, values, unit)
+        missing = share_missing(table)
+        found = table if missing <= _MANY else found
+        if missing <= _FEW:
+            break
+    if found is not None:
+        kept[key] = found
+    while len(kept) > _KEPT:
+        kept.pop(next(iter(kept)))
+    return found
+
+
+def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Tensor:
+    missing = torch.nonzero(torch.isnan(found))[:, 0]
+    for at in torch.split(missing, LARGE // 2):
+        found[at] = exact(at).to(found)
+    return found

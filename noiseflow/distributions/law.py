@@ -1,0 +1,223 @@
+"""What a noise model returns: a distribution of one observation per pixel, given that pixel's signal."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from noiseflow.distributions.answers import answering
+from noiseflow.distributions.expectations import mode_of, panels
+from noiseflow.distributions.pixels import Pixels, Taking
+
+_PANELS, _TAIL = 512, 1e-10  # of the default quadrature: panels of four nodes between the quantiles of this probability
+
+
+class NoiseDistribution(Pixels, Distribution):
+    """p(observation | signal), one observation per pixel: ``batch_shape`` is the signal's, ``event_shape`` is ().
+
+    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf`, `sample`, `mean` and `variance`. What it
+    writes answers like every other noise distribution: numbers and tensors of any real type are taken, half precision is
+    computed in single precision, the answer has the type that signal and observation promote to, NaN gives NaN, an infinite
+    observation has log-density −inf, large inputs are evaluated in pieces of bounded memory.
+
+    Args:
+        shape: batch shape, that of the signal.
+        like: a tensor with the number type and device of the answers: the signal.
+    """
+
+    has_rsample: ClassVar[bool] = True  # type: ignore[misc]
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+    discrete: ClassVar[bool] = False
+
+    def __init__(self, shape: torch.Size, *, like: Tensor | None = None) -> None:
+        super().__init__(shape, torch.Size(), validate_args=False)
+        self._set_kind(like)
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        answering(cls)
+
+    @abstractmethod
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density in nats per detector unit; of a digitised model, log-mass."""
+
+    @abstractmethod
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        """log P(low < observation ≤ high), accurate far into both tails; the bounds may be infinite."""
+
+    @abstractmethod
+    def cdf(self, value: Tensor) -> Tensor:
+        """P(observation ≤ value)."""
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        """P(observation < value); differs from `cdf` only where single values have mass."""
+        return self.cdf(value)
+
+    @abstractmethod
+    def icdf(self, value: Tensor) -> Tensor:
+        """The quantile: smallest observation whose CDF reaches `value`."""
+
+    @abstractmethod
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        """Draw observations, ``(*sample_shape, *batch_shape)``."""
+
+    def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        """Draw observations that are differentiable, once, in signal and parameters.
+
+        The draw stays at its place in the CDF: do/dθ = −(∂F/∂θ)/p (Figurnov et al. 2018, arXiv:1805.08498).
+
+        Raises:
+            NotImplementedError: single values have mass, so that a draw cannot move with a parameter.
+        """
+        if not self.has_rsample:
+            raise NotImplementedError(
+                f"{type(self).__name__}: observations are discrete and have no derivative; use sample(), or log_prob of the draws"
+            )
+        drawn = self.sample(sample_shape, generator=generator)
+        missing, slope = self._place(drawn)
+        return drawn - (missing - missing.detach()) / slope.detach()
+
+    def _place(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The place of an observation in the distribution and its derivative, for `rsample`."""
+        return self.cdf(value), torch.exp(self.log_prob(value))
+
+    def rescaled(self, scale: Tensor, shift: Tensor) -> NoiseDistribution:
+        """The distribution of scale·o + shift; a digitised one rounds and clips after that. Both broadcast with the batch."""
+        return RescaledDistribution(self, scale, shift)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The least and the greatest possible observation, which may be infinite."""
+        infinity = torch.full((), math.inf, dtype=self.working_dtype, device=self.device)
+        return -infinity, infinity
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Which observations are possible."""
+        return constraints.real
+
+    @property
+    def mode(self) -> Tensor:
+        """The likeliest observation, to 1/1000 of the spacing of the quadrature's nodes."""
+        return self.cast(mode_of(self))
+
+    def entropy(self) -> Tensor:
+        """−E[log p], nats, by quadrature; the integral is over the density between clipping limits and a sum over masses."""
+        return self.cast(-self.expectation(self.log_prob))
+
+    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+        """E[function(observation)] by quadrature, shape of the batch; the function takes observations (Q, *batch)."""
+        nodes, weights = self.quadrature()
+        values = function(nodes)  # infinite at impossible ones
+        return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        """Nodes and weights (Q, *batch) of expectations: Gauss–Legendre's rule on panels between far quantiles."""
+        ends = (
+            self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())),
+            self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)),
+        )
+        return self.panels(ends[0].double(), ends[1].double(), _PANELS)
+
+    def panels(self, low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Nodes and weights (4·count, *batch) of the integral over the density between two bounds."""
+        nodes, lengths = panels(low.detach(), high.detach(), count)
+        weights = lengths * torch.exp(self.log_prob(nodes))
+        return nodes, weights / weights.detach().sum(0)
+
+
+def bisect_quantile(
+    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 60
+) -> Tensor:
+    """The quantile by bisection between bounds that bracket it, for distributions without a closed form."""
+    with torch.no_grad():
+        low, high = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
+        for _ in range(num_steps):
+            middle = low + (high - low) / 2
+            above = distribution.cdf(middle) >= value
+            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+        return high
+
+
+class RescaledDistribution(NoiseDistribution):
+    """The distribution of scale·o + shift, o from another noise distribution.
+
+    Args:
+        base: distribution of o.
+        scale, shift: positive numbers and numbers that broadcast with the batch of `base`; new axes may only lead.
+    """
+
+    def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
+        shape = torch.broadcast_shapes(base.batch_shape, scale.shape, shift.shape)  # type: ignore[no-untyped-call]
+        super().__init__(shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base, self.scale, self.shift = base, scale, shift
+
+    @property
+    def independent(self) -> bool:  # type: ignore[override]
+        """Whether pixels may be evaluated apart."""
+        return self.base.independent
+
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """Whether every observation has a mass."""
+        return self.base.discrete
+
+    @property
+    def has_rsample(self) -> bool:  # type: ignore[override]
+        """Whether draws have a derivative."""
+        return self.base.has_rsample
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        low, high = (end * self.scale.detach() + self.shift.detach() for end in self.base.limits)
+        return low, high
+
+    def mapped(self, take: Taking, shape: torch.Size) -> Self:
+        own = [each.expand(self.batch_shape) for each in (self.scale, self.shift)]
+        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
+        return type(self)(base.mapped(take, shape), *(take(each, ()) for each in own))
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
+        nodes, weights = base.quadrature()
+        return nodes * self.scale + self.shift, weights
+
+    def _back(self, value: Tensor) -> Tensor:
+        finite = torch.isfinite(value)  # the gradient of an infinite bound must not become NaN
+        inside = (torch.where(finite, value, torch.zeros_like(value)) - self.shift) / self.scale
+        return torch.where(finite, inside, value)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.base.log_prob((value - self.shift) / self.scale) - torch.log(self.scale)
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.base.log_interval_prob(self._back(low), self._back(high))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self.base.cdf(self._back(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self.base.cdf_below(self._back(value))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.base.icdf(value) * self.scale + self.shift
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        leading = self.batch_shape[: len(self.batch_shape) - len(self.base.batch_shape)]
+        return (
+            self.base.sample((*sample_shape, *leading), generator=generator) * self.scale.detach() + self.shift.detach()
+        )
+
+    @property
+    def mean(self) -> Tensor:
+        return self.base.mean * self.scale + self.shift
+
+    @property
+    def variance(self) -> Tensor:
+        return self.base.variance * self.scale**2 + torch.zeros_like(self.shift)

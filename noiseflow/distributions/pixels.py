@@ -1,0 +1,157 @@
+"""What every noise distribution knows of its pixels: number type and device, expanding, taking apart."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, ClassVar, Self, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+Kept = TypeVar("Kept")
+Taking = Callable[[Tensor, tuple[int, ...]], Tensor]
+
+
+class Pixels:
+    """A batch of independent pixels.
+
+    Attributes:
+        independent: whether pixels may be evaluated apart from each other.
+        takes_missing: whether `log_prob` itself knows what an observation that is NaN means.
+        light: whether a gradient keeps a few numbers per pixel only, so that nothing is gained by evaluating it in pieces.
+        per_pixel: names of the attributes that hold one value or row of values per pixel; None to take all tensors whose first
+            axes are the batch's.
+    """
+
+    independent: ClassVar[bool] = True
+    takes_missing: ClassVar[bool] = False
+    per_pixel: ClassVar[tuple[str, ...] | None] = None
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The noise model and the signal, where likelihoods of large inputs may be looked up in tables."""
+        return None
+
+    @property
+    def light(self) -> bool:
+        return False
+
+    def _set_kind(self, like: Tensor | None) -> None:
+        floating = like is not None and like.is_floating_point()
+        self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
+        self._given_device = None if like is None else like.device
+        self._computed: dict[bool, Any] = {}
+
+    def once(self, compute: Callable[[], Kept]) -> Kept:
+        """What `compute` gives, computed once with gradients and once without."""
+        key = torch.is_grad_enabled()
+        if key not in self._computed:
+            self._computed[key] = compute()
+        kept: Kept = self._computed[key]
+        return kept
+
+    def _pixels(self) -> Tensor | None:
+        """Some tensor of the batch's shape, of a subclass that has not said what its answers are like."""
+        held = (value for value in vars(self).values() if isinstance(value, Tensor) and value.is_floating_point())
+        return next((value for value in held if value.shape == self.batch_shape), None)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number type of samples, means and variances."""
+        if self._given_dtype is not None:
+            return self._given_dtype
+        pixels = self._pixels()
+        return torch.get_default_dtype() if pixels is None else pixels.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where samples are."""
+        if self._given_device is not None:
+            return self._given_device
+        pixels = self._pixels()
+        return torch.get_default_device() if pixels is None else pixels.device
+
+    @property
+    def working_dtype(self) -> torch.dtype:
+        """The number type of the computation: single precision at least."""
+        return torch.promote_types(self.dtype, torch.float32)
+
+    def working(self, tensor: Tensor) -> Tensor:
+        """A tensor in the number type of the computation, or a wider one of its own."""
+        return tensor.to(torch.promote_types(tensor.dtype, self.working_dtype))
+
+    def clean(self, signal: Tensor) -> Tensor:
+        """A signal in the number type of the computation; NaN where it is not finite, so that all its answers are NaN."""
+        signal = self.working(signal)
+        if is_traced(signal) or not bool(torch.isfinite(signal).all()):
+            return torch.where(torch.isfinite(signal), signal, torch.full_like(signal, math.nan))
+        return signal
+
+    def cast(self, tensor: Tensor) -> Tensor:
+        """An answer in the number type of the signal."""
+        return tensor if self._given_dtype is None else tensor.to(self._given_dtype)
+
+    def anything(self) -> Tensor:
+        """A number of the working type, on the device."""
+        return torch.zeros((), dtype=self.working_dtype, device=self.device)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The signal's shape."""
+        shape: torch.Size = self._batch_shape  # type: ignore[attr-defined]
+        return shape
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Self:
+        """The same distribution for a larger batch; pixels of a new or stretched axis are independent of each other."""
+        shape = torch.Size(batch_shape)
+        torch.broadcast_shapes(self.batch_shape, shape)  # type: ignore[no-untyped-call]
+        return self.mapped(lambda tensor, rest: tensor.expand(*shape, *rest), shape)
+
+    def flat(self) -> Self:
+        """The same pixels in one row."""
+        return self.mapped(lambda tensor, rest: tensor.reshape(-1, *rest), torch.Size([math.prod(self.batch_shape)]))
+
+    def parts(self, size: int) -> list[Self]:
+        """Distributions of `size` consecutive pixels each, of a batch with one axis."""
+        split: dict[int, tuple[Tensor, ...]] = {}
+
+        def part(index: int) -> Taking:
+            return lambda tensor, rest: split.setdefault(id(tensor), torch.split(tensor, size))[index]
+
+        count = self.batch_shape[0]
+        starts = range(0, count, size)
+        return [self.mapped(part(i), torch.Size([min(size, count - at)])) for i, at in enumerate(starts)]
+
+    def mapped(self, take: Taking, shape: torch.Size) -> Self:
+        """A copy with every tensor of pixels replaced by ``take(tensor, shape of the axes after the batch's)``."""
+        other = copy.copy(self)
+        other._batch_shape, other._computed = shape, {}  # type: ignore[attr-defined]
+        size = len(self.batch_shape)
+        for name, value in vars(self).items():
+            if isinstance(getattr(type(self), name, None), cached_property):
+                del other.__dict__[name]
+            elif isinstance(value, Pixels):
+                setattr(other, name, value.mapped(take, shape))
+            elif isinstance(value, Tensor) and self._is_per_pixel(name, value):
+                setattr(other, name, take(value, tuple(value.shape[size:])))
+        return other
+
+    def _is_per_pixel(self, name: str, tensor: Tensor) -> bool:
+        if self.per_pixel is not None:
+            return name in self.per_pixel
+        return tensor.shape[: len(self.batch_shape)] == self.batch_shape
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.batch_shape)) or "1"
+        kind = str(self.dtype).removeprefix("torch.")
+        inside = getattr(self, "base", None)
+        of = f", of {type(inside).__name__}" if isinstance(inside, Pixels) else ""
+        return f"{type(self).__name__}({shape} pixels, {kind}, {self.device}{of})"
+
+
+def is_traced(tensor: Tensor) -> bool:
+    """Whether values cannot be looked at: inside ``torch.compile`` or a transform of ``torch.func``."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)

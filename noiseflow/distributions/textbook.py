@@ -1,0 +1,159 @@
+"""The distributions of the textbook noise models: normal and Poisson."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import constraints
+
+from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
+from noiseflow.distributions.levels import Levels, between
+
+_NEAR = 1e-3  # of a level: a value computed as gain·k + offset must count as having reached k
+
+
+class GaussianDistribution(LatentDistribution):
+    """Normal distribution around the signal.
+
+    Args:
+        signal: detector units, any shape.
+        log_scale: log of the standard deviation, a number.
+    """
+
+    per_pixel = ("signal",)
+
+    def __init__(self, signal: Tensor, log_scale: Tensor) -> None:
+        super().__init__(signal.shape, like=signal)
+        self.signal, self.log_scale = self.clean(signal), self.working(log_scale)
+
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        latent = (value - self.signal) * torch.exp(-self.log_scale)
+        return latent, -self.log_scale.expand_as(latent)
+
+    def from_latent(self, latent: Tensor) -> Tensor:
+        return self.signal + latent * torch.exp(self.log_scale)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.signal
+
+    @property
+    def variance(self) -> Tensor:
+        return torch.exp(2 * self.log_scale).expand_as(self.signal)
+
+    @property
+    def mode(self) -> Tensor:
+        """The signal."""
+        return self.mean
+
+
+class PoissonDistribution(NoiseDistribution):
+    """Scaled and shifted Poisson distribution.
+
+    Args:
+        signal: detector units, any shape.
+        gain, offset: numbers: counts per electron, and counts at zero dose.
+    """
+
+    has_rsample: ClassVar[bool] = False  # type: ignore[misc]
+    discrete: ClassVar[bool] = True
+    per_pixel = ("signal",)
+
+    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor) -> None:
+        super().__init__(signal.shape, like=signal)
+        self.signal, self.gain, self.offset = self.clean(signal), self.working(gain), self.working(offset)
+
+    @property
+    def rate(self) -> Tensor:
+        """Expected electrons."""
+        return ((self.signal - self.offset) / self.gain).clamp(min=0)
+
+    def _count(self, value: Tensor) -> Tensor:
+        return ((value - self.offset) / self.gain).detach()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self._log_mass(torch.round(self._count(value))) - torch.log(self.gain)
+
+    def _log_mass(self, count: Tensor) -> Tensor:
+        rate = self.rate
+        possible = (count == 0) | ((count > 0) & (rate > 0)) | torch.isnan(rate)
+        count = torch.where(possible, count, torch.zeros_like(count))
+        log_rate = torch.log(torch.where(rate > 0, rate, torch.ones_like(rate)))
+        log_mass = count * log_rate - rate - torch.lgamma(count + 1)
+        return torch.where(possible, log_mass, torch.full_like(log_mass, -math.inf))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self._mass_up_to(torch.floor(self._count(value) + _NEAR))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self._mass_up_to(torch.ceil(self._count(value) - _NEAR) - 1)
+
+    def _mass_up_to(self, count: Tensor, *, beyond: bool = False) -> Tensor:
+        incomplete = torch.special.gammainc if beyond else torch.special.gammaincc
+        mass = incomplete((count + 1).clamp(min=1) + 0 * self.rate.detach(), self.rate + 0 * count)
+        return torch.where(count >= 0, mass, torch.full_like(mass, float(beyond)))
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return between(self, *(torch.floor(self._count(bound) + _NEAR) for bound in (low, high)))
+
+    def log_masses(self, count: Tensor) -> Tensor:
+        """Log-masses of counts; −inf below 0."""
+        return self._log_mass(count)
+
+    def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
+        """P(k ≤ count), or P(k > count) where `beyond`; the count may be infinite."""
+        finite = torch.isfinite(count)
+        inside = self._mass_up_to(torch.where(finite, count, torch.zeros_like(count)), beyond=beyond)
+        return torch.where(finite, inside, ((count > 0) != beyond).to(inside.dtype))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        rate = self.rate
+        low = torch.full_like(rate, -0.5).expand_as(value)
+        spread = 12 * (torch.sqrt(rate) + 1)
+        found = bisect_quantile(self, value, self._value(low), self._value((rate + spread).expand_as(value)))
+        return self._value(torch.round(self._count(found)))
+
+    def _value(self, count: Tensor) -> Tensor:
+        return count * self.gain + self.offset
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        return self._value(self._poisson((*sample_shape, *self.batch_shape), generator))
+
+    def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+        rate = self.rate.expand(shape)
+        drawn = torch.poisson(torch.nan_to_num(rate), generator=generator)
+        return torch.where(torch.isnan(rate), rate, drawn)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The offset, and infinity."""
+        return self.offset.detach(), torch.full_like(self.offset.detach(), math.inf)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Offset plus whole multiples of the gain."""
+        return Levels(float(self.gain), float(self.offset), float(self.offset), math.inf)
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        rate = self.rate.detach()
+        most = rate + 12 * (torch.sqrt(rate) + 1)
+        first = (rate - 12 * torch.sqrt(rate)).clamp(min=0).floor()
+        count = torch.arange(int((most - first).max()) + 1 if rate.numel() else 1, device=rate.device)
+        nodes = first + count.to(first).view(-1, *(1,) * rate.ndim)
+        return self._value(nodes), torch.exp(self._log_mass(nodes))
+
+    def entropy(self) -> Tensor:
+        """−Σ P log P over the electrons, nats, plus log gain: that of the density that `log_prob` gives."""
+        return super().entropy()
+
+    @property
+    def mean(self) -> Tensor:
+        return self._value(self.rate)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.rate * self.gain**2
