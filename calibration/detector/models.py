@@ -38,6 +38,9 @@ BLOCK = 8
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
 """Those that are fitted always; the flexible ones only where these leave something to gain."""
 
+FLEXIBLE = ("mixture", "flow", "spline", "physics-flow")
+"""Those of some thousand parameters."""
+
 NUM_STEPS = 200
 """Optimisation steps of each model."""
 
@@ -161,11 +164,11 @@ def fit_models(
         progress(len(models), "simple models")
     losses = {name: _losses(model, pixels) for name, model in models.items()}
     best = min(losses, key=lambda name: float(losses[name].mean()))
-    if kinds is None and attainable(models[best], pixels) > WORTH_FITTING:
-        flexible = [name for name in KINDS if name not in SIMPLE]
-        models |= _fitted(flexible, pixels, detector, seed, device)
-        losses |= {name: _losses(models[name], pixels) for name in flexible}
-        best = min(losses, key=lambda name: float(losses[name].mean()))
+    for more in (("excess-noise",), FLEXIBLE):
+        if kinds is None and attainable(models[best], pixels) > WORTH_FITTING:
+            models |= _fitted(more, pixels, detector, seed, device)
+            losses |= {name: _losses(models[name], pixels) for name in more}
+            best = min(losses, key=lambda name: float(losses[name].mean()))
     if progress is not None:
         progress(len(KINDS), "all models")
     return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]

@@ -14,7 +14,9 @@ from noiseflow.models.base import ArrayModel
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
-_BELOW = 0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
+_BELOW = (
+    0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
+)
 _LEAST = 1e-14  # density, per standard deviation, under which the transform's rounding errors rule
 _FITTED, _ITERATIONS = 16384, 60
 
@@ -22,9 +24,11 @@ _FITTED, _ITERATIONS = 16384, 60
 class ExcessNoise(ArrayModel):
     """Shot noise whose electrons are multiplied at random, plus read noise.
 
-    observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with mean 1
-    and variance F² − 1. F² = 2 is the exponential law of a long multiplication register (EMCCD, doi:10.1109/TED.2003.813462); F²
-    near 1 is a Poisson-Gaussian detector; between lie photomultipliers (Polya law) and direct detectors (straggling).
+    observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with
+    mean 1 and variance F² − 1. F² = 2 is the exponential law of a long multiplication register (EMCCD,
+    doi:10.1109/TED.2003.813462); F² near 1 is a Poisson-Gaussian detector; between lie photomultipliers (Polya law) and direct
+    detectors (straggling).
+
     The variance, F²·gain·(signal − offset) + (gain·read_noise)², identifies F²·gain; the shape of the noise tells them apart.
     Clock-induced charge counts as signal.
 
@@ -47,8 +51,8 @@ class ExcessNoise(ArrayModel):
         super().__init__()
         if not (gain > 0 and read_noise > 0 and excess_factor > 1):
             raise ValueError(
-                f"gain is {gain}, read_noise {read_noise} and excess_factor {excess_factor}; the first two must be positive and the "
-                "last above 1"
+                f"gain is {gain}, read_noise {read_noise} and excess_factor {excess_factor}; the first two must be positive and "
+                "the last above 1"
             )
         start = [math.log(gain), math.log(read_noise), math.log(excess_factor - 1)]
         self.change = nn.Parameter(torch.zeros(4))
@@ -115,17 +119,19 @@ class ExcessNoise(ArrayModel):
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
         model = behind(self)
-        climber = torch.optim.LBFGS([self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9)
+        climber = torch.optim.LBFGS(
+            [self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9
+        )
         best, kept = math.inf, self.change.detach().clone()
 
         def loss() -> Tensor:
             nonlocal best, kept
             climber.zero_grad()
             value = -model(seen).log_prob(values).clamp(min=-60.0).mean()
-            value.backward()  # type: ignore[no-untyped-call]
-            if float(value) < best:
-                best, kept = float(value), self.change.detach().clone()
-            return value
+            value.backward()
+            if float(value.detach()) < best:
+                best, kept = float(value.detach()), self.change.detach().clone()
+            return torch.as_tensor(value)
 
         with torch.enable_grad():
             climber.step(loss)  # type: ignore[no-untyped-call]
@@ -161,7 +167,9 @@ class ExcessNoiseDistribution(NoiseDistribution):
         gain, offset, read_noise, pulse_variance: scalars, float64; the last is F² − 1.
     """
 
-    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor) -> None:
+    def __init__(
+        self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, pulse_variance: Tensor
+    ) -> None:
         super().__init__(signal.shape)
         self.signal, self.gain, self.offset = signal, gain, offset
         self.read_noise, self.pulse_variance = read_noise, pulse_variance
@@ -176,9 +184,13 @@ class ExcessNoiseDistribution(NoiseDistribution):
             rate = roots**2
             deviation = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2)
             width = _WIDTH
-            turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
+            turn = (
+                torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * width)
+            )
             phase = turn / deviation[:, None]
-            pulse = torch.exp(-torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance)
+            pulse = torch.exp(
+                -torch.log1p(torch.complex(torch.zeros_like(phase), -phase * self.pulse_variance)) / self.pulse_variance
+            )
             exponent = rate[:, None] * (pulse - 1) - 0.5 * (phase * self.read_noise) ** 2
             start = -_BELOW * _CELLS * width
             shift = torch.complex(torch.zeros_like(phase), -(turn * start + phase * rate[:, None]))
@@ -216,11 +228,13 @@ class ExcessNoiseDistribution(NoiseDistribution):
         return self._as(value, self._at(value, False))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        """Log-probability of (low, high]: the difference of the distribution function, or density times width in the far tails."""
+        """Log-probability of (low, high]: the distribution function's difference; in the far tails density times width."""
         ends = []
         for value, empty in ((low, 0.0), (high, 1.0)):
             finite = torch.isfinite(value)
-            ends.append(torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty))
+            ends.append(
+                torch.where(finite, self._at(torch.where(finite, value, self.signal.expand(value.shape)), False), empty)
+            )
         ends[0] = torch.where(low == math.inf, torch.ones_like(ends[0]), ends[0])
         ends[1] = torch.where(high == -math.inf, torch.zeros_like(ends[1]), ends[1])
         mass = ends[1] - ends[0]

@@ -45,7 +45,9 @@ def _jpeg(image: sim.Image) -> sim.Image:
     blocks = image.reshape(len(image) // 8, 8, -1, 8).swapaxes(1, 2)
     found = dctn(blocks, axes=(2, 3), norm="ortho")
     weight = 4.0 * (1 + np.add.outer(np.arange(8), np.arange(8)))
-    return np.asarray(idctn(np.round(found / weight) * weight, axes=(2, 3), norm="ortho").swapaxes(1, 2).reshape(image.shape))
+    return np.asarray(
+        idctn(np.round(found / weight) * weight, axes=(2, 3), norm="ortho").swapaxes(1, 2).reshape(image.shape)
+    )
 
 
 def _vignette_moved(generator: np.random.Generator, scene: sim.Image) -> sim.Image:
@@ -69,7 +71,8 @@ CASES: dict[str, Maker] = {
         clean=True,
     ),
     "clean burst of 6": lambda s: replace(
-        pair(s, lambda g, x: (np.stack([exposed(g, x) for _ in range(6)]), None)), clean=True  # type: ignore[arg-type,return-value]
+        pair(s, lambda g, x: (np.stack([exposed(g, x) for _ in range(6)]), None)),
+        clean=True,  # type: ignore[arg-type,return-value]
     ),
     "both resampled × 0.8": lambda s: pair(s, both(sim.resampled)),
     "both resampled × 0.8, cubic": lambda s: pair(s, both(lambda image: np.asarray(ndimage.zoom(image, 0.8, order=3)))),
@@ -80,7 +83,9 @@ CASES: dict[str, Maker] = {
     "afterglow 0.1 along y": lambda s: pair(s, both(lambda image: sim.afterglow(image, 0.1, axis=0))),
     "long drifted by 4 pixels": lambda s: pair(s, long_of(lambda g, x: sim.drifted(x, 4))),
     "long drifted by 2 pixels": lambda s: pair(s, long_of(lambda g, x: sim.drifted(x, 2))),
-    "long drifted by 4 pixels, ratio known": lambda s: pair(s, long_of(lambda g, x: sim.drifted(x, 4)), exposure_ratio=RATIO),
+    "long drifted by 4 pixels, ratio known": lambda s: pair(
+        s, long_of(lambda g, x: sim.drifted(x, 4)), exposure_ratio=RATIO
+    ),
     "long blurred, 2 pixels": lambda s: pair(s, long_of(lambda g, x: _blur(2.0)(x))),
     "long blurred, 0.7 pixels": lambda s: pair(s, long_of(lambda g, x: _blur(0.7)(x))),
     "short blurred by optics, 1.5 pixels": lambda s: pair(

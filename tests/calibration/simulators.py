@@ -25,7 +25,9 @@ class Case:
     clean: bool = False
 
 
-def random_scene(generator: np.random.Generator, size: int = 256, *, contrast: float = 0.6, mean: float = 80.0) -> Image:
+def random_scene(
+    generator: np.random.Generator, size: int = 256, *, contrast: float = 0.6, mean: float = 80.0
+) -> Image:
     """Electrons per pixel of a smooth random field with detail from 2 to 20 pixels, (size, size)."""
     shape = (size, size)
     layers = sum(blur * ndimage.gaussian_filter(generator.standard_normal(shape), blur) for blur in (2.0, 6.0, 20.0))
@@ -84,8 +86,15 @@ def afterglow(image: Image, rest: float, *, axis: int = 1) -> Image:
 
 def drifted(electrons: Image, pixels: int) -> Image:
     """A scene that moved along x by `pixels` during the exposure."""
-    return np.asarray(np.mean([ndimage.shift(electrons, (0, step), order=1, mode="wrap") for step in
-                               np.linspace(-pixels / 2, pixels / 2, 4 * pixels + 1)], axis=0))
+    return np.asarray(
+        np.mean(
+            [
+                ndimage.shift(electrons, (0, step), order=1, mode="wrap")
+                for step in np.linspace(-pixels / 2, pixels / 2, 4 * pixels + 1)
+            ],
+            axis=0,
+        )
+    )
 
 
 def pair(seed: int, spoil: Callable[[np.random.Generator, Image], tuple[Image, Image]], **options: Any) -> Case:
