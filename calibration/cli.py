@@ -37,7 +37,7 @@ def calibrate(
     kind: Annotated[
         str,
         typer.Option(
-            help="auto, or gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow."
+            help="auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow."
         ),
     ] = "auto",
     exposure_ratio: Annotated[

@@ -31,7 +31,8 @@ LEAST_MISFIT = 0.8
 a usual calibration it scatters by 0.05. Bursts share their frames, which takes some scatter away."""
 
 WIDEST_GAIN = 0.04
-"""Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded: twice the goal."""
+"""Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded:
+twice the goal."""
 
 BIAS = 0.02
 """Relative error of the gain that may go without a warning: the goal of the calibration."""
@@ -151,8 +152,8 @@ def _correlation(
         text += "carry afterglow or interference"
         if correctable(correlation, repairs):
             text += (
-                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain reported is"
-                " the one before; per pixel of the recorded frame it is "
+                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain "
+                "reported is the one before; per pixel of the recorded frame it is "
                 f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Give raw frames to be sure"
             )
             grade: Grade = (
@@ -165,7 +166,9 @@ def _correlation(
         text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
         found.append(Reason("compressed", "bad", text + ". Give raw frames."))
     if correlation.period:
-        text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed in blocks"
+        text = (
+            f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed"
+        )
         found.append(Reason("periodic noise", "bad", text + ", so that the gain is not the camera's. Give raw frames."))
     return found
 

@@ -303,7 +303,12 @@ def _residuals(burst: Burst) -> list[Residual]:
         difference = difference - difference.mean()
         spread = float(difference.std())
         found.append(
-            Residual(np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT), mask, 0.0, np.full(mask.shape, spread))
+            Residual(
+                np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT),
+                mask,
+                0.0,
+                np.full(mask.shape, spread),
+            )
         )
     return found
 
