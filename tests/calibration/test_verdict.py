@@ -1,5 +1,7 @@
 """No figure is wrong without a flag, and clean exposures raise none."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -61,11 +63,13 @@ def test_excess_noise_is_flagged_and_photon_transfer_gives_the_product():
 @pytest.mark.parametrize("seed", [21, 22])
 def test_every_case_is_right_or_flagged(name, seed):
     case = CASES[name](seed)
-    try:
-        found = measured(case)
-    except ValueError as error:
-        assert "\n" not in str(error)
-        assert not case.clean
+    if name == "gamma-encoded":  # nothing in it is Poisson-Gaussian: either way of saying so will do
+        with contextlib.suppress(ValueError):
+            assert measured(case).verdict.grade == "bad"
+        return
+    found = measured(case)
+    if found.figures is None:
+        assert found.verdict.grade == "bad"
         return
     if found.verdict.grade == "good":
         assert found.figures.gain.median == pytest.approx(case.gain, rel=0.04)  # 2 % and its own error
