@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: demo test test-slow fuzz check docs clean
+.PHONY: demo test test-shard test-slow fuzz soak mutation check docs clean
 
 demo: .venv/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
@@ -12,6 +12,12 @@ test: export OMP_NUM_THREADS := 1
 test: .venv/test-ready
 	$(BIN)/python -m pytest -n 2
 
+# What CI runs: all fast tests and one share of the slow ones, SHARD=K/N.
+test-shard: export OMP_NUM_THREADS := 1
+test-shard: export NOISEFLOW_SLOW_SHARD = $(SHARD)
+test-shard: .venv/test-ready
+	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
+
 test-slow: .venv/test-ready
 	$(BIN)/python -m pytest -m "slow or not slow"
 
@@ -19,6 +25,18 @@ test-slow: .venv/test-ready
 fuzz: export NOISEFLOW_FUZZ_EXAMPLES ?= 5000
 fuzz: .venv/test-ready
 	$(BIN)/python -m pytest tests/fuzz
+
+# Each command in a loop with kills, full disks, two at a time, ...: SECONDS of it, its report on the last lines and in soak.md.
+soak: export OMP_NUM_THREADS := 1
+soak: SECONDS ?= 3600
+soak: .venv/test-ready
+	$(BIN)/python -m tests.soak --seconds $(SECONDS) --report soak.md
+
+# Mutations of the mathematical core, one at a time, against the tests nearest to them; NUMBER=0 tries all.
+mutation: export OMP_NUM_THREADS := 1
+mutation: NUMBER ?= 60
+mutation: .venv/test-ready
+	$(BIN)/python -m tests.mutation --number $(NUMBER)
 
 check: docs
 	$(BIN)/ruff check .

@@ -3,10 +3,13 @@ from . import io as io
 from . import metrics as metrics
 from .fitting.fit import fit as fit
 from .fitting.loop import FitResult as FitResult
+from .fitting.selection import select as select
 from .fitting.signal_models import KnownSignal as KnownSignal
 from .fitting.signal_models import StaticScene as StaticScene
 from .io.model_files import load as load
+from .io.model_files import register as register
 from .io.model_files import save as save
+from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson
 from .models.digitisation import Digitisation as Digitisation

@@ -35,5 +35,4 @@ MOVED = {
     "spatial": "metrics.spatial",
     "standardisation": "models.standardisation",
     "tabulated": "distributions.tabulated",
-    "transforms": "distributions.transforms",
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -23,29 +22,66 @@ class Kind(Protocol):
 
 
 _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
+_CPU = 1  # of the DLPack standard
 
 
-def as_tensor(data: Tensor | NDArray[Any], *, like: Kind | None = None) -> Tensor:
-    """A tensor of a tensor or an array; memory is shared where it can be.
+def is_array(data: Any) -> bool:
+    """Whether this is a number or an array of any library (``__array__`` or ``__dlpack__``), and not a tensor."""
+    if isinstance(data, Tensor):
+        return False
+    return isinstance(data, (bool, int, float)) or hasattr(data, "__array__") or hasattr(data, "__dlpack__")
+
+
+def is_lazy(data: Any) -> bool:
+    """Whether this is a Dask array, or an xarray of one, whose blocks are still to be computed."""
+    return not isinstance(data, Tensor) and library_of(getattr(data, "data", data)) == "dask"
+
+
+def library_of(data: Any) -> str:
+    """The package that an object's class comes from."""
+    return type(data).__module__.split(".")[0]
+
+
+def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
+    """A tensor of a tensor, a number, or an array of any library; memory is shared where it can be.
 
     Args:
         data: real numbers or booleans, any shape; a tensor is returned as it is.
         like: take the number type and device of this tensor or projector over, for arrays alone.
 
     Raises:
-        ValueError: the array's numbers are not real.
+        ValueError: the array's numbers are not real, or some are masked.
     """
     if isinstance(data, Tensor):
         return data
-    array = np.asarray(data)
-    if array.dtype.kind not in "buif":
-        raise ValueError(f"an array of {array.dtype} has no real numbers; convert it first, with .astype(float)")
-    kind = _WIDER.get(array.dtype.str[1:], np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("="))
-    tensor = torch.from_numpy(np.require(array, kind, ["C", "W"]))
+    if np.ma.is_masked(data):
+        raise ValueError(
+            "some values of this array are masked; leave them out (mask=~array.mask, where there is such an argument) or "
+            "fill them, with array.filled(value)"
+        )
+    capsule = hasattr(data, "__dlpack_device__")
+    if capsule and (data.__dlpack_device__()[0] != _CPU or not hasattr(data, "__array__")):
+        tensor: Tensor = torch.utils.dlpack.from_dlpack(data)
+    else:
+        tensor = _from_numpy(np.asarray(data))
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)
 
 
-def floating(data: Tensor | NDArray[Any]) -> Tensor:
+def _from_numpy(array: NDArray[Any]) -> Tensor:
+    if array.dtype.kind not in "buif":
+        raise ValueError(f"an array of {array.dtype} has no real numbers; convert it first, with .astype(float)")
+    kind = _WIDER.get(array.dtype.str[1:], np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("="))
+    return torch.from_numpy(np.require(array, kind, ["C", "W"]))
+
+
+def unmasked(*arrays: Any) -> tuple[list[Any], Tensor | None]:
+    """The arrays without their masks, and which values no masked array masks, (N,) boolean; None where none is masked."""
+    masks = [np.ma.getmaskarray(each).reshape(-1) for each in arrays if np.ma.is_masked(each)]
+    bare = [np.ma.getdata(each) if isinstance(each, np.ma.MaskedArray) else each for each in arrays]
+    return bare, torch.from_numpy(~np.logical_or.reduce(masks)) if masks else None
+
+
+def floating(data: Any) -> Tensor:
     """As `as_tensor`; an array of integers, booleans or half precision becomes the default floating type."""
     if isinstance(data, Tensor):
         return data
@@ -59,55 +95,3 @@ def alike(result: Tensor | NDArray[Any], given: Given) -> Given:
     if isinstance(given, Tensor):
         return result if isinstance(result, Tensor) else torch.from_numpy(result).to(given.device)
     return result.detach().cpu().numpy() if isinstance(result, Tensor) else result
-
-
-class ArrayDistribution:
-    """The distribution of the observations of an array of signals; arrays in, arrays out.
-
-    The methods are those of `NoiseDistribution`, without gradients.
-    """
-
-    def __init__(self, distribution: Any, like: Tensor) -> None:
-        self.tensors, self._like = distribution, like
-
-    def __repr__(self) -> str:
-        return f"ArrayDistribution({type(self.tensors).__name__} of {' x '.join(map(str, self._like.shape))} pixels)"
-
-    def _call(self, name: str, *values: NDArray[Any]) -> NDArray[Any]:
-        with torch.no_grad():
-            found = getattr(self.tensors, name)(*(as_tensor(np.asarray(v), like=self._like) for v in values))
-        return np.asarray(found.cpu().numpy())
-
-    def log_prob(self, value: NDArray[Any]) -> NDArray[Any]:
-        """Log-density in nats per detector unit; of a digitised model, log-mass."""
-        return self._call("log_prob", value)
-
-    def log_interval_prob(self, low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any]:
-        """log P(low < observation ≤ high)."""
-        return self._call("log_interval_prob", low, high)
-
-    def cdf(self, value: NDArray[Any]) -> NDArray[Any]:
-        """P(observation ≤ value)."""
-        return self._call("cdf", value)
-
-    def cdf_below(self, value: NDArray[Any]) -> NDArray[Any]:
-        """P(observation < value)."""
-        return self._call("cdf_below", value)
-
-    def icdf(self, value: NDArray[Any]) -> NDArray[Any]:
-        """The quantile: smallest observation whose CDF reaches `value`."""
-        return self._call("icdf", value)
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> NDArray[Any]:
-        """Draw observations, ``(*sample_shape, *signal.shape)``."""
-        return np.asarray(self.tensors.sample(sample_shape, generator=generator).cpu().numpy())
-
-    @property
-    def mean(self) -> NDArray[Any]:
-        """Mean of each pixel's observations."""
-        return np.asarray(self.tensors.mean.detach().cpu().numpy())
-
-    @property
-    def variance(self) -> NDArray[Any]:
-        """Variance of each pixel's observations."""
-        return np.asarray(self.tensors.variance.detach().cpu().numpy())

@@ -10,6 +10,11 @@ Kind = TypeVar("Kind")
 _FEW = 4
 
 
+def printable(text: str) -> str:
+    """Text that moves no cursor and colours nothing: every control and invisible character but the line end becomes ``?``."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+
+
 def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:
     """Give a dataclass a repr of one line.
 

@@ -12,13 +12,16 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class NoiseModel(Protocol):
-    """A conditional density p(observation | signal); an ``nn.Module``."""
+    """A conditional density p(observation | signal); an ``nn.Module``.
+
+    `NoiseModelBase` is its full contract, with a default for everything but the call.
+    """
 
     def __call__(self, signal: Tensor) -> NoiseDistribution:
         """The distribution of the observations of pixels with the given signals.
 
         Args:
-            signal: clean expected readings, any shape, detector units.
+            signal: clean signals, any shape, detector units.
 
         Returns:
             A distribution with ``batch_shape == signal.shape`` and ``event_shape == ()``.

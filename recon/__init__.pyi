@@ -4,8 +4,9 @@ from .fields.fields import MultiresolutionField as MultiresolutionField
 from .fields.fields import VoxelField as VoxelField
 from .fields.regularisers import total_variation as total_variation
 from .joint.joint import JointReconstructor as JointReconstructor
-from .joint.joint import Reconstruction as Reconstruction
 from .joint.signal_model import TomographySignal as TomographySignal
+from .methods._registry import Method as Method
+from .methods._registry import reconstruct as reconstruct
 from .metrics.metrics import compare as compare
 from .metrics.metrics import fourier_shell_correlation as fourier_shell_correlation
 from .projection.image_formation import Linear as Linear
@@ -13,6 +14,9 @@ from .projection.image_formation import Transmission as Transmission
 from .projection.projector import SliceProjector as SliceProjector
 from .projection.sirt import sirt as sirt
 from .projection.wbp import wbp as wbp
+from .reconstruction import Reconstruction as Reconstruction
+from .series.prepare import Prepared as Prepared
+from .series.prepare import prepare as prepare
 from .series.tilt_series import TiltSeries as TiltSeries
 from .series.tilt_series import Volume as Volume
 from .series.tilt_series import VolumeGrid as VolumeGrid

@@ -19,6 +19,8 @@ sample {bad}/list.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/deep.safetensors {good}/clean.mrc -o {out}/n.mrc | deep.safetensors
 sample {bad}/wide.safetensors {good}/clean.mrc -o {out}/n.mrc | wide.safetensors
 sample {bad}/broad.safetensors {good}/clean.mrc -o {out}/n.mrc | do not fit
+sample {bad}/maps.safetensors {good}/clean.mrc -o {out}/n.mrc | a size of 60000
+sample {bad}/bins.safetensors {good}/clean.mrc -o {out}/n.mrc | do not fit
 sample {bad}/mismatch.safetensors {good}/clean.mrc -o {out}/n.mrc | do not fit
 sample {bad}/spoilt.safetensors {good}/clean.mrc -o {out}/n.mrc | NaN
 sample {good}/model.safetensors {bad}/missing.mrc -o {out}/n.mrc | does not exist
@@ -102,6 +104,7 @@ simulate {out}/s --tilts 0:10:0 | tilts
 simulate {out}/s --tilts 0:10 | START:STOP:STEP
 simulate {out}/s --tilts=0:1e12:1e-6 | 10000 tilts
 simulate {out}/s --tilts a:b:c | START:STOP:STEP
+simulate {out}/s --tilts=-6_0:60:2 | START:STOP:STEP
 simulate {out}/s --tilts nan:10:1 | tilts
 simulate {out}/s --phantom unicorn | unicorn
 simulate {out}/s --noise {bad}/missing.safetensors | missing.safetensors
@@ -129,8 +132,11 @@ reconstruct {good}/tilts.mrc --angles {bad}/blank.tlt -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/words.tlt -o {out}/v.mrc | line 1
 reconstruct {good}/tilts.mrc --angles {bad}/binary.tlt -o {out}/v.mrc | binary.tlt
 reconstruct {good}/tilts.mrc --angles {bad}/short.tlt -o {out}/v.mrc | there are 2
-reconstruct {good}/tilts.mrc --angles {bad}/nan.tlt -o {out}/v.mrc | NaN
-reconstruct {good}/tilts.mrc --angles {bad}/huge.tlt -o {out}/v.mrc | infinite
+reconstruct {good}/tilts.mrc --angles {bad}/unknown.tlt -o {out}/v.mrc | within ±360
+reconstruct {good}/tilts.mrc --angles {bad}/huge.tlt -o {out}/v.mrc | within ±360
+reconstruct {good}/tilts.mrc --angles {bad}/far.tlt -o {out}/v.mrc | within ±360
+reconstruct {good}/tilts.mrc --angles {bad}/script.tlt -o {out}/v.mrc | is not an angle
+reconstruct {good}/one-tilt.npy -o {out}/v.mrc | images are flat
 reconstruct {good}/tilts.mrc --angles {bad}/same.tlt -o {out}/v.mrc | different angles
 reconstruct {good}/tilts.mrc --angles {bad}/no.mdoc -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/folder -o {out}/v.mrc | folder
@@ -165,7 +171,7 @@ evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/
 calibrate --short {good}/model.safetensors --long {good}/long.tif -o {out}/m.safetensors | a noise model
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/none/m.safetensors | create the folder
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | name the output
-simulate {good} | would be lost
+simulate {good} | --overwrite
 simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | would be lost

@@ -30,6 +30,10 @@ def make_good_files(folder: Path) -> None:
     io.write(folder / "alone.mrc", stack)
     io.write(folder / "clean.mrc", stack[0])
     io.write(folder / "small.mrc", stack[0, :9, :9])
+    only = np.zeros_like(stack)
+    only[4] = stack[4]
+    np.save(folder / "one-tilt.npy", only)
+    np.savetxt(folder / "one-tilt.rawtlt", ANGLES)
     noiseflow.save(noiseflow.Gaussian(0.1), folder / "model.safetensors")
     for name in ("channel1_050ms.tif", "channel1_long.tif"):
         image = tifffile.imread(DATA / "exposures_miro" / name)
@@ -44,8 +48,10 @@ def make_bad_files(folder: Path) -> None:
     texts = {
         "words.tlt": "zero\none\n",
         "short.tlt": "0\n1\n",
-        "nan.tlt": "nan\n" * SHAPE[0],
+        "unknown.tlt": "nan\n" * SHAPE[0],
         "huge.tlt": "1e400\n" * SHAPE[0],
+        "far.tlt": "1e30\n" * SHAPE[0],
+        "script.tlt": "".join(f"{angle}_0\n" for angle in range(SHAPE[0])),
         "same.tlt": "5\n" * SHAPE[0],
         "blank.tlt": "\n\n",
         "wrong.xf": "1 0 0 1\n",
@@ -147,6 +153,12 @@ def _models(folder: Path) -> None:
         "list": {"model": [1, 2]},
         "deep": {"model": deep},
         "wide": {"model": {"kind": "RadialFlow", "arguments": {"num_layers": 10**9}}},
+        "maps": {
+            "model": {"kind": "WithMaps", "arguments": {"shape": [60_000, 60_000]}, "models": {"model": sound_model}}
+        },
+        "bins": {
+            "model": {"kind": "SplineFlow", "arguments": dict.fromkeys(("num_bins", "width", "neighbourhood"), 1023)}
+        },
         "broad": {
             "parameters": 0.1,
             "model": {"kind": "RadialFlow", "arguments": {"width": 100_000}},

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,19 @@ DATA = Path(__file__).parent.parent / "noiseflow" / "data"
 # a shell's background jobs ignore Ctrl-C, and the programs under test would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep one share of the slow tests where ``NOISEFLOW_SLOW_SHARD`` asks for it, as ``K/N``: the same share every time."""
+    wanted = os.environ.get("NOISEFLOW_SLOW_SHARD")
+    if wanted is None:
+        return
+    share, count = map(int, wanted.split("/"))
+    left_out = {
+        item for item in items if item.get_closest_marker("slow") and zlib.crc32(item.nodeid.encode()) % count != share
+    }
+    config.hook.pytest_deselected(items=list(left_out))
+    items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture(autouse=True)

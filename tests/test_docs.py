@@ -86,7 +86,7 @@ def public_names(module: ModuleType) -> set[str]:
     """What a package exports, or what a module (or a folder of modules) defines."""
     if module.__name__ in PACKAGES:
         return {name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)}
-    homes = {name: f"{getattr(value, '__module__', '')}." for name, value in vars(module).items()}
+    homes = {name: f"{getattr(getattr(module, name), '__module__', '')}." for name in dir(module)}
     return {name for name, home in homes.items() if home.startswith(f"{module.__name__}.") and name[0] != "_"}
 
 

@@ -71,7 +71,6 @@ def run(command: list[str], folder: Path, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
 def test_wheel_is_small_whole_and_licensed(shipped: Path) -> None:
     (wheel,) = shipped.glob("*.whl")
     assert wheel.stat().st_size < 10e6
@@ -89,7 +88,6 @@ def test_wheel_is_small_whole_and_licensed(shipped: Path) -> None:
     assert metadata["Requires-Python"] == ">=3.11"
 
 
-@pytest.mark.slow
 def test_sdist_holds_the_sources_of_the_wheel(shipped: Path) -> None:
     (sdist,) = shipped.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
@@ -115,6 +113,29 @@ def test_demo_of_the_installed_wheel_needs_no_checkout(shipped: Path, tmp_path: 
     run([str(binaries / "noiseflow"), "demo", "--out", "demo"], work, OMP_NUM_THREADS="1")
     assert list((work / "demo").rglob("*.html"))
     assert list((work / "demo").rglob("*.mrc"))
+
+
+def test_what_pip_installs_by_default_is_free_of_the_gpl() -> None:
+    """The extra [formats] brings RosettaSciIO, GPL-3.0; nobody gets it without asking for it."""
+    pending, seen = ["noiseflow"], set()
+    while pending:
+        name = pending.pop()
+        if name in seen or not _is_installed(name):
+            continue
+        seen.add(name)
+        for requirement in map(Requirement, importlib.metadata.requires(name) or []):
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                pending.append(canonicalize_name(requirement.name))
+    assert {"torch", "numpy", "mrcfile"} <= seen
+    assert not {name for name in seen if _is_gpl(name)}
+    assert _is_gpl("rosettasciio")
+
+
+def _is_gpl(package: str) -> bool:
+    metadata = importlib.metadata.metadata(package)
+    told = [metadata.get("License-Expression") or "", (metadata.get("License") or "")[:80]]
+    told += [line for line in metadata.get_all("Classifier") or [] if line.startswith("License")]
+    return any(re.search(r"(?<!L)GPL|(?<!Lesser )General Public", text) for text in told)
 
 
 def test_supported_pythons_are_said_alike_everywhere() -> None:

@@ -84,8 +84,8 @@ def test_noise_models_return_what_they_are_given(name: str, make: Callable[[], t
     [
         (lambda x: projector()(x), VOLUME),
         (lambda x: projector().T(x), RANDOM.random((7, 5, 8), dtype=np.float32)),
-        (lambda x: recon.projection.sirt(x, projector(), num_iterations=3), RANDOM.random((7, 5, 8), dtype=np.float32)),
-        (lambda x: recon.projection.wbp(x, projector()), RANDOM.random((7, 5, 8), dtype=np.float32)),
+        (lambda x: recon.sirt(x, projector(), num_iterations=3), RANDOM.random((7, 5, 8), dtype=np.float32)),
+        (lambda x: recon.wbp(x, projector()), RANDOM.random((7, 5, 8), dtype=np.float32)),
         (lambda x: recon.total_variation(x, smoothing=0.1), VOLUME),
         (lambda x: recon.fourier_shell_correlation(x, x), VOLUME),
         (lambda x: metrics.pixel_log_prob(noiseflow.Gaussian(), x, x), SIGNAL.ravel()),
@@ -151,7 +151,7 @@ def public_classes() -> set[type]:
     found = set()
     for package in (noiseflow, recon, calibration):
         found |= {value for value in map(package.__getattr__, package.__all__) if inspect.isclass(value)}
-    return found - {noiseflow.NoiseModel, noiseflow.SignalModel}
+    return found - {noiseflow.NoiseModel, noiseflow.NoiseModelBase, noiseflow.SignalModel}
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import noiseflow
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure, show_image
 from recon import VolumeGrid, read_tilt_series
-from recon.methods.methods import reconstruct
+from recon.methods._registry import reconstruct
 
 NEEDLE = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
 

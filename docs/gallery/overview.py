@@ -14,7 +14,7 @@ import torch
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure, show_image
 from recon import JointReconstructor, VolumeGrid, add_noise, clean_tilt_series
-from recon.methods.methods import reconstruct
+from recon.methods._registry import reconstruct
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, tilt_range
 

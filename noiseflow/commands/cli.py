@@ -11,17 +11,22 @@ import signal
 import sys
 import threading
 import warnings
-from importlib.metadata import entry_points, version
+from collections.abc import Callable
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from noiseflow.commands.console import START_AGAIN, Invocation, end_stopped, invoked
+from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
+from noiseflow.described import printable
+from noiseflow.plugins import load_plugin, package_of, plugins
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
 _TYPED = "noiseflow.typed"
 _UNASKED = ("DEFAULT", "DEFAULT_MAP")
+_ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 
 def build_app() -> typer.Typer:
@@ -36,10 +41,39 @@ def build_app() -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_options)
-    found = {point.name: point for point in entry_points(group="noiseflow.commands")}
+    found = plugins("noiseflow.commands")
     for name in sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
-        app.command(name, cls=_ListCommand)(found[name].load())
+        try:
+            command = load_plugin(found[name])
+            if package_of(found[name]) != "noiseflow":
+                _require_command(command)
+        except (ImportError, TypeError) as error:
+            app.command(name, context_settings=_ANY_WORDS)(_broken(str(error)))
+        else:
+            app.command(name, cls=_ListCommand)(command)
     return app
+
+
+def _require_command(command: Any) -> None:
+    """Refuse what no command can be made of, before it spoils the help of all.
+
+    Raises:
+        TypeError: it is no function, or its parameters are none of a command.
+    """
+    alone = typer.Typer()
+    try:
+        alone.command()(command)
+        typer.main.get_command(alone)
+    except Exception as error:
+        raise TypeError(f"this plug-in is no command ({error}); mend, update or uninstall its package") from error
+
+
+def _broken(problem: str) -> Callable[[typer.Context], None]:
+    def command(context: typer.Context) -> None:
+        raise ImportError(problem)
+
+    command.__doc__ = f"Cannot be loaded: {problem}"
+    return command
 
 
 class _Group(TyperGroup):
@@ -118,7 +152,11 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    with steady_streams() as stdout:
+        _run(sys.argv[1:] if arguments is None else arguments, stdout)
+
+
+def _run(arguments: list[str], stdout: SteadyStream) -> None:
     debug, interrupts = "--debug" in arguments, _Interrupts()
     if not debug:
         warnings.showwarning = _show_warning
@@ -136,9 +174,11 @@ def main(arguments: list[str] | None = None) -> None:
         untold = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # stopped again, before a line was printed
         if end.code == 130 and untold:
             end_stopped(f"stopped; {START_AGAIN}")
+        stdout.flush()
+        if not end.code and (lost := was_lost(stdout)) is not None:
+            print(f"noiseflow: {lost}", file=sys.stderr)
+            sys.exit(1)
         raise
-    except BrokenPipeError:
-        sys.exit(1)
     except Exception as error:
         if interrupts.came:
             end_stopped(f"stopped; {START_AGAIN}")
@@ -174,18 +214,22 @@ def _keep_ctrl_c() -> None:
 
 
 def _in_one_line(error: Exception) -> str:
-    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
-    if isinstance(error, (ValueError, ModuleNotFoundError)):
+    text = printable(" ".join([*str(error).split(), *_notes(error)]))
+    if isinstance(error, (ValueError, ImportError)):
         return text or type(error).__name__
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return (
             f"out of memory ({text[:200] or 'no more could be had'}); take a smaller or binned input, or fewer voxels"
         )
     if isinstance(error, OSError):
-        return _system_error(error)
+        return printable("; ".join([_system_error(error), *_notes(error)]))
     return (
         f"unexpected {type(error).__name__}: {text[:300]}; this is a fault of noiseflow: please report it with --debug"
     )
+
+
+def _notes(error: Exception) -> list[str]:
+    return list(getattr(error, "__notes__", ()))
 
 
 def _system_error(error: OSError) -> str:
@@ -207,4 +251,4 @@ def _system_error(error: OSError) -> str:
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     if category is UserWarning:
-        print(f"noiseflow: warning: {' '.join(str(message).split())}", file=sys.stderr)
+        print(f"noiseflow: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)

@@ -16,9 +16,14 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from noiseflow.described import printable
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
 DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace existing outputs even if noiseflow did not write them.")
+]
 
 Progress = Callable[[int, str], None]
 """``progress(done, note)``: steps done so far, and a few words such as the current likelihood."""
@@ -33,7 +38,7 @@ def end_stopped(text: str) -> NoReturn:
     """End a program that was stopped, with one line and exit code 130; Ctrl-C again has no effect any more."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    print(f"noiseflow: {text}", file=sys.stderr, flush=True)
+    print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
     sys.exit(130)  # not typer.Exit, which a command that runs others would not notice
 
 
@@ -49,7 +54,7 @@ class Output:
 
     def line(self, text: str) -> None:
         """One line for people."""
-        print(text, file=sys.stderr if self.json_mode else sys.stdout, flush=True)
+        print(printable(text), file=sys.stderr if self.json_mode else sys.stdout, flush=True)
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table aligned for a terminal; the first column is left-aligned, the others right."""
@@ -131,7 +136,8 @@ class _LogLines:
             self.last = now
             speed = f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
             left = _duration((total - done) / rate)
-            print(f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}", file=sys.stderr, flush=True)
+            line = f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}"
+            print(printable(line), file=sys.stderr, flush=True)
 
 
 def _duration(seconds: float) -> str:

@@ -12,11 +12,17 @@ from typing import Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, SeedOption, progress_shown
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, progress_shown
+
+_FILES = (
+    *("report.html", "detector.safetensors", "clean.tif", "sampled.tif", "needle.mrc", "phantom.mrc"),
+    *("calibration/report.html", "needle/index.html", "phantom-report/index.html", "comparison/index.html"),
+)
 
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
+    overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
@@ -26,14 +32,14 @@ def demo(
 
     output = Output(json)
     started = time.perf_counter()
-    check_folder(out)
+    check_folder(out, holds=_FILES, overwrite=overwrite)
     out.mkdir(parents=True, exist_ok=True)
     report = Report("noiseflow demo", "Everything below was made by the commands shown; repeat them on your own files.")
     report.text(
         "Three uses on real data: calibrate a detector from a short and a long exposure, sample its noise, and reconstruct "
         "volumes from noisy tilt series."
     )
-    run = _Runner(output, report, str(seed))
+    run = _Runner(output, report, str(seed), overwrite=overwrite)
     with as_file(files("noiseflow") / "data") as data:
         short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
         model = out / "detector.safetensors"
@@ -65,8 +71,8 @@ def demo(
 class _Runner:
     """Runs a command of this program, shows it, and takes its report into the page."""
 
-    def __init__(self, output: Output, report: Any, seed: str) -> None:
-        self.output, self.report, self.seed = output, report, seed
+    def __init__(self, output: Output, report: Any, seed: str, *, overwrite: bool) -> None:
+        self.output, self.report, self.seed, self.overwrite = output, report, seed, overwrite
 
     def __call__(self, command: str, *arguments: str | Path) -> dict[str, Any]:
         from noiseflow.commands.cli import build_app
@@ -75,6 +81,8 @@ class _Runner:
         shown = "noiseflow " + " ".join(words)
         self.output.line(f"\n$ {shown}")
         self.report.command(f"$ {shown}")
+        if self.overwrite:
+            words.append("--overwrite")
         if command != "compare":
             words += ["--seed", self.seed]
         printed = textio.StringIO()

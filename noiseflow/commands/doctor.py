@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import platform
 import time
-from importlib.metadata import PackageNotFoundError, entry_points, requires, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any
 
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
+from noiseflow.commands.locations import OWN, folder_of, modules_of, shadows
+from noiseflow.plugins import GROUPS, load_plugin, plugins
 
 
 def doctor(json: JsonOption = False) -> None:
@@ -18,7 +20,12 @@ def doctor(json: JsonOption = False) -> None:
     packages = _packages()
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
     out.line(f"noiseflow {version('noiseflow')}, {python}\n")
-    out.table(("package", "version"), [(name, found or "missing") for name, found in packages.items()])
+    folders = _folders(list(packages))
+    rows = [(name, found or "missing", folders[name]) for name, found in packages.items()]
+    out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *rows])
+    problems = [*(f"shadow: {line}" for line in shadows(list(packages))), *_broken_plugins()]
+    for problem in problems:
+        out.line(f"\nwarning: {problem}")
     devices = _devices()
     out.line(f"\ndevices: {'; '.join(devices)}\n")
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
@@ -29,11 +36,13 @@ def doctor(json: JsonOption = False) -> None:
     out.line("")
     for name, result in tests.items():
         out.line(f"self-test {name}: {result['problem'] or 'ok'} ({result['seconds']:.1f} s)")
-    healthy = all(packages.values()) and not any(result["problem"] for result in tests.values())
+    healthy = all(packages.values()) and not problems and not any(result["problem"] for result in tests.values())
     out.result(
         {
             "healthy": healthy,
             "versions": {"noiseflow": version("noiseflow"), "python": platform.python_version(), **packages},
+            "folders": folders,
+            "problems": problems,
             "devices": devices,
             "extras": {
                 name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
@@ -48,13 +57,13 @@ def doctor(json: JsonOption = False) -> None:
 def run_self_tests() -> dict[str, dict[str, Any]]:
     """Every self-test of the installed packages (entry points ``noiseflow.self_tests``): its problem, or None, and time."""
     results = {}
-    for point in sorted(entry_points(group="noiseflow.self_tests"), key=lambda point: point.name):
+    for name, point in sorted(plugins("noiseflow.self_tests").items()):
         started = time.perf_counter()
         try:
-            problem = point.load()()
+            problem = load_plugin(point)()
         except Exception as error:  # whatever breaks is what the user wants to know
             problem = f"{type(error).__name__}: {error}"
-        results[point.name] = {"problem": problem, "seconds": time.perf_counter() - started}
+        results[name] = {"problem": problem, "seconds": time.perf_counter() - started}
     return results
 
 
@@ -72,6 +81,24 @@ def check_noise_models() -> str | None:
     sampled = model(signal).sample(generator=generator) - signal
     ratio = float(sampled.std() / (observation - signal).std())
     return None if 0.8 < ratio < 1.25 else f"the fitted model's noise is {ratio:.2f} times the true one"
+
+
+def _folders(packages: list[str]) -> dict[str, str]:
+    """Package → where its modules would be loaded from."""
+    modules = {name: modules_of(name) for name in packages} | {name: [name] for name in OWN}
+    found = {name: {str(folder_of(module) or "nowhere") for module in each} for name, each in modules.items()}
+    return {name: ", ".join(sorted(folders)) or "nowhere" for name, folders in found.items()}
+
+
+def _broken_plugins() -> list[str]:
+    problems = []
+    for group in GROUPS:
+        for point in plugins(group).values():
+            try:
+                load_plugin(point)
+            except ImportError as error:
+                problems.append(str(error))
+    return problems
 
 
 def _packages() -> dict[str, str | None]:

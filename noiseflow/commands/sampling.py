@@ -12,6 +12,7 @@ from noiseflow.commands.console import (
     DeviceOption,
     JsonOption,
     Output,
+    OverwriteOption,
     Progress,
     SeedOption,
     StepReport,
@@ -31,6 +32,7 @@ def sample(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     clean: Annotated[Path, typer.Argument(help="Clean image or stack, in the model's units.")],
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noisy image to write (.tif, .mrc, .npy).")],
+    overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -39,8 +41,8 @@ def sample(
     import noiseflow
     from noiseflow import io
 
-    io.check_output(output)
     io.require_other(output, clean)
+    io.check_output(output, overwrite=overwrite)
     image = io.read(clean)
     io.require_finite(image.data, clean)
     noise_model = noiseflow.load(model).to(choose_device(device))

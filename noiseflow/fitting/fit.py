@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,14 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import as_tensor
-from noiseflow.distributions.picked import needs_image
+from noiseflow.arrays import as_tensor, is_array, unmasked
+from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixels import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal
+from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
+from noiseflow.models.around import ForeignModel, as_noise_model
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
-from noiseflow.models.scan_noise import ScanNoise, shared_axis
 
 _log = logging.getLogger("noiseflow")
 
@@ -33,19 +36,22 @@ def fit(
     skip_non_finite: bool = False,
     digitise: bool = True,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
-    num_steps: int = 500,
+    num_steps: int | None = None,
     batch_size: int = 8192,
-    learning_rate: float = 1e-2,
+    learning_rate: float | None = None,
     warm_up: float = 0.0,
     noise_interval: int = 10,
     noise_steps: int = 10,
     standardise: bool = True,
+    train_noise: bool = True,
     tabulate: bool = True,
     generator: torch.Generator | None = None,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
     checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
+    parameter_groups: Sequence[dict[str, Any]] | None = None,
+    tables: TableKeeper | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
 
@@ -53,62 +59,81 @@ def fit(
     Learning rates fall geometrically to 1 %; in a joint fit more slowly at first, and to nothing at the end.
 
     Args:
-        noise_model: the model to fit; one without trainable parameters stays as it is.
+        noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals; one without
+            trainable parameters stays as it is.
         signal: clean signals, a tensor or an array shaped like `observation`, or a `SignalModel`. A trainable one may offer
             ``parameter_groups()``, parameter groups with their learning rates for Adam.
-        observation: noisy readings, a tensor or an array of any shape and real type, detector units; for models that look
+        observation: noisy images, a tensor or an array of any shape and real type, detector units; for models that look
             beyond single pixels, images (..., y, x).
-        mask: pixels to use, shaped like `observation`; all by default.
+        mask: pixels to use, shaped like `observation`; all by default. What a masked array masks is left out besides.
         skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
         digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
             model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
         held_out: fraction of the pixels, or those, boolean, that judge the fit and never train it.
-        num_steps: optimisation steps.
+        num_steps: optimisation steps; by default as many as the noise model asks for (its ``num_steps``, 500 by default).
         batch_size: pixels per noise-model step.
-        learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``.
+        learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``; by default the
+            noise model's own (its ``learning_rate``, 0.01 by default).
         warm_up: share of the steps of a joint fit in which its rates grow to their full size. Adam's first steps move everything
             as far, which a rough start gains from and a good one is lost to.
         noise_interval, noise_steps: in a joint fit, this many noise-model steps after every so many signal steps.
         standardise: measure the data's scaling first and store it in the noise model.
+        train_noise: whether the noise model learns; otherwise it stays as it is.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
         progress: called with the steps done and a note.
         checkpoint: called at every look at the held-out pixels, and on Ctrl-C, with all that `resume` needs.
         checkpoint_interval: call it after a step every so many seconds instead.
-        resume: a state that `checkpoint` was given; the fit goes on from there.
+        resume: a state that `checkpoint` was given; the fit continues from there.
+        parameter_groups: of the signal model with their learning rates, in place of its own ``parameter_groups()``.
+        tables: keeps the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
         The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, or no finite step could be made.
+        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, a signal model that gives other
+            shapes than `SignalModel` says, or no finite step could be made.
     """
     if not 0 <= warm_up < 1:
         raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
-    if isinstance(signal, np.ndarray):
+    (signal, observation), kept = unmasked(signal, observation)
+    if is_array(signal):
         signal = as_tensor(signal)
     observation = as_tensor(observation)
     mask = mask if mask is None else as_tensor(mask)
-    held_out = as_tensor(held_out) if isinstance(held_out, np.ndarray) else held_out
+    held_out = held_out if isinstance(held_out, float | int) else as_tensor(held_out)
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
         )
-    signal_model = KnownSignal(signal) if isinstance(signal, Tensor) else signal
+    signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal  # type: ignore[assignment]
+    check_signal_model(signal_model, observation.numel())
+    if kept is not None:
+        kept = kept.to(observation.device).reshape(observation.shape)
+        mask = kept if mask is None else mask.reshape(observation.shape).bool() & kept
     use = _usable(signal_model, observation, mask, skip_non_finite)
-    digitisation = Digitisation()
-    if digitise and _may_be_wrapped(noise_model):
-        noise_model, digitisation = _behind_converter(noise_model, observation, use)
-    axis = shared_axis(noise_model)
-    if needs_image(noise_model) and observation.ndim < 2:
+    model, digitisation = as_noise_model(noise_model), Digitisation()
+    if digitise and model.learns and not model.describes_single_readings:
+        model, digitisation = _behind_converter(model, observation, use)
+    if model.needs_image and observation.ndim < 2:
         raise ValueError(
-            f"{type(noise_model).__name__} looks beyond single pixels: give images (..., y, x); these pixels have shape "
+            f"{type(model).__name__} looks beyond single pixels: give images (..., y, x); these pixels have shape "
             f"{tuple(observation.shape)}"
         )
+    axis = model.shared_axis
     choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
     pixels = choose(_as_floating(observation), use, held_out, _own_generator(generator))
-    loop = FitLoop(noise_model, signal_model, pixels, FitResult(noise_model, digitisation))
-    loop.prepare(num_steps, learning_rate, standardise and resume is None)
+    num_steps = model.num_steps if num_steps is None else num_steps
+    learning_rate = model.learning_rate if learning_rate is None else learning_rate
+    result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
+    loop = FitLoop(model, signal_model, pixels, result, tables)
+    loop.prepare(
+        learning_rate,
+        standardise=standardise and resume is None,
+        train_noise=train_noise,
+        parameter_groups=parameter_groups,
+    )
     if resume is not None:
         loop.load_state(resume)
     schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
@@ -139,28 +164,25 @@ def _as_floating(observation: Tensor) -> Tensor:
     return observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
 
 
-def _may_be_wrapped(noise_model: nn.Module) -> bool:
-    """Whether the model can learn, and none of its parts describes single readings already."""
-    known = any(getattr(module, "describes_single_readings", False) for module in noise_model.modules())
-    return not known and any(parameter.requires_grad for parameter in noise_model.parameters())
-
-
-def _behind_converter(noise_model: nn.Module, observation: Tensor, use: Tensor) -> tuple[nn.Module, Digitisation]:
-    """The model behind the rounding and rails that its readings show, and these; the model itself where they show none."""
-    readings = observation.detach().reshape(-1)[use].cpu()
-    found = detect_digitisation((readings.float() if readings.dtype == torch.bfloat16 else readings).numpy())
-    if not found.found or not (needs_image(noise_model) or _has_intervals(noise_model, observation.device)):
+def _behind_converter(
+    noise_model: NoiseModelBase, observation: Tensor, use: Tensor
+) -> tuple[NoiseModelBase, Digitisation]:
+    """The model behind the rounding and clipping that its pixel values show, and these; itself where they show none."""
+    values = observation.detach().reshape(-1)[use].cpu()
+    found = detect_digitisation((values.float() if values.dtype == torch.bfloat16 else values).numpy())
+    if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
-        "readings are %s: the model is fitted behind that, and the result's noise_model describes it (digitise=False: do not)",
+        "pixel values are %s: the model is fitted behind that, and the result's noise_model describes it "
+        "(digitise=False: do not)",
         found.in_words(),
     )
-    return noise_model.behind(found) if isinstance(noise_model, ScanNoise) else Digitised(noise_model, *found), found
+    return noise_model.behind(lambda inner: Digitised(inner, *found)), found
 
 
-def _has_intervals(noise_model: nn.Module, device: torch.device) -> bool:
+def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:
     """Whether the model's distributions give the mass of an interval; those of other libraries do not."""
-    return hasattr(noise_model(torch.zeros(1, device=device)), "log_interval_prob")
+    return isinstance(noise_model(torch.zeros(1, device=device)), NoiseDistribution)
 
 
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:

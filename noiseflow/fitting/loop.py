@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from noiseflow.described import described
 from noiseflow.distributions.picked import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.average import BestState, WeightAverage
-from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixels import FitPixels, thinned
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.digitisation import Digitisation
@@ -25,7 +25,7 @@ Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
-_LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
+_LOOK_COUNT, _FROZEN_LOOK_COUNT, _FINAL_LOOK_COUNT = 20_000, 40_000, 100_000
 _FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
@@ -76,28 +76,49 @@ class Schedule:
 class FitLoop:
     """A noise model, a signal model and pixels, on their way to the most likely parameters."""
 
-    def __init__(self, noise_model: nn.Module, signal_model: nn.Module, pixels: FitPixels, result: FitResult) -> None:
+    def __init__(
+        self,
+        noise_model: nn.Module,
+        signal_model: nn.Module,
+        pixels: FitPixels,
+        result: FitResult,
+        tables: TableKeeper | None = None,
+    ) -> None:
         self.noise_model, self.signal_model, self.pixels, self.result = noise_model, signal_model, pixels, result
+        self.tables = TableKeeper() if tables is None else tables
         self.best = BestState()
         self.average: WeightAverage | None = None
         self.done = 0
         self.table: ObservationTable | None = None
-        self.resumed_table: dict[str, Any] | None = None
         self.fixed_part: Tensor | None = None
 
-    def prepare(self, num_steps: int, learning_rate: float, standardise: bool) -> None:
-        """Scale the noise model to the data and set up the optimisers."""
+    def prepare(
+        self,
+        learning_rate: float,
+        *,
+        standardise: bool,
+        train_noise: bool = True,
+        parameter_groups: Sequence[dict[str, Any]] | None = None,
+    ) -> None:
+        """Scale the noise model to the data and set up the optimisers.
+
+        Args:
+            learning_rate: of the noise model, and of a signal model without parameter groups.
+            standardise: measure the data's scaling first.
+            train_noise: whether the noise model learns.
+            parameter_groups: of the signal model, in place of its own.
+        """
         if standardise and hasattr(self.noise_model, "standardise"):
             with torch.no_grad():
                 pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
                 self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
-        noise = [p for p in self.noise_model.parameters() if p.requires_grad]
+        noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]
         self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
         self.signal_optimiser = None
         if any(p.requires_grad for p in self.signal_model.parameters()):
             everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
-            own = getattr(self.signal_model, "parameter_groups", None)
-            self.signal_optimiser = adam(own() if own is not None else everything)
+            own = getattr(self.signal_model, "parameter_groups", lambda: everything)
+            self.signal_optimiser = adam(own() if parameter_groups is None else parameter_groups)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
         if noise and self.signal_optimiser is None:
             self.average = WeightAverage(self.noise_model)
@@ -109,7 +130,7 @@ class FitLoop:
         num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
-            self.table = self._make_table()
+            self.table = self.tables.get(self._make_table)
         if not joint and self.pixels.train.ndim == 1:
             self.fixed_part = self._compute_fixed_part()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
@@ -145,7 +166,7 @@ class FitLoop:
             raise
         if self.best.state is not None:
             self._load_models(self.best.state)
-            scores, count = self.held_out_log_prob()
+            scores, count = self._look(_FINAL_LOOK_COUNT)
             self.result.held_out_nll = -float(scores.sum()) / count
         self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
         return self.result
@@ -177,9 +198,10 @@ class FitLoop:
         self.result.history[step] = nll
         return models if self.average is None else self._models()
 
-    def _look(self) -> tuple[Tensor, int]:
+    def _look(self, most: int | None = None) -> tuple[Tensor, int]:
         """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""
-        most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
+        if most is None:
+            most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
         if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
             return self.held_out_log_prob(most)
         pixels = thinned(self.pixels.judge, most)
@@ -201,12 +223,12 @@ class FitLoop:
             table.check(self.noise_model)
         self.result.table_error = table.error
 
-    def _make_table(self) -> ObservationTable:
+    def _make_table(self, resume: dict[str, Any] | None) -> ObservationTable:
         signal = self._some_signals()
         observed = self.pixels.observation[self.pixels.train]
         low = float(torch.minimum(signal.min(), observed.min()))
         high = float(torch.maximum(signal.max(), observed.max()))
-        return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=self.resumed_table)
+        return ObservationTable(self.noise_model, self.pixels.observation, low, high, resume=resume)
 
     @torch.no_grad()
     def _some_signals(self) -> Tensor:
@@ -275,7 +297,7 @@ class FitLoop:
         return predicted
 
     @torch.no_grad()
-    def held_out_log_prob(self, most: int = 100_000) -> tuple[Tensor, int]:
+    def held_out_log_prob(self, most: int) -> tuple[Tensor, int]:
         """Log-likelihoods of at most so many held-out pixels, or of lines of as many, and the number of pixels."""
         pixels = thinned(self.pixels.judge, most)
         parts = torch.split(pixels, max(1, 32768 // pixels[0].numel()))
@@ -321,7 +343,7 @@ class FitLoop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
-            "table": None if self.table is None else self.table.state(),
+            "table": self.tables.state(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -335,4 +357,5 @@ class FitLoop:
         if self.average is not None:
             self.average.load_state(state["average"])
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
-        self.result.recoveries, self.resumed_table = state["recoveries"], state["table"]
+        self.result.recoveries = state["recoveries"]
+        self.tables.resume = state["table"]

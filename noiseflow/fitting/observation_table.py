@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -21,9 +22,10 @@ _WORTHWHILE = 0.7  # error of finer columns, relative to that of the size before
 class ObservationTable:
     """log p(o | s) and its signal derivative for pixels whose observations stay fixed while their signals change.
 
-    Rows are signals, columns residuals (noise changes fast along the residual and slowly along the signal). Where that is not
-    accurate enough and the observations have few levels (counts of a few electrons), columns are the levels themselves. Beyond
-    the rows the log-likelihood continues along its slope, so that a stray signal is still pulled back.
+    Rows are signals. Where the observations have few levels (integer counts, 8-bit data), columns are the levels themselves:
+    nothing is interpolated along them, and the table is small. Otherwise, or where no such table is accurate enough, columns are
+    residuals: noise changes fast along the residual and slowly along the signal. Beyond the rows the log-likelihood continues
+    along its slope, so that a stray signal is still pulled back.
 
     Args:
         noise_model: the model to tabulate; call `rebuild` after it changes.
@@ -60,9 +62,10 @@ class ObservationTable:
         """What makes the same rows and columns again: their number, the range of signals, the model they were laid out for."""
         return {"low": self.low, "high": self.high, "size": self._size, "laid_out_for": self._laid_out_for}
 
-    def _exists(self, size: int) -> bool:
-        """Whether there is such a size: rows and columns, or rows with all levels of the observations for columns."""
-        return size < len(SIZES) or (size < 2 * len(SIZES) and self._levels is not None)
+    @property
+    def _num_sizes(self) -> int:
+        """Of tables to try: rows with all levels of the observations for columns, if they are few, then rows and residuals."""
+        return len(SIZES) if self._levels is None else 2 * len(SIZES)
 
     @cached_property
     def _levels(self) -> Tensor | None:
@@ -79,17 +82,17 @@ class ObservationTable:
         self.error = self.measure_error(noise_model)
 
     def _refine(self, noise_model: nn.Module) -> None:
-        """Take the first size from the present one on that is accurate enough, or else the most accurate one; sizes between
-        are left out where finer columns gain little."""
+        """Take the first size from the present one on that is accurate enough, or else the most accurate one; sizes of one kind
+        are left out where finer ones gain little."""
         errors: dict[int, float] = {}
         size = self._size
-        while self._exists(size):
+        while size < self._num_sizes:
             errors[size] = self.error = self._build(noise_model, size)
             self._size = size
             if self.error <= self._tolerance:
                 return
-            stalled = self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
-            size = max(size + 1, len(SIZES)) if stalled else size + 1
+            stalled = size % len(SIZES) > 0 and self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
+            size = (size // len(SIZES) + 1) * len(SIZES) if stalled else size + 1
         best = min(errors, key=lambda size: errors[size])
         if best != self._size:
             self._size = best
@@ -111,13 +114,13 @@ class ObservationTable:
     def check(self, noise_model: nn.Module) -> float:
         """Measure the error again, and refine the table where the model has outgrown it."""
         self.error = self.measure_error(noise_model)
-        if self.error > self._tolerance and self._exists(self._size + 1):
+        if self.error > self._tolerance and self._size + 1 < self._num_sizes:
             self._refine(noise_model)
         return self.error
 
     def _build(self, noise_model: nn.Module, size: int) -> float:
         num_rows, num_columns = SIZES[size % len(SIZES)]
-        levels = self._levels if size >= len(SIZES) else None
+        levels = self._levels if size < len(SIZES) else None
         self._laid_out_for = copy.deepcopy(noise_model.state_dict())
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
         self._rows = Rows(self._scale, num_rows)
@@ -189,3 +192,25 @@ class ObservationTable:
         jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
         signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)
         return mean_error(self.log_prob(signal, part), noise_model(signal).log_prob(observation))
+
+
+class TableKeeper:
+    """The table of some pixels under a noise model that stays as it is, made by the first fit that needs it.
+
+    Attributes:
+        resume: what `state` returned; the table is made again with the same rows and columns.
+    """
+
+    def __init__(self) -> None:
+        self.table: ObservationTable | None = None
+        self.resume: dict[str, Any] | None = None
+
+    def get(self, make: Callable[[dict[str, Any] | None], ObservationTable]) -> ObservationTable:
+        """The table, made by ``make(resume)`` if there is none."""
+        if self.table is None:
+            self.table, self.resume = make(self.resume), None
+        return self.table
+
+    def state(self) -> dict[str, Any] | None:
+        """What makes the same table again; None where there is none."""
+        return self.resume if self.table is None else self.table.state()

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from noiseflow.arrays import as_tensor
 from noiseflow.models.base import Described
 
+_RATE = 0.1  # of the frames' deviation: some hundred steps, their rates falling, reach the estimate of any pixel
+
 
 class KnownSignal(Described):
     """A known clean image as a signal model: nothing to learn.
@@ -39,28 +41,62 @@ class KnownSignal(Described):
 class StaticScene(Described):
     """Repeated exposures of one still scene: the clean image is learnt, one value per pixel.
 
+    Where noise is Gaussian the most likely image is the mean of the exposures. Where it has outliers, a long tail or clipping, a
+    joint fit finds an image that is nearer to the truth, for it weighs every exposure by the noise that it learns.
+
+    Every exposure has a share in the image it is compared with, so residuals are too small by √(1 − 1/n) (Neyman & Scott 1948,
+    doi:10.2307/1914288). What the model predicts for a pixel of an exposure therefore lies further from that exposure, by the
+    inverse factor: the noise learnt has the right width, of whatever law, and its skewness to about 1/n.
+
+    Scenes need signals over many widths of the noise, or a noise model that does not depend on the signal: a free value for every
+    pixel could otherwise tell the noise model, by moving a little, how far its exposures are off.
+
     Args:
-        exposures: (n, ...) repeated exposures, detector units; the clean image starts at their mean.
+        exposures: (n, ...) repeated exposures, detector units; the clean image starts at their mean. NaN and infinite pixels are
+            left out.
 
     Raises:
         ValueError: fewer than two exposures.
     """
 
+    exposures: Tensor
+    widening: Tensor
+
     def __init__(self, exposures: Tensor | NDArray[Any]) -> None:
         super().__init__()
         if exposures.shape[0] < 2:
             raise ValueError("a static scene needs at least two exposures; one exposure cannot tell signal from noise")
-        self.count = exposures.shape[0]
-        mean = as_tensor(exposures).to(torch.get_default_dtype()).mean(0)
-        self.shape = mean.shape
-        self.scene = nn.Parameter(mean.reshape(-1).clone())
+        frames = as_tensor(exposures).detach()
+        frames = frames if frames.is_floating_point() else frames.to(torch.get_default_dtype())
+        self.count, self.shape = frames.shape[0], frames.shape[1:]
+        flat = frames.reshape(self.count, -1)
+        seen = torch.isfinite(flat)
+        flat = torch.where(seen, flat, torch.zeros_like(flat))
+        number = seen.sum(0).clamp(min=1).to(flat.dtype)
+        mean = flat.sum(0) / number
+        self.scene = nn.Parameter(torch.where(seen.any(0), mean, mean.mean()))
+        # not part of the state: copies of a fit's state would each hold all exposures
+        self.register_buffer("exposures", torch.where(seen, flat, mean).reshape(-1), persistent=False)
+        widening = torch.where(number > 1, torch.sqrt(number / (number - 1).clamp(min=1)), torch.ones_like(number))
+        self.register_buffer("widening", widening, persistent=False)
+        self._deviation = float((self.exposures - mean.repeat(self.count)).abs().median()) / 0.6745
 
     def forward(self, pixels: Tensor) -> Tensor:
-        return self.scene[pixels % self.scene.numel()]
+        place = pixels % self.scene.numel()
+        return self._apart(self.scene[place], self.exposures[pixels], self.widening[place])
 
     def signal(self) -> Tensor:
-        """All pixels of all exposures, flat."""
-        return self.scene.repeat(self.count)
+        """What the model predicts for all pixels of all exposures, flat."""
+        return self._apart(self.scene.repeat(self.count), self.exposures, self.widening.repeat(self.count))
+
+    @staticmethod
+    def _apart(scene: Tensor, exposure: Tensor, widening: Tensor) -> Tensor:
+        return exposure + (scene - exposure) * widening
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """The scene, at a rate that suits the deviation of the exposures."""
+        spread = self._deviation or float(self.scene.detach().std()) or 1.0
+        return [{"params": [self.scene], "lr": _RATE * spread}]
 
     def extra_repr(self) -> str:
         return f"{self.count} exposures of {' x '.join(map(str, self.shape))} pixels"
@@ -68,3 +104,38 @@ class StaticScene(Described):
     def image(self) -> Tensor:
         """The clean image."""
         return self.scene.detach().reshape(self.shape)
+
+
+@torch.no_grad()
+def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
+    """Refuse a signal model that gives other shapes than `SignalModel` says, before anything is fitted to it.
+
+    Raises:
+        TypeError: not a module.
+        ValueError: `signal()` is not flat, `penalty()` no scalar, or the prediction of two pixels not two numbers.
+    """
+    if not isinstance(signal_model, nn.Module):
+        raise TypeError(
+            f"signal is {type(signal_model).__name__}; give a tensor, an array or a torch module (a SignalModel)"
+        )
+    kind = type(signal_model).__name__
+    device = next((p.device for p in signal_model.parameters()), torch.device("cpu"))
+    if hasattr(signal_model, "signal"):
+        shape = tuple(signal_model.signal().shape)  # type: ignore[operator]
+        if shape != (num_pixels,):
+            raise ValueError(
+                f"{kind}.signal() has shape {shape} and the observation {num_pixels} pixels; return all of them flat, "
+                "with .reshape(-1)"
+            )
+    some = torch.arange(min(2, num_pixels), device=device)
+    shape = tuple(signal_model(some).shape)
+    if shape != tuple(some.shape):
+        raise ValueError(
+            f"{kind} predicts shape {shape} for {some.numel()} pixel indices; return one signal for each index"
+        )
+    if hasattr(signal_model, "penalty"):
+        penalty = signal_model.penalty()  # type: ignore[operator]
+        if not (isinstance(penalty, float | int) or penalty.ndim == 0):
+            raise ValueError(
+                f"{kind}.penalty() has shape {tuple(penalty.shape)}; return a scalar, such as .sum() or .mean()"
+            )

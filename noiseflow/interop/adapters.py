@@ -1,8 +1,8 @@
-"""Noise models for other programs: a deepinv noise model, and the Gaussian-mixture file of PN2V and CAREamics."""
+"""Noise models for other programs: deepinv's noise model and data fidelity, the mixture file of PN2V and CAREamics."""
 
 from __future__ import annotations
 
-import functools
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from noiseflow.fitting.fit import fit
 from noiseflow.io import atomic_path, check_output
-from noiseflow.metrics.evaluation import kl_divergence
-from noiseflow.models.base import ArrayModel
-from noiseflow.models.digitised import Digitised
+from noiseflow.metrics.evaluation import pixel_log_prob
+from noiseflow.models.around import as_noise_model
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.mixture import MixtureDistribution
 
-_NUM_PIXELS = 100_000
+_NUM_PIXELS, _AT_ONCE = 100_000, 8192
 _LEAST_VARIANCE = 1e-4  # of the noise's own
 
 
@@ -34,30 +34,30 @@ def to_deepinv(noise_model: nn.Module, *, seed: int = 0) -> Any:
     Raises:
         ModuleNotFoundError: deepinv is not installed.
     """
-    generator = torch.Generator(next(noise_model.parameters()).device).manual_seed(seed)
-    return _deepinv_class()(noise_model, generator)
+    model = as_noise_model(noise_model)
+    return _deepinv().FittedNoise(model, torch.Generator(model.device).manual_seed(seed))
 
 
-@functools.cache
-def _deepinv_class() -> Any:
+def to_deepinv_fidelity(noise_model: nn.Module) -> Any:
+    """A noise model's likelihood as a ``deepinv.optim.DataFidelity``: −log p(y | A(x)), summed over each image.
+
+    Args:
+        noise_model: the model; it is not copied.
+
+    Returns:
+        What deepinv's optimisers take as ``data_fidelity``. Measurements are in the noise model's detector units.
+
+    Raises:
+        ModuleNotFoundError: deepinv is not installed.
+    """
+    return _deepinv().Likelihood(noise_model)
+
+
+def _deepinv() -> Any:
     try:
-        from deepinv.physics import NoiseModel as DeepinvNoiseModel
-    except ImportError as error:
-        raise ModuleNotFoundError("to_deepinv needs deepinv; python -m pip install 'noiseflow[deepinv]'") from error
-
-    class FittedNoise(DeepinvNoiseModel):  # type: ignore[misc]
-        """Noise of a fitted noiseflow model."""
-
-        def __init__(self, model: nn.Module, generator: torch.Generator) -> None:
-            super().__init__(noise_model=self._sample, rng=generator)
-            self.model = model
-
-        def _sample(self, signal: Tensor) -> Tensor:
-            with torch.no_grad():
-                noisy: Tensor = self.model(signal).sample(generator=self.rng)
-            return noisy
-
-    return FittedNoise
+        return import_module("noiseflow.interop.deepinv")
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("this needs deepinv; python -m pip install 'noiseflow[deepinv]'") from error
 
 
 def to_pn2v_gmm(
@@ -72,8 +72,10 @@ def to_pn2v_gmm(
 ) -> float:
     """Write the Gaussian-mixture noise model of PN2V and CAREamics that comes closest to a noise model.
 
-    A mixture whose means, variances and log-weights are polynomials of the signal is fitted to draws of the model. Its mean is
-    the signal and it has no rounding or clipping: of a `Digitised` model, the model inside is written.
+    A mixture whose means, variances and log-weights are polynomials of the signal is fitted to draws of the model, whichever that
+    is. The file's form leaves out what the pixel's place decides and what the converter does: of a `Digitised` or `WithMaps`
+    model, the model inside is written; of `ScanNoise`, the law of single pixels; of one that looks at a neighbourhood, that of
+    even surroundings. The mean of the mixture is the signal.
 
     Args:
         noise_model: the model.
@@ -91,31 +93,63 @@ def to_pn2v_gmm(
         ValueError: the model does not tell which signals it was fitted on and `signal_range` is not given, or the range is empty.
     """
     path = check_output(path, suffixes=frozenset({".npz"}))
-    model = noise_model.model if isinstance(noise_model, Digitised) else noise_model
+    model = as_noise_model(noise_model).without_converter()
     low, high = _fitted_range(model) if signal_range is None else signal_range
     if not low < high:
         raise ValueError(f"signal_range is {low:g} … {high:g}; the first must lie below the second")
     generator = torch.Generator().manual_seed(seed)
     signal = low + (high - low) * torch.rand(_NUM_PIXELS, generator=generator)
-    with torch.no_grad():
-        observation = model.cpu()(signal).sample(generator=generator)
+    observation = _draws(model, signal, generator)
     mixture = PolynomialMixture(low, high, num_gaussians, num_coefficients)
     fit(mixture, signal, observation, digitise=False, num_steps=num_steps, learning_rate=3e-2, generator=generator)
     with atomic_path(path) as partial:
         np.savez(partial, **mixture.arrays())
-    return kl_divergence(model, mixture, signal, seed=seed + 1)[0]
+    observation = _draws(model, signal, generator)  # others than those it was fitted to
+    return float((_log_prob(model, signal, observation) - pixel_log_prob(mixture, signal, observation)).mean())
 
 
-def _fitted_range(model: nn.Module) -> tuple[float, float]:
-    for module in model.modules():
-        if hasattr(module, "signal_low"):
-            return float(module.signal_low), float(module.signal_high)  # type: ignore[arg-type]
-    raise ValueError(
-        f"{type(model).__name__} does not tell which signals it was fitted on; give signal_range=(low, high) in detector units"
-    )
+def _fitted_range(model: NoiseModelBase) -> tuple[float, float]:
+    if model.fitted_range is None:
+        raise ValueError(
+            f"{type(model).__name__} does not say which signals it was fitted on; give signal_range=(low, high) in detector units"
+        )
+    return model.fitted_range
 
 
-class PolynomialMixture(ArrayModel):
+def _even(values: Tensor, model: NoiseModelBase) -> Tensor:
+    """(N, k, k) even images around pixels (N,), as large as the window that the model looks at."""
+    return values.to(model.device)[:, None, None].expand(-1, model.neighbourhood, model.neighbourhood)
+
+
+@torch.no_grad()
+def _draws(model: NoiseModelBase, signal: Tensor, generator: torch.Generator) -> Tensor:
+    """One observation for each of (N,) signals, on the CPU."""
+    if model.device.type != "cpu":
+        generator = torch.Generator(model.device).manual_seed(generator.initial_seed())
+    if not model.needs_image:
+        found: Tensor = model(signal.to(model.device)).sample(generator=generator).cpu()
+        return found
+    middle, parts = model.neighbourhood // 2, torch.split(signal, _AT_ONCE)
+    drawn = [model(_even(part, model)).sample(generator=generator)[:, middle, middle] for part in parts]
+    return torch.cat(drawn).cpu()
+
+
+@torch.no_grad()
+def _log_prob(model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
+    """Log-density of each of (N,) observations by itself, float64, on the CPU."""
+    if not model.needs_image:
+        return pixel_log_prob(model, signal.to(model.device), observation.to(model.device)).cpu()
+    middle, parts = model.neighbourhood // 2, []
+    for s, o in zip(torch.split(signal, _AT_ONCE), torch.split(observation, _AT_ONCE), strict=True):
+        values = _even(o, model).clone()
+        if model.shared_axis is not None:  # those beside are missing, or the pixel's density would be that given them
+            values.fill_(torch.nan)
+            values[:, middle, middle] = o.to(values)
+        parts.append(model(_even(s, model)).log_prob(values)[:, middle, middle].double().cpu())
+    return torch.cat(parts)
+
+
+class PolynomialMixture(NoiseModelBase):
     """The noise model of PN2V (Prakash et al. 2020, arXiv:1911.12291) as CAREamics evaluates it.
 
     With t the signal from 0 at `low` to 1 at `high`: the variances are Σ exp(a_i)·tⁱ, the log-weights Σ b_i·tⁱ before they are
@@ -130,7 +164,7 @@ class PolynomialMixture(ArrayModel):
 
     def __init__(self, low: float, high: float, num_gaussians: int, num_coefficients: int) -> None:
         super().__init__()
-        self.low, self.high = low, high
+        self.range = low, high
         place = torch.linspace(-1, 1, num_gaussians) if num_gaussians > 1 else torch.zeros(1)
         raw = torch.zeros(3, num_gaussians, num_coefficients)
         raw[0, :, 0], raw[1, :, 0], raw[1, :, 1:], raw[2, :, 0] = place, -0.5, -3.0, -place.abs()
@@ -146,7 +180,8 @@ class PolynomialMixture(ArrayModel):
 
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``."""
-        t = ((signal - self.low) / (self.high - self.low))[..., None, None]
+        low, high = self.range
+        t = ((signal - low) / (high - low))[..., None, None]
         powers = t ** torch.arange(self.raw.shape[-1], device=signal.device)
         centre, log_weight = ((self.raw[row] * powers).sum(-1) for row in (0, 2))
         variance = (torch.exp(self.raw[1]) * powers).sum(-1).clamp(min=_LEAST_VARIANCE)
@@ -162,7 +197,7 @@ class PolynomialMixture(ArrayModel):
         rows = [scale * centre, log_variance + 2 * torch.log(scale), log_weight]
         return {
             "trained_weight": torch.cat(rows).float().numpy(),
-            "min_signal": np.float32(self.low),
-            "max_signal": np.float32(self.high),
+            "min_signal": np.float32(self.range[0]),
+            "max_signal": np.float32(self.range[1]),
             "min_sigma": np.float32(_LEAST_VARIANCE * float(scale) ** 2),
         }

@@ -2,6 +2,7 @@
 
 from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
+from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of
@@ -18,3 +19,5 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
+from .lock import locked as locked
+from .partials import partial_folder as partial_folder

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import text_lines
+from noiseflow.io.checks import number, text_lines
 
 
 def read_transforms(path: str | Path) -> NDArray[np.float64]:
@@ -26,16 +26,16 @@ def read_transforms(path: str | Path) -> NDArray[np.float64]:
     """
     path = Path(path)
     rows = []
-    for number, line in enumerate(text_lines(path, "alignment file", holds="six numbers per line"), 1):
+    for count, line in enumerate(text_lines(path, "alignment file", holds="six numbers per line"), 1):
         if not line.strip():
             continue
         try:
-            a11, a12, a21, a22, dx, dy = map(float, line.split())
+            a11, a12, a21, a22, dx, dy = map(number, line.split())
         except ValueError:
-            raise ValueError(f"{path} line {number}: six numbers A11 A12 A21 A22 DX DY are needed") from None
+            raise ValueError(f"{path} line {count}: six numbers A11 A12 A21 A22 DX DY are needed") from None
         row = np.array([[a11, a12, dx], [a21, a22, dy]])
         if not np.isfinite(row).all() or abs(np.linalg.det(row[:, :2])) < 1e-6:
-            raise ValueError(f"{path} line {number}: this transform cannot be inverted")
+            raise ValueError(f"{path} line {count}: this transform cannot be inverted")
         rows.append(row)
     if not rows:
         raise ValueError(f"{path} holds no transforms; it needs one line of six numbers per section")

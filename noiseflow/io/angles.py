@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import text_lines
+from noiseflow.io.checks import number, text_lines
 from noiseflow.io.image_file import ImageFile
 
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
+LARGEST_ANGLE = 360
+"""Degrees; series go from 0 to 180, or once around."""
 
 
 def read_angles(path: str | Path) -> NDArray[np.float64]:
@@ -96,12 +98,16 @@ def _compare(angles: NDArray[np.float64], inside: NDArray[np.float64] | None, an
 
 def _angle_lines(lines: list[str], path: Path) -> list[float]:
     values = []
-    for number, line in enumerate(lines, 1):
+    for count, line in enumerate(lines, 1):
         if line.strip():
             try:
-                values.append(float(line))
+                values.append(number(line.strip()))
             except ValueError:
-                raise ValueError(f"{path} line {number}: '{line.strip()[:40]}' is not an angle in degrees") from None
+                raise ValueError(f"{path} line {count}: '{line.strip()[:40]}' is not an angle in degrees") from None
+            if not abs(values[-1]) <= LARGEST_ANGLE:
+                raise ValueError(
+                    f"{path} line {count}: {line.strip()[:40]} is no tilt angle; angles are degrees within ±{LARGEST_ANGLE}"
+                )
     return values
 
 

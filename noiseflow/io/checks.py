@@ -10,6 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def number(text: str) -> float:
+    """A number as instruments write it: without what Python allows besides, such as ``6_0`` or digits of other scripts.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"'{text}' is no number")
+    return float(text)
+
+
 class Unsupported(ValueError):
     """A sound file with contents that noiseflow cannot use; the message follows the file's name."""
 

@@ -8,23 +8,26 @@ import importlib.util
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from noiseflow.io.image_file import WRITE_SUFFIXES
-from noiseflow.io.partials import clear_leftovers, partial_prefix
+from noiseflow.io.ownership import require_own
+from noiseflow.io.partials import REPLACED, clear_leftovers, link_target, partial_folder
 
 
-def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) -> Path:
+def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, overwrite: bool = True) -> Path:
     """Fail now, before long work, where a result could not be written; returns the path.
 
     Args:
-        path: the file to write.
+        path: the file to write; of a link, its target.
         suffixes: allowed ones; by default those of the image formats that `write` knows.
+        overwrite: replace whatever is there; otherwise only what this program wrote.
 
     Raises:
         ValueError: another suffix, or a folder of that name.
         FileNotFoundError: the folder does not exist.
+        FileExistsError: without `overwrite`, a file that this program did not write.
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
@@ -39,10 +42,12 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None) ->
         raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: pip install 'noiseflow[formats]'")
     if path.is_dir() and not is_zarr:
         raise ValueError(f"{path} is a folder; name an output file")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent} does not exist; create the folder first")
-    _require_writable(path.parent)
-    clear_leftovers(path)
+    target = link_target(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{target.parent} does not exist; create the folder first")
+    require_own(path, overwrite=overwrite)
+    _require_writable(target.parent)
+    clear_leftovers(target)
     return path
 
 
@@ -59,15 +64,18 @@ def require_other(output: str | Path, *inputs: str | Path | None) -> None:
             raise ValueError(f"{output} is an input too and would be lost; name another output")
 
 
-def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
+def check_folder(path: str | Path, *, num_bytes: int = 0, holds: Sequence[str] = (), overwrite: bool = True) -> Path:
     """Fail now, before long work, where results could not be written into a folder, which need not exist yet.
 
     Args:
         path: the folder.
         num_bytes: room that the results will take.
+        holds: names of the files that will be written there.
+        overwrite: replace files of these names whoever wrote them; otherwise only those that this program wrote.
 
     Raises:
         ValueError: a file of that name, or a file above it.
+        FileExistsError: without `overwrite`, one of the files is there and this program did not write it.
         PermissionError: it could not be made or written to.
         OSError: the disk has not as much room.
     """
@@ -75,6 +83,8 @@ def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ValueError(f"{existing} is a file; name a folder instead of {path}")
+    for name in holds:
+        require_own(path / name, overwrite=overwrite)
     _require_writable(existing)
     free = shutil.disk_usage(existing).free
     if num_bytes > free:
@@ -83,6 +93,17 @@ def check_folder(path: str | Path, *, num_bytes: int = 0) -> Path:
             "free some space, choose another disk or a smaller size"
         )
     return path
+
+
+def reserve(path: Path, num_bytes: int) -> None:
+    """Take the room of a file before it is written through a memory map, where a full disk would end the program.
+
+    Raises:
+        OSError: the disk has not as much room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        with path.open("r+b") as stream:
+            os.posix_fallocate(stream.fileno(), 0, num_bytes)
 
 
 def _require_writable(folder: Path) -> None:
@@ -104,36 +125,26 @@ def require_whole(path: Path, num_bytes: int) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside `path`, renamed onto it when the block succeeds and removed when it fails."""
-    path = Path(path)
-    clear_leftovers(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=partial_prefix(path.stem), suffix=path.suffix)
-    os.close(handle)
-    partial = Path(name)
-    try:
+    """A name for a temporary file, renamed onto `path` when the block succeeds; a link's target is written, and it stays a link."""
+    with partial_folder(path) as folder:
+        partial = folder / Path(path).name
         yield partial
         partial.chmod(0o666 & ~_umask())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        partial.replace(link_target(path))
 
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder beside `path`, which takes its place when the block succeeds and is removed when it fails."""
-    path = Path(path)
-    clear_leftovers(path)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=partial_prefix(path.stem), suffix=path.suffix))
-    old = partial.with_name(partial.name + ".old")
-    try:
+    """A temporary folder, which takes the place of `path`, or of a link's target, when the block succeeds."""
+    target = link_target(path)
+    with partial_folder(path) as folder:
+        partial = folder / "new"
+        partial.mkdir()
         yield partial
         partial.chmod(0o777 & ~_umask())
-        if path.exists():
-            path.rename(old)
-        partial.rename(path)
-    finally:
-        for leftover in (partial, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        if target.exists():
+            target.rename(folder / REPLACED)
+        partial.rename(target)
 
 
 def _umask() -> int:

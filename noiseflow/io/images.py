@@ -96,7 +96,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
     Raises:
         ValueError: unknown suffix, no image, or a number type the format cannot hold.
     """
-    from noiseflow.io import mrc, ome_zarr, tiff
+    from noiseflow.io import mrc, numpy_files, ome_zarr, tiff
 
     path = check_output(path)
     data = as_array(data)
@@ -115,9 +115,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
-            stored = data
-            with target.open("wb") as stream:
-                np.save(stream, data, allow_pickle=False)
+            stored = numpy_files.write(target, data)
         require_whole(target, stored.nbytes)
 
 

@@ -2,33 +2,66 @@
 
 from __future__ import annotations
 
+import inspect
 import json
-from collections.abc import Mapping
-from importlib.metadata import entry_points, version
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 import noiseflow
-from noiseflow.io import atomic_path, check_output
+from noiseflow.io import check_output
+from noiseflow.io.tensor_files import save_tensors
+from noiseflow.models.base import NoiseModelBase
+from noiseflow.plugins import load_plugins
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
+Kind = TypeVar("Kind", bound=type[NoiseModelBase])
+_REGISTERED: dict[str, type[NoiseModelBase]] = {}
+
+
+def register(kind: Kind) -> Kind:
+    """Let model files name a class of noise models; a class decorator. No package needs to be installed.
+
+    A program that loads such a file registers the class too, before `load`: a file holds parameters and never code.
+
+    Args:
+        kind: a concrete subclass of `NoiseModelBase`; its ``config()`` gives the arguments that make the model again.
+
+    Raises:
+        TypeError: not a noise model, or an abstract one.
+        ValueError: another class has that name already.
+    """
+    if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
+        raise TypeError(
+            f"{kind!r} is no class of noise models; derive it from noiseflow.NoiseModelBase and give it forward()"
+        )
+    taken = kinds().get(kind.__name__)
+    if taken is not None and (taken.__module__, taken.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(
+            f"{kind.__name__} is the name of {taken.__module__}.{taken.__qualname__}; give the class another"
+        )
+    _REGISTERED[kind.__name__] = kind
+    return kind
+
+
 def kinds() -> dict[str, type[nn.Module]]:
-    """Every noise model that a file may name: the public ones here, and those of installed packages (entry points
-    ``noiseflow.noise_models``)."""
+    """Every noise model that a file may name: the public ones here, those given to `register`, and those of installed packages
+    (entry points ``noiseflow.noise_models``)."""
     own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
     found = {
         name: kind
         for name, kind in own.items()
-        if isinstance(kind, type) and issubclass(kind, nn.Module) and hasattr(kind, "config")
+        if inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
     }
-    return found | {point.name: point.load() for point in entry_points(group="noiseflow.noise_models")}
+    return found | _REGISTERED | load_plugins("noiseflow.noise_models")
 
 
 def save(
@@ -45,8 +78,6 @@ def save(
     Raises:
         ValueError: unknown kind of model, or a path that cannot be written.
     """
-    from safetensors.torch import save_file
-
     path = check_output(path, suffixes=MODEL_SUFFIXES)
     metadata = {
         "format": "noiseflow noise model",
@@ -57,8 +88,7 @@ def save(
         "provenance": json.dumps(dict(provenance or {}), default=str),
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
-    with atomic_path(path) as partial:
-        save_file(tensors, partial, metadata=metadata)
+    save_tensors(path, tensors, metadata)
     return path
 
 
@@ -72,10 +102,9 @@ def load(path: str | Path) -> nn.Module:
     metadata, tensors = _open(Path(path))
     try:
         description = json.loads(metadata["model"])
-        sizes = _checked_sizes(description, sum(tensor.numel() for tensor in tensors.values()))
-        if max(sizes, default=0) > _LARGEST_USUAL_SIZE:
-            with torch.device("meta"):  # takes no memory, whatever the description claims
-                _check_parameters(_build(description), tensors)
+        _check_sizes(description, sum(tensor.numel() for tensor in tensors.values()))
+        with torch.device("meta"):  # takes no memory, whatever the description claims
+            _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
@@ -113,18 +142,26 @@ def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> No
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")
 
 
-def _checked_sizes(description: Mapping[str, Any], num_parameters: int, *, depth: int = 0) -> list[int]:
-    """All whole numbers among the arguments; refuses what could only cost memory and time: a size larger than the
-    parameters it would have, and models nested without end."""
+def _check_sizes(description: Mapping[str, Any], num_parameters: int, *, depth: int = 0) -> None:
+    """Refuse what could only cost memory and time: a size larger than the parameters it would have, and models nested
+    without end."""
     inner = description.get("models", {})
     if depth > _DEEPEST or len(inner) > _DEEPEST:
         raise ValueError("models within models without end; fit and save the model again")
-    sizes = [abs(value) for value in description["arguments"].values() if isinstance(value, int)]
-    if max(sizes, default=0) > max(num_parameters, _LARGEST_USUAL_SIZE):
-        raise ValueError(f"a size of {max(sizes)} with {num_parameters} parameters; fit and save the model again")
+    largest = max(_whole_numbers(description["arguments"]), default=0)
+    if largest > max(num_parameters, _LARGEST_USUAL_SIZE):
+        raise ValueError(f"a size of {largest} with {num_parameters} parameters; fit and save the model again")
     for child in inner.values():
-        sizes += _checked_sizes(child, num_parameters, depth=depth + 1)
-    return sizes
+        _check_sizes(child, num_parameters, depth=depth + 1)
+
+
+def _whole_numbers(value: Any) -> Iterator[int]:
+    """Sizes of all whole numbers in nested values."""
+    if isinstance(value, int):
+        yield abs(value)
+    elif isinstance(value, (list, dict)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _whole_numbers(item)
 
 
 def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
@@ -153,7 +190,8 @@ def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
         raise ValueError(
-            f"{kind} is not a known kind of noise model; register it as an entry point of 'noiseflow.noise_models'"
+            f"{kind} is not a known kind of noise model; put @noiseflow.register before its class, or name it under the "
+            "entry points 'noiseflow.noise_models' of a package"
         )
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
@@ -162,6 +200,8 @@ def _describe(model: nn.Module) -> dict[str, Any]:
 def _build(description: Mapping[str, Any]) -> nn.Module:
     known = kinds()
     if description["kind"] not in known:
-        raise ValueError(f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}")
+        raise ValueError(
+            f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}; import what registers it"
+        )
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
     return known[description["kind"]](**description["arguments"], **inner)

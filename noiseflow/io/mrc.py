@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.ownership import signature
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -70,6 +71,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     stored = np.ascontiguousarray(_storable(data))
     with Sectionwise(path, "w+", overwrite=True) as mrc:
         mrc.set_data(stored)
+        mrc.add_label(signature())
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]
     return stored

@@ -12,6 +12,7 @@ from noiseflow.io.checks import require_room
 from noiseflow.io.image_file import ImageFile
 from noiseflow.io.metadata import recorded_angles
 from noiseflow.io.microscope import choose_member
+from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -32,6 +33,21 @@ def read_npz(path: Path, member: str | None = None) -> ImageFile:
         lists = [n for n, shape in zip(names, shapes, strict=True) if shape == (len(data),)]
         angles = recorded_angles(((n, [float(value) for value in archive[n]]) for n in lists), len(data))
     return ImageFile(data, None, angles)
+
+
+def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
+    """Write an array of any number type as it is, section by section, with the mark of `noiseflow.io.ownership`.
+
+    Returns:
+        The pixels as stored.
+    """
+    described = {"descr": np.lib.format.dtype_to_descr(data.dtype), "fortran_order": False, "shape": data.shape}
+    start = npy_start()
+    with path.open("wb") as stream:
+        stream.write(start + repr(described).encode().ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n")
+        for section in data:
+            stream.write(np.ascontiguousarray(section).data)
+    return data
 
 
 def _claim(archive: Any, name: str, path: Path) -> tuple[int, ...]:

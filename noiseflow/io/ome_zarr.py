@@ -5,6 +5,7 @@ Source: https://ngff.openmicroscopy.org/0.5
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.ownership import MARK
 from noiseflow.io.units import in_angstrom
 
 _SMALLEST_EDGE = 64
@@ -45,6 +47,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
     multiscale: dict[str, Any] = {"name": path.stem.split(".")[0], "type": "mean", "datasets": datasets}
     multiscale["axes"] = [{"name": axis, "type": "space", **unit} for axis in axes]
     group.attrs["ome"] = {"version": "0.5", "multiscales": [multiscale]}
+    group.attrs["_creator"] = {"name": MARK, "version": version("noiseflow")}
 
 
 def read(path: Path) -> ImageFile:

@@ -1,22 +1,50 @@
-"""Names of temporary files tell whose they are: what a killed program left is cleared away when the next writes the same."""
+"""Names of temporary folders tell whose they are: what a killed program left is cleared away when the next writes the same."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import platform
 import re
 import shutil
+import tempfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 _LONGEST = 40
+_ENDING = ".part"
+REPLACED = "replaced"
+"""Name, within a temporary folder, of the folder that is being replaced."""
 
 
-def partial_prefix(stem: str) -> str:
-    """How the name of a temporary file of this process begins."""
-    return f".{stem[:_LONGEST]}-{_machine()}-{os.getpid()}-"
+def link_target(path: str | Path) -> Path:
+    """What a symbolic link points to, or the path itself: a link that is written stays a link."""
+    path = Path(path)
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
+@contextlib.contextmanager
+def partial_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary folder beside an output, gone when the block ends; a killed run's is cleared by the next one.
+
+    Whatever libraries leave beside the files they write lies in it, too.
+
+    Raises:
+        FileNotFoundError: the output's folder is gone.
+    """
+    path = link_target(path)
+    clear_leftovers(path)
+    try:
+        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=_prefix(path.stem), suffix=path.suffix + _ENDING))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(errno.ENOENT, "the output folder does not exist any more", str(path.parent)) from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def clear_leftovers(path: Path) -> None:
@@ -24,21 +52,30 @@ def clear_leftovers(path: Path) -> None:
 
     Files of other machines, of running programs and of other names stay.
     """
-    name = rf"\.{re.escape(path.stem[:_LONGEST])}-{_machine()}-(\d{{1,9}})-\w{{8}}{re.escape(path.suffix)}(\.old)?"
+    _clear(path.parent, rf"\.{re.escape(path.stem[:_LONGEST])}", re.escape(path.suffix), path)
+
+
+def clear_all_leftovers(folder: Path) -> None:
+    """Remove what programs that no longer run left of any output in a folder of ours; all else stays, as above."""
+    _clear(folder, r"\..*", r"(?:\.\w+)?", None)
+
+
+def _clear(folder: Path, beginning: str, suffix: str, path: Path | None) -> None:
+    name = re.compile(rf"{beginning}-{_machine()}-(\d{{1,9}})-\w{{8}}{suffix}{re.escape(_ENDING)}")
     with contextlib.suppress(OSError):
-        for leftover in sorted(path.parent.iterdir()):
-            found = re.fullmatch(name, leftover.name)
-            if found is not None and not _runs(int(found[1])):
-                _clear(leftover, path, replaced=found[2] is not None)
+        for leftover in sorted(folder.iterdir()):
+            found = name.fullmatch(leftover.name)
+            if found is None or leftover.is_symlink() or _runs(int(found[1])):
+                continue
+            replaced = leftover / REPLACED
+            if path is not None and replaced.exists() and not path.exists():
+                replaced.rename(path)
+            if path is not None or not replaced.exists():
+                shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _clear(leftover: Path, path: Path, *, replaced: bool) -> None:
-    if replaced and not path.exists():
-        leftover.rename(path)
-    elif leftover.is_dir() and not leftover.is_symlink():
-        shutil.rmtree(leftover, ignore_errors=True)
-    else:
-        leftover.unlink(missing_ok=True)
+def _prefix(stem: str) -> str:
+    return f".{stem[:_LONGEST]}-{_machine()}-{os.getpid()}-"
 
 
 @functools.cache

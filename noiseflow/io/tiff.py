@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.ownership import signature
 from noiseflow.io.units import in_angstrom
 
 if TYPE_CHECKING:
@@ -46,20 +47,27 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     import tifffile
 
     if voxel_size is None:
-        tifffile.imwrite(path, data, photometric="minisblack")  # or a stack of three would be stored as colour
+        tifffile.imwrite(
+            path, data, photometric="minisblack", software=signature()
+        )  # or a stack of three would be stored as colour
         return data
     z, y, x = voxel_size
     if data.dtype in _OUTSIDE_OME:
         data = exactly_as(data, (np.float32, np.int32, np.uint32, np.float64), "OME-TIFF")
     if data.dtype in _IMAGEJ_TYPES and data.nbytes < _IMAGEJ_BYTES:
         tifffile.imwrite(
-            path, data, imagej=True, resolution=(1 / x, 1 / y), metadata={"spacing": z, "unit": "angstrom"}
+            path,
+            data,
+            imagej=True,
+            resolution=(1 / x, 1 / y),
+            metadata={"spacing": z, "unit": "angstrom"},
+            software=signature(),
         )
         return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
     units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
     metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
-    tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata)
+    tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata, software=signature())
     return data
 
 

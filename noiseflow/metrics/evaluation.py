@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import Given, alike, as_tensor, floating
+from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
 
 _CHUNK = 65536
@@ -98,7 +98,7 @@ def evaluate(
 
     Args:
         noise_model: the model.
-        signal, observation: tensors or arrays of any shape, equal; detector units.
+        signal, observation: tensors or arrays of any shape, equal; detector units. Masked pixels are left out.
         num_bins: bins of the residual histograms.
         num_signal_bins: bins of equal population along the signal.
         skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
@@ -107,7 +107,10 @@ def evaluate(
     Raises:
         ValueError: shapes differ, pixels are not finite, or there are none.
     """
+    (signal, observation), kept = unmasked(signal, observation)
     signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)
+    if kept is not None and signal.shape == observation.shape:
+        signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
     if signal.shape != observation.shape or not signal.numel():
         raise ValueError(
             f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
@@ -141,7 +144,11 @@ def evaluate(
 
 @torch.no_grad()
 def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) -> Given:
-    """Log-likelihood of each pixel, float64, (N,), computed piece by piece."""
+    """Log-likelihood of each pixel, float64, (N,), computed piece by piece; of Dask arrays, a Dask array."""
+    if is_lazy(signal) or is_lazy(observation):
+        lazy = noise_model(signal if is_lazy(signal) else observation * 0 + signal)
+        found: Given = lazy.log_prob(observation).astype(float)
+        return found
     pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
     return alike(torch.cat([noise_model(s).log_prob(o).double().cpu() for s, o in pieces]), signal)
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 
-class Gaussian(ArrayModel):
+class Gaussian(NoiseModelBase):
     """Gaussian noise of one standard deviation around the signal.
 
     Args:
@@ -31,10 +30,6 @@ class Gaussian(ArrayModel):
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Start at the root-mean-square residual of (N,) signals and observations."""
         self.log_scale.copy_(torch.log((observation.double() - signal.double()).square().mean().sqrt()))
-
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
 
     def extra_repr(self) -> str:
         return f"scale={math.exp(self.log_scale.item()):.4g}"
@@ -66,7 +61,7 @@ class GaussianDistribution(LatentDistribution):
         return torch.exp(2 * self.log_scale).expand_as(self.signal)
 
 
-class Poisson(ArrayModel):
+class Poisson(NoiseModelBase):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
     Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell: it
@@ -95,10 +90,6 @@ class Poisson(ArrayModel):
         self.log_gain.copy_(torch.log(gain))
         self.offset.copy_(offset)
         self.requires_grad_(False)
-
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
 
     def extra_repr(self) -> str:
         return f"gain={math.exp(self.log_gain.item()):.4g}, offset={self.offset.item():.4g}"

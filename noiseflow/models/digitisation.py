@@ -52,6 +52,8 @@ def detect_digitisation(readings: ArrayLike) -> Digitisation:
         readings: any shape and real type, detector units; NaN and infinite ones are left out.
     """
     values = np.asarray(readings.detach().cpu() if hasattr(readings, "detach") else readings)
+    if isinstance(readings, np.ma.MaskedArray):
+        values = readings.compressed()
     if values.dtype.kind == "b":
         values = values.astype(np.uint8)
     values = values.reshape(-1)

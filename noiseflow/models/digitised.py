@@ -12,14 +12,15 @@ from torch import Tensor, nn
 from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.around import ModelAround
+from noiseflow.models.base import NoiseModelBase
 
 _MOMENT_NODES = 257
 _MOMENT_COUNT = 2**18
 _LEAST_KEPT, _RAILED = 256, 0.02
 
 
-class Digitised(ArrayModel):
+class Digitised(ModelAround):
     """A detector that rounds to steps and clips at rails, in front of any noise model.
 
     An observation k stands for every reading in (k − step/2, k + step/2]; the rails stand for everything beyond them too.
@@ -34,16 +35,18 @@ class Digitised(ArrayModel):
     """
 
     describes_single_readings = True
+    step: float = 1.0
+    low: float = -math.inf
+    high: float = math.inf
 
     def __init__(self, model: nn.Module, step: float = 1.0, low: float = -math.inf, high: float = math.inf) -> None:
-        super().__init__()
+        super().__init__(model)
         if step < 0:
             raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
         if not low < high:
             raise ValueError(f"low is {low} and high is {high}; the low rail must lie below the high one")
-        if any(hasattr(module, "behind") for module in model.modules()):
+        if self.model.shared_axis is not None:
             raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
-        self.model = model
         self.step, self.low, self.high = float(step), float(low), float(high)
 
     def forward(self, signal: Signal) -> DigitisedDistribution:
@@ -54,17 +57,15 @@ class Digitised(ArrayModel):
         return Digitised(self.model, step=self.step)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """Standardise the model inside, on what of the (N,) pixels the rails leave as it was, where that is enough."""
-        if not hasattr(self.model, "standardise"):
-            return
-        values, is_flow = values_of(signal), hasattr(self.model, "standardisation")
-        kept, seen = self._before_rails(values, observation, mirror=is_flow)
+        """Standardise the model inside, on what of the (N,) pixels clipping leaves as it was, where that is enough."""
+        values, by_level = values_of(signal), self.model.standardises_by_level
+        kept, seen = self._before_rails(values, observation, mirror=by_level)
         if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
             kept, seen = torch.ones_like(kept), observation
-        span = {"span": (float(values.min()), float(values.max()))} if is_flow else {}
-        self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)  # type: ignore[operator]
-        if hasattr(self.model, "settle"):  # the converter spoils what it was standardised on; now its part is known
-            self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))  # type: ignore[operator]
+        span = {"span": (float(values.min()), float(values.max()))} if by_level else {}
+        self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)
+        if not self.model.needs_image:  # the converter spoils what it was standardised on; now its part is known
+            self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
         """Which pixels the rails leave as they were, boolean, and their readings.
@@ -89,28 +90,32 @@ class Digitised(ArrayModel):
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
         """What of the likelihood of (N,) pixels does not change while the model inside learns; None where everything may."""
-        if not hasattr(self.model, "fixed_interval_part"):
-            return None
         on_low, on_high = observation <= self.low, observation >= self.high
         below, above = (observation - self.step / 2, observation + self.step / 2)
         low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
         if self.step > 0:
-            fixed: Tensor = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
-            return fixed
+            return self.model.fixed_interval_part(signal, low, high)
         # readings between the rails have a density: their interval is the whole line, and is not used
         on_rail = on_low | on_high
         low, high = torch.where(on_rail, low, -math.inf), torch.where(on_rail, high, math.inf)
-        interval = self.model.fixed_interval_part(signal, low, high)  # type: ignore[operator]
-        density = self.model.fixed_part(signal, observation)  # type: ignore[operator]
+        interval, density = (
+            self.model.fixed_interval_part(signal, low, high),
+            self.model.fixed_part(signal, observation),
+        )
+        if interval is None or density is None:
+            return None
         return torch.cat([interval, density, on_rail[:, None].to(interval.dtype)], -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
         """Log-likelihood of pixels by their `fixed_part`."""
-        found: Tensor = self.model.log_interval_prob_from(signal, fixed_part[:, :3])  # type: ignore[operator]
+        found = self.model.log_interval_prob_from(signal, fixed_part[:, :3])
         if self.step > 0:
             return found
-        between = self.model.log_prob_from(signal, fixed_part[:, 3:5])  # type: ignore[operator]
+        between = self.model.log_prob_from(signal, fixed_part[:, 3:5])
         return torch.where(fixed_part[:, 5] > 0, found, between)
+
+    def without_converter(self) -> NoiseModelBase:
+        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""

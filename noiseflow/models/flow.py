@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import LatentDistribution, normal_quadrature
 from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, interpolate_cubic
 
 _NUM_NODES = 257
@@ -27,7 +27,8 @@ class Layer:
 
     Args:
         initial: starting values of the raw parameters.
-        build: raw parameters (..., P) to a transform; any real parameters must give a valid one.
+        build: raw parameters (..., P) to a transform; any real parameters must give a valid one. A function of a module, for
+            models are pickled.
         conditional: whether the parameters depend on the signal.
     """
 
@@ -38,41 +39,49 @@ class Layer:
 
 def affine_layer(*, conditional: bool = True) -> Layer:
     """Location and scale of the standardised residual."""
-    return Layer((0.0, 0.0), lambda raw: Affine(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)), conditional)
+    return Layer((0.0, 0.0), _affine, conditional)
+
+
+def _affine(raw: Tensor) -> Transform:
+    return Affine(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5))
 
 
 def scale_layer(*, conditional: bool = True) -> Layer:
     """Scale of the standardised residual alone."""
-    return Layer((0.0,), lambda raw: Affine(torch.zeros_like(raw[..., 0]), _bounded(raw[..., 0], 5)), conditional)
+    return Layer((0.0,), _scale, conditional)
+
+
+def _scale(raw: Tensor) -> Transform:
+    return Affine(torch.zeros_like(raw[..., 0]), _bounded(raw[..., 0], 5))
 
 
 def radial_layer(centre: float = 0.0, *, conditional: bool = True) -> Layer:
     """One radial map; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
+    return Layer((centre, 0.0, 0.0), _radial, conditional)
 
-    def build(raw: Tensor) -> Transform:
-        return Radial(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 3), _bounded(raw[..., 2], 3))
 
-    return Layer((centre, 0.0, 0.0), build, conditional)
+def _radial(raw: Tensor) -> Transform:
+    return Radial(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 3), _bounded(raw[..., 2], 3))
 
 
 def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = True) -> Layer:
     """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
+    return Layer((0.0,) * (3 * num_bins + 1), partial(_spline, num_bins=num_bins, reach=reach), conditional)
 
-    def build(raw: Tensor) -> Transform:
-        widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
-        return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
 
-    return Layer((0.0,) * (3 * num_bins + 1), build, conditional)
+def _spline(raw: Tensor, *, num_bins: int, reach: float) -> Transform:
+    widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
+    return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
 
 
 def tail_layer(*, conditional: bool = False) -> Layer:
     """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
+    return Layer((-4.0, -4.0), _tail, conditional)
 
-    def build(raw: Tensor) -> Transform:
-        weight = 0.4 * torch.sigmoid(_bounded(raw, 10))
-        return StudentTail(weight[..., 0], weight[..., 1])
 
-    return Layer((-4.0, -4.0), build, conditional)
+def _tail(raw: Tensor) -> Transform:
+    weight = 0.4 * torch.sigmoid(_bounded(raw, 10))
+    return StudentTail(weight[..., 0], weight[..., 1])
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
@@ -117,7 +126,7 @@ def _knots(raw: Tensor, reach: float) -> Tensor:
     return torch.cat([-end, inner, end], -1)
 
 
-class ConditionalFlow(ArrayModel):
+class ConditionalFlow(NoiseModelBase):
     """A noise model made of layers, the first one next to the data; the last one gives the standard normal latent.
 
     Args:
@@ -134,6 +143,9 @@ class ConditionalFlow(ArrayModel):
             standard deviations in the mean); set it to False for the exact values at any size.
     """
 
+    standardises_by_level = True
+    neighbourhood: int = 1
+
     def __init__(
         self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
     ) -> None:
@@ -142,7 +154,6 @@ class ConditionalFlow(ArrayModel):
             raise ValueError(f"neighbourhood is {neighbourhood}; a window around a pixel has an odd side: 3, 5, …")
         self.layers, self.neighbourhood = tuple(layers), neighbourhood
         self.mean_preserving = mean_preserving
-        self.tabulate = True
         self.width = width
         self.standardisation = Standardisation()
         self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
@@ -155,6 +166,10 @@ class ConditionalFlow(ArrayModel):
     def needs_image(self) -> bool:
         """Whether the model looks beyond single pixels."""
         return self.neighbourhood > 1
+
+    @property
+    def fitted_range(self) -> tuple[float, float]:
+        return self.standardisation.fitted_range
 
     def forward(self, signal: Signal) -> FlowDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units.
@@ -329,6 +344,8 @@ class SplineFlow(ConditionalFlow):
         neighbourhood: see `ConditionalFlow`.
     """
 
+    joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
+
     def __init__(
         self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
     ) -> None:
@@ -347,6 +364,10 @@ class SignalDependentGaussian(ConditionalFlow):
         width: hidden units of the network that gives the standard deviation.
         neighbourhood: see `ConditionalFlow`.
     """
+
+    starts_anew = (
+        True  # its width is measured on the residuals; from the width about a worse signal it would hardly move
+    )
 
     def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
         super().__init__([scale_layer()], mean_preserving=True, width=width, neighbourhood=neighbourhood)

@@ -34,6 +34,10 @@ class LatentMean:
         self._laid_out: tuple[Any, ...] | None = None
         self._solved: tuple[Any, ...] | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Nothing of what was computed: it is known by the parameters' places in memory, and a copy has others."""
+        return {"_laid_out": None, "_solved": None}
+
     def __call__(self, signal: Tensor, detector: PoissonGaussian, correction: ConditionalFlow) -> Tensor:
         """Shifts at signals of any shape, float64; differentiable in them and in the parameters of `correction`."""
         self._lay_out(detector, correction)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from noiseflow.distributions import tabulated
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval
 from noiseflow.distributions.transforms import between_rows
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation
 
@@ -22,7 +22,7 @@ _BISECTIONS = 60
 _SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
 
 
-class Mixture(ArrayModel):
+class Mixture(NoiseModelBase):
     """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
 
     Args:
@@ -31,12 +31,12 @@ class Mixture(ArrayModel):
         mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
         width: hidden units of the network that turns a signal into the parameters.
 
-    Attributes:
-        tabulate: as that of `ConditionalFlow`.
-
     Raises:
         ValueError: fewer than one component.
     """
+
+    standardises_by_level = True
+    joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
 
     def __init__(
         self,
@@ -51,7 +51,6 @@ class Mixture(ArrayModel):
             raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
         self.num_components, self.shared_shape = num_components, shared_shape
         self.mean_preserving, self.width = mean_preserving, width
-        self.tabulate = True
         self.standardisation = Standardisation()
         # apart from the start, or all components would stay equal: means ±½, the outer ones wider
         place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
@@ -92,6 +91,10 @@ class Mixture(ArrayModel):
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
         self.standardisation.set_from(signal, observation, span)
 
+    @property
+    def fitted_range(self) -> tuple[float, float]:
+        return self.standardisation.fitted_range
+
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again."""
         names = ("num_components", "shared_shape", "mean_preserving", "width")
@@ -112,7 +115,7 @@ class MixtureDistribution(NoiseDistribution):
     """
 
     def __init__(
-        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: nn.Module
+        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: NoiseModelBase
     ) -> None:
         super().__init__(signal.shape)
         self.signal, self._components_at, self._model = signal, components_at, model
@@ -183,7 +186,7 @@ class MixtureDistribution(NoiseDistribution):
         return found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        if getattr(self._model, "tabulate", False) and self.signal.numel() * math.prod(sample_shape) >= tabulated.LARGE:
+        if self._model.tabulate and self.signal.numel() * math.prod(sample_shape) >= tabulated.LARGE:
             found = tabulated.sample(self._model, self.signal.expand((*sample_shape, *self.batch_shape)), generator)
             if found is not None:
                 return found

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
 
 
-class PoissonGaussian(ArrayModel):
+class PoissonGaussian(NoiseModelBase):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
     The rate of k is (signal − offset)/gain. Below the offset it is 0, and read noise is spread about the signal: no clean image
@@ -35,6 +34,7 @@ class PoissonGaussian(ArrayModel):
     """
 
     starts_most_likely = True  # `standardise` leaves little to climb
+    most_joint_steps = 15  # the exact sum over electrons takes long, and it starts at its most likely parameters
     origin: Tensor
     axes: Tensor
 
@@ -88,21 +88,17 @@ class PoissonGaussian(ArrayModel):
         self.settle(signal, observation)
 
     def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module] = lambda detector: detector
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
         """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
 
         Args:
             signal, observation: detector units.
-            behind: puts the detector behind what stands in front of the readings, such as rounding and rails.
+            behind: puts the detector behind what stands in front of its values, such as rounding and clipping.
         """
         from noiseflow.models.detector_start import settle
 
-        settle(self, behind(self), signal, observation)
-
-    def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
-        return {}
+        settle(self, self if behind is None else behind(self), signal, observation)
 
     def extra_repr(self) -> str:
         gain, offset, read_noise = (float(each.detach()) for each in self._parameters_now())

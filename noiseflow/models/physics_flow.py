@@ -6,17 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from noiseflow.distributions.transforms import Affine, Transform
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow, affine_layer, spline_layer
 from noiseflow.models.latent_mean import LatentMean
 from noiseflow.models.physical import PoissonGaussian
 from noiseflow.models.physics_distribution import PhysicsFlowDistribution
 
 
-class PhysicsFlow(ArrayModel):
+class PhysicsFlow(NoiseModelBase):
     """Poisson–Gaussian noise, corrected by a flow of its latent.
 
     The latent of an observation under the detector, z = Φ⁻¹(F(o | s)), is standard normal if the detector is the whole truth.
@@ -33,10 +33,9 @@ class PhysicsFlow(ArrayModel):
             correction leaves up to 1e-2, and 1e-1 near the offset.
         width: hidden units of the conditioning network.
         detector: the physical part; a default `PoissonGaussian` where none is given.
-
-    Attributes:
-        tabulate: as that of `ConditionalFlow`.
     """
+
+    most_joint_steps = PoissonGaussian.most_joint_steps
 
     def __init__(
         self,
@@ -48,7 +47,6 @@ class PhysicsFlow(ArrayModel):
     ) -> None:
         super().__init__()
         self.num_bins, self.mean_preserving, self.width = num_bins, mean_preserving, width
-        self.tabulate = True
         self.detector = (PoissonGaussian() if detector is None else detector).requires_grad_(False)
         self.correction = ConditionalFlow([affine_layer(), spline_layer(num_bins)], width=width)
         self._latent_mean = LatentMean()
@@ -71,9 +69,15 @@ class PhysicsFlow(ArrayModel):
         self.detector.standardise(signal, observation)
         self.correction.standardise(signal, observation)
 
-    def settle(self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module]) -> None:
+    def settle(
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
+    ) -> None:
         """Move the detector to its most likely parameters; see `PoissonGaussian.settle`."""
         self.detector.settle(signal, observation, behind)
+
+    @property
+    def fitted_range(self) -> tuple[float, float]:
+        return self.correction.fitted_range
 
     @torch.no_grad()
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:

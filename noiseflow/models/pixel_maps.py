@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from noiseflow.arrays import floating
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.around import ModelAround
+from noiseflow.models.base import NoiseModelBase
 
 
-class WithMaps(ArrayModel):
+class WithMaps(ModelAround):
     """A noise model seen through a detector whose pixels have gains and offsets of their own.
 
     observation = gain·o + offset, o drawn from the model at the clean signal: signals are those of an ideal pixel (gain 1,
@@ -43,14 +44,14 @@ class WithMaps(ArrayModel):
         *,
         shape: Sequence[int] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(model)
         sizes = [tuple(each.shape) for each in (gain, offset) if each is not None] or [tuple(shape or ())]
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:
             raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or two of one size")
-        self.model = model
         self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
         self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
-        if not bool((torch.isfinite(self.gain) & torch.isfinite(self.offset) & (self.gain > 0)).all()):
+        given = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
+        if not all(bool(torch.isfinite(each).all()) for each in given):
             raise ValueError(
                 "some gains are not positive, or gains or offsets are NaN; mend or mask these pixels' maps"
             )
@@ -77,9 +78,11 @@ class WithMaps(ArrayModel):
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
         """Standardise the model inside on the readings of ideal pixels."""
-        if hasattr(self.model, "standardise"):
-            gain, offset = self._at(signal)
-            self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)  # type: ignore[operator]
+        gain, offset = self._at(signal)
+        self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
+
+    def without_converter(self) -> NoiseModelBase:
+        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside and the maps."""

@@ -11,15 +11,14 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, normal_quadrature
 from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.models.base import ArrayModel
-from noiseflow.models.digitisation import Digitisation
-from noiseflow.models.digitised import Digitised
+from noiseflow.models.around import ModelAround, as_noise_model
+from noiseflow.models.base import NoiseModelBase
 
 _REACH = 8.0  # standard deviations of the offset beyond which nothing is looked for
 _FINE, _COARSE = 0.1, 0.25
 
 
-class ScanNoise(ArrayModel):
+class ScanNoise(ModelAround):
     """A noise model plus one Gaussian offset for every row (or column) of an image, as scanning adds it.
 
     The readings of a row are no longer independent: given the offset b they are, so the likelihood of a row is
@@ -40,22 +39,26 @@ class ScanNoise(ArrayModel):
     needs_image = True
 
     def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
-        super().__init__()
+        super().__init__(model)
         if not scale > 0:
             raise ValueError(f"scale is {scale}; the standard deviation of the offsets must be positive")
         if along not in ("row", "column"):
             raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
-        if shared_axis(model) is not None:
+        if self.model.shared_axis is not None:
             raise ValueError(
                 "the model inside has offsets of rows or columns already; one such term is all there can be"
             )
-        self.model, self.along = model, along
+        self.along = along
         self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
 
     @property
     def axis(self) -> int:
         """The axis of an image along which pixels share an offset."""
         return -1 if self.along == "row" else -2
+
+    @property
+    def shared_axis(self) -> int:
+        return self.axis
 
     def forward(self, signal: Signal) -> ScanDistribution:
         """The distribution of images; of picked pixels, those along the last axis share an offset.
@@ -67,9 +70,9 @@ class ScanNoise(ArrayModel):
         axis = -1 if isinstance(signal, PickedSignal) else self.axis
         return ScanDistribution(self.model(given_to(self.model, signal)), torch.exp(self.log_scale), axis)
 
-    def behind(self, digitisation: Digitisation) -> ScanNoise:
-        """Put the model inside behind a converter: offsets are added before readings are rounded and clipped."""
-        self.model = Digitised(self.model, *digitisation)
+    def behind(self, converter: Callable[[NoiseModelBase], NoiseModelBase]) -> ScanNoise:
+        """Put the model inside behind a converter: offsets are added before pixel values are rounded and clipped."""
+        self.model = converter(self.model)
         return self
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
@@ -86,9 +89,11 @@ class ScanNoise(ArrayModel):
         share = variance / (variance + chance)
         with torch.no_grad():
             self.log_scale.copy_(variance.sqrt().log())
-        if hasattr(self.model, "standardise"):
-            left = observation - (share * (mean - mean.mean())).to(observation)[:, None]
-            self.model.standardise(given_to(self.model, signal[present]), left[present])  # type: ignore[operator]
+        left = observation - (share * (mean - mean.mean())).to(observation)[:, None]
+        self.model.standardise(given_to(self.model, signal[present]), left[present])
+
+    def without_converter(self) -> ScanNoise:
+        return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale)), along=self.along)
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside."""
@@ -100,8 +105,7 @@ class ScanNoise(ArrayModel):
 
 def shared_axis(noise_model: nn.Module) -> int | None:
     """The axis of an image along which pixels share an offset of a noise model; None where pixels are independent."""
-    found = [module.axis for module in noise_model.modules() if isinstance(module, ScanNoise)]
-    return found[0] if found else None
+    return as_noise_model(noise_model).shared_axis
 
 
 class ScanDistribution(NoiseDistribution):

@@ -33,6 +33,11 @@ class Standardisation(nn.Module):
         self.register_buffer("location", torch.zeros(_NUM_KNOTS))
         self.register_buffer("log_scale", torch.full((_NUM_KNOTS,), -2.3))
 
+    @property
+    def fitted_range(self) -> tuple[float, float]:
+        """Least and greatest signal of the fit, detector units."""
+        return float(self.signal_low), float(self.signal_high)
+
     def coordinate(self, signal: Tensor) -> Tensor:
         """Coordinate in [0, 1] of each signal."""
         fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)

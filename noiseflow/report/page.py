@@ -12,7 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from noiseflow.described import printable
 from noiseflow.io import atomic_path, check_output
+from noiseflow.io.ownership import signature
 from noiseflow.report.charts import themed_svg
 
 if TYPE_CHECKING:
@@ -36,29 +38,29 @@ class Report:
 
     def heading(self, text: str) -> None:
         """Start a section."""
-        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+        self._parts.append(f"<h2>{_escape(text)}</h2>")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(f"<p>{html.escape(text)}</p>")
+        self._parts.append(f"<p>{_escape(text)}</p>")
 
     def command(self, text: str) -> None:
         """Add a command as it would be typed; no line ends within an option."""
-        unbroken = re.sub(r"(?<!\S)(--\S+)", r"<span>\1</span>", html.escape(text))
+        unbroken = re.sub(r"(?<!\S)(--\S+)", r"<span>\1</span>", _escape(text))
         self._parts.append(f'<p class="command">{unbroken}</p>')
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
         """Add the few figures that matter most, (name, value), as cards."""
-        cards = "".join(f"<div><dt>{html.escape(n)}</dt><dd>{html.escape(v)}</dd></div>" for n, v in facts)
+        cards = "".join(f"<div><dt>{_escape(n)}</dt><dd>{_escape(v)}</dd></div>" for n, v in facts)
         self._parts.append(f'<dl class="facts">{cards}</dl>')
 
     def table(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str = "", prose: bool = False
     ) -> None:
         """Add a table; the first column is left-aligned, and with `prose` all are, and long cells wrap."""
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        note = f'<p class="note">{html.escape(caption)}</p>' if caption else ""
+        head = "".join(f"<th>{_escape(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{_escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        note = f'<p class="note">{_escape(caption)}</p>' if caption else ""
         kind = ' class="prose"' if prose else ""
         self._parts.append(f'<div class="scroll"><table{kind}><tr>{head}</tr>{body}</table></div>{note}')
 
@@ -67,7 +69,7 @@ class Report:
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches="tight")
         data = base64.b64encode(stream.getvalue()).decode()
-        text = html.escape(caption)
+        text = _escape(caption)
         self._parts.append(
             f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
         )
@@ -76,16 +78,16 @@ class Report:
         """Add small figures of `new_chart` side by side, as many in a row as fit; they follow light and dark."""
         drawn = "".join(themed_svg(figure) for figure in figures)
         self._parts.append(
-            f'<figure><div class="charts">{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>'
+            f'<figure><div class="charts">{drawn}</div><figcaption>{_escape(caption)}</figcaption></figure>'
         )
 
     def widget(self, kind: str, data: dict[str, Any], *, caption: str) -> None:
         """Add an interactive picture: ``volume`` or ``tilts``, with the data its script in ``assets`` reads."""
         stored = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
         self._parts.append(
-            f'<figure data-widget="{html.escape(kind)}"><script type="application/json">{stored}</script>'
+            f'<figure data-widget="{_escape(kind)}"><script type="application/json">{stored}</script>'
             "<noscript><p>This picture needs JavaScript.</p></noscript>"
-            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            f"<figcaption>{_escape(caption)}</figcaption></figure>"
         )
 
     def include(self, path: str | Path) -> None:
@@ -101,9 +103,10 @@ class Report:
     def save(self, path: str | Path) -> Path:
         """Write the page; returns its path."""
         path = check_output(path, suffixes=frozenset({".html"}))
-        title, lead = html.escape(self.title), html.escape(self.lead)
+        title, lead = _escape(self.title), _escape(self.lead)
         page = (
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            f'<meta name="generator" content="{signature()}">'
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}"><title>{title}</title>'
             '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
             f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'
@@ -114,6 +117,10 @@ class Report:
         with atomic_path(path) as partial:
             partial.write_text(page, encoding="utf-8")
         return path
+
+
+def _escape(text: str) -> str:
+    return html.escape(printable(text))
 
 
 def _asset(name: str) -> str:

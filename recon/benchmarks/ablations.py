@@ -18,7 +18,7 @@ from recon.benchmarks.scenes import Cell, Results, Scene, make_scene
 from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.joint.joint import JointReconstructor
-from recon.methods.laplace import Laplace
+from recon.joint.laplace import Laplace
 from recon.metrics.metrics import compare
 
 WEIGHT = 0.4
@@ -78,7 +78,7 @@ def _searched(scene: Scene, **options: Any) -> Best:
 
 def _once(scene: Scene, **options: Any) -> Best:
     result = JointReconstructor(**options)(scene.noisy, scene.grid)
-    return Best(f"weight {result.signal_model.weight:.3g}", result.volume.attenuation, {})
+    return Best(f"weight {result.weight:.3g}", result.volume.attenuation, {})
 
 
 def _likelihoods(scene: Scene) -> list[Variant]:

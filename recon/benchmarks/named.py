@@ -15,8 +15,8 @@ from recon.benchmarks import paper as benchmark_paper
 from recon.benchmarks import rivals as benchmark_rivals
 from recon.benchmarks.rivals import Effort
 from recon.benchmarks.scenes import Results, make_scene
-from recon.methods.classical import part_of
-from recon.methods.methods import reconstruct
+from recon.methods._classical import part_of
+from recon.methods._registry import reconstruct
 from recon.metrics.metrics import fourier_shell_correlation, resolution
 
 

@@ -17,7 +17,7 @@ from recon.benchmarks.scenes import Cell, Results
 from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from recon.fields.fields import VoxelField
 from recon.joint.joint import JointReconstructor
-from recon.methods.laplace import Laplace
+from recon.joint.laplace import Laplace
 from recon.metrics.comparison import project
 from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
 from recon.simulate.noises import CountingNoise
@@ -79,7 +79,7 @@ def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Cal
 
     def once(reconstructor: JointReconstructor, words: str) -> Best:
         result = reconstructor(given, grid)
-        return Best(f"{words}weight {result.signal_model.weight:.3g}", result.volume.attenuation, {})
+        return Best(f"{words}weight {result.weight:.3g}", result.volume.attenuation, {})
 
     return {
         "WBP": lambda: best(back_projections(given, grid), score),

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from noiseflow import Gaussian, fit
 from recon.fields.fields import Field
-from recon.joint.alternation import block_mask
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
+from recon.joint.task import block_mask
 from recon.methods.kniesel2022.network import CoordinateDensity
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
@@ -70,7 +70,7 @@ def fit_network(
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        start = JointReconstructor(noise_model=Gaussian, seed=seed).prepare(tilt_series, grid)
+        start = JointReconstructor(noise_model=Gaussian, seed=seed).signal_model(tilt_series, grid)
         field = NetworkField(grid.shape, layer_width=width, scale=float(start.field.scale))
         rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
         model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)

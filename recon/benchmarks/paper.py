@@ -54,7 +54,7 @@ def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
 
     def joint(reconstructor: JointReconstructor) -> Best:
         result = reconstructor(noisy)
-        return Best(f"chose weight {result.signal_model.weight:.3g}", result.volume.attenuation, {})
+        return Best(f"chose weight {result.weight:.3g}", result.volume.attenuation, {})
 
     return {
         "WBP": lambda: best(back_projections(noisy, grid), score),

@@ -22,7 +22,7 @@ from recon.benchmarks.external import astra_sirt, missing, quantem_inr
 from recon.benchmarks.scenes import Cell, Results, Scene, make_scene
 from recon.fields.fields import VoxelField
 from recon.joint.joint import JointReconstructor
-from recon.methods.classical import LineIntegralProblem
+from recon.methods._classical import LineIntegralProblem
 from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022
 from recon.metrics.metrics import compare
 from recon.projection.sirt import sirt

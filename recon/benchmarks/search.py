@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.denoise.denoisers import find_denoiser
 from recon.joint.joint import JointReconstructor
 from recon.joint.weight import choose_weight
-from recon.methods.classical import LineIntegralProblem
-from recon.methods.denoise import find_denoiser
+from recon.methods._classical import LineIntegralProblem
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp
 from recon.series.tilt_series import TiltSeries, VolumeGrid

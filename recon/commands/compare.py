@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, progress_bar
 from recon.commands.options import parse_mode
 
 
@@ -21,6 +21,7 @@ def compare(
         str, typer.Option(help="Projections are line integrals (linear) or exp(-line integral) (transmission).")
     ] = "linear",
     report: Annotated[Path | None, typer.Option("--report", "--plot", help="Folder for a page with pictures.")] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
@@ -30,8 +31,8 @@ def compare(
     from recon.series.tilt_series import Volume
 
     output = Output(json)
-    if report is not None and report.exists() and not report.is_dir():
-        raise ValueError(f"{report} is a file; name a folder for the report")
+    if report is not None:
+        io.check_folder(report, holds=["index.html"], overwrite=overwrite)
     files = [io.read(path) for path in (volume, reference)]
     first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
     tilt_angles = None if angles is None else io.read_angles(angles)

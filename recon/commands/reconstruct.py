@@ -13,7 +13,6 @@ from noiseflow.commands.console import (
     DeviceOption,
     JsonOption,
     Output,
-    Progress,
     SeedOption,
     choose_device,
     step_report,
@@ -23,7 +22,7 @@ from recon.commands.running import memory_line, open_journal, scratch_beside, st
 
 if TYPE_CHECKING:
     from recon.joint.checkpoint import Journal
-    from recon.methods.methods import Outcome
+    from recon.reconstruction import Reconstruction
     from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
@@ -104,6 +103,10 @@ def reconstruct(
     reference: Annotated[
         Path | None, typer.Option(help="Volume that the report correlates the result with, where --fsc is not given.")
     ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Print the plan with its memory and expected time, and stop before fitting."),
+    ] = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -115,7 +118,7 @@ def reconstruct(
     from noiseflow.io import require_other
     from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
-    from recon.methods.methods import settings_of
+    from recon.methods import find_method, settings_of
     from recon.report.page import read_reference
     from recon.series.tilt_series import VolumeGrid
 
@@ -129,7 +132,7 @@ def reconstruct(
         raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
-    if save_noise_model is not None and method.startswith(("sirt", "wbp")):
+    if save_noise_model is not None and not find_method(method).learns_noise:
         raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
     with warnings_as_lines(output) as warned:
         fixed = load_noise_model(noise_model)
@@ -159,12 +162,16 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        output.line(memory_line(tilt_series, grid, method, chosen_device, slices_at_once))
+        memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once)
+        output.line(memory)
+        if dry_run:
+            _show_plan(tilt_series, grid, options, memory, output)
+            return
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
         with stoppable(journal, context), scratch_beside(out) as scratch:
             if slices_at_once is not None:
-                options |= {"rows_at_once": slices_at_once, "scratch": scratch}
+                options |= {"slices_at_once": slices_at_once, "scratch": scratch}
             with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
             targets.write(
@@ -184,26 +191,45 @@ def reconstruct(
 
 def _solve(
     tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
-) -> tuple[Outcome, tuple[Volume, Volume] | None]:
+) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
-    from recon.joint.joint import JointReconstructor
-    from recon.methods.methods import reconstruct
+    from recon.methods import reconstruct
     from recon.report.page import even_odd
-    from recon.scale.blocks import reconstruct_in_blocks
 
-    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage}
+    def progress(done: int, total: int, note: str) -> None:
+        if journal.report is not None:
+            journal.report("reconstructing", done, total, note)
 
-    def progress(title: str) -> Progress:
-        return journal.progress(title, options["num_steps"] or JointReconstructor.num_steps)
-
-    if "scratch" in options:
-        return reconstruct_in_blocks(tilt_series, grid, **options, progress=progress("fitting a block")), None
-    outcome = reconstruct(tilt_series, grid, **options, progress=progress("fitting the volume"))
+    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
+    outcome = reconstruct(tilt_series, grid, **options)
     if not fsc:
         return outcome, None
-    options["progress"] = progress("fitting half of the tilts")
-    first, second = (reconstruct(half, grid, **options).volume for half in even_odd(tilt_series))
+    halves = zip(("even tilts: ", "odd tilts: "), even_odd(tilt_series), strict=True)
+    first, second = (reconstruct(half, grid, **options, prefix=prefix).volume for prefix, half in halves)
     return outcome, (first, second)
+
+
+def _show_plan(tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], memory: str, output: Output) -> None:
+    """What would be done, in words and for programs."""
+    from dataclasses import asdict
+
+    from recon.joint.plan import describe
+    from recon.methods import find_method, settings_of
+    from recon.scale.cost import expected_seconds
+
+    method = find_method(options["method"])
+    result: dict[str, Any] = {"method": method.name, "memory": memory, "stages": [], "expected_seconds": None}
+    if method.plan is None:
+        output.line(f"{method.name}: {method.description} It has no stages to plan.")
+    else:
+        made = {name: value for name, value in options.items() if name != "method"}
+        stages, slab = method.plan(tilt_series, grid, settings_of(method.name, **made))
+        seconds = expected_seconds(stages, tilt_series, grid, slab)
+        output.line(f"slab: {slab} of {grid.height} slices")
+        output.line(describe(stages))
+        output.line(f"expected: about {seconds:.0f} s on this machine")
+        result |= {"stages": [asdict(stage) for stage in stages], "expected_seconds": seconds}
+    output.result(result)
 
 
 def _settings(

@@ -15,7 +15,7 @@ from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.io.model_files import MODEL_SUFFIXES
 from recon.commands.inputs import Prepared
-from recon.methods.methods import Outcome
+from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
 
@@ -48,7 +48,7 @@ class Targets:
         self,
         output: Output,
         tilt_series: TiltSeries,
-        outcome: Outcome,
+        outcome: Reconstruction,
         *,
         seconds: float,
         inputs: Sequence[Path],
@@ -85,13 +85,13 @@ class Targets:
         )
 
 
-def _save_noise_model(outcome: Outcome, path: Path, source: Path) -> None:
+def _save_noise_model(outcome: Reconstruction, path: Path, source: Path) -> None:
     if outcome.noise_model is None:
         raise ValueError(f"--save-noise-model: method {outcome.method} learns no noise model; use --method joint")
     noiseflow.save(outcome.noise_model, path, provenance={"tilt_series": source.name, "method": outcome.method})
 
 
-def _figures(tilt_series: TiltSeries, outcome: Outcome, seconds: float) -> dict[str, str]:
+def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -> dict[str, str]:
     rows = {
         "method": outcome.method,
         "volume (z, y, x)": " x ".join(str(size) for size in outcome.volume.attenuation.shape),

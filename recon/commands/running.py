@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from noiseflow.commands.console import START_AGAIN, end_stopped
+from noiseflow.described import printable
+from noiseflow.io import locked, partial_folder
 
 if TYPE_CHECKING:
     from noiseflow.commands.console import Output
@@ -58,14 +60,20 @@ class StopSignal:
 
 @contextlib.contextmanager
 def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
-    """Run fits that can be stopped; says how to go on, and ends with exit code 130.
+    """Run fits that can be stopped, alone on their journal; says how to go on, and ends with exit code 130.
 
     Raises:
         SystemExit: the run was stopped.
+        BlockingIOError: another run holds the journal.
+        OSError: the disk is full or gone; the error says how to go on where there is a state.
     """
-    with StopSignal(journal):
+    with locked(journal.folder.with_suffix("")), StopSignal(journal):
         try:
             yield
+        except OSError as error:
+            if journal.resumed and journal.exists:
+                error.add_note(f"the last state is kept: when that is mended, go on with: {resume_command(context)}")
+            raise
         except KeyboardInterrupt as stop:
             advice = f"go on with: {resume_command(context)}" if journal.resumed else START_AGAIN
             end_stopped(f"{str(stop) or 'stopped'}; {advice}")
@@ -94,7 +102,7 @@ def warnings_as_lines(output: Output) -> Iterator[list[str]]:
         text = " ".join(str(message).split())
         if issubclass(category, UserWarning) and text not in told:
             told.append(text)
-            print(f"noiseflow: warning: {text}", file=sys.stderr, flush=True)
+            print(f"noiseflow: warning: {printable(text)}", file=sys.stderr, flush=True)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
@@ -122,12 +130,9 @@ def memory_line(
 
 @contextlib.contextmanager
 def scratch_beside(out: Path) -> Iterator[Path]:
-    """A name for a file beside `out`, gone at the end if it was made."""
-    scratch = out.with_name(f".{out.name}.blocks.npy")
-    try:
-        yield scratch
-    finally:
-        scratch.unlink(missing_ok=True)
+    """A name for a file beside `out`, gone at the end; what a killed run left is cleared by the next one."""
+    with partial_folder(out) as folder:
+        yield folder / "blocks.npy"
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:

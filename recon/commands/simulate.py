@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, SeedOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, progress_bar
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def simulate(
         ),
     ] = 0.0,
     mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
+    overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
@@ -65,10 +66,14 @@ def simulate(
         "validation": angles_between(angles, _VALIDATION, share=1 / 3),
         "test": angles_between(angles, _TEST, share=2 / 3),
     }
-    if (folder / "tilts.mrc").exists() and not (folder / "truth.mrc").exists():
-        raise ValueError(f"{folder} holds a tilts.mrc that was not simulated and would be lost; name another folder")
+    if (folder / "tilts.mrc").exists() and not (folder / "truth.mrc").exists() and not overwrite:
+        raise ValueError(
+            f"{folder} holds a tilts.mrc that was not simulated and would be lost; name another folder, or give --overwrite"
+        )
     num_images = sum(map(len, stacks.values())) + len(angles)
-    io.check_folder(folder, num_bytes=4 * size**2 * (size + num_images))
+    holds = [f"{name}{suffix}" for name in (*stacks, "tilts") for suffix in (".mrc", ".rawtlt")]
+    num_bytes = 4 * size**2 * (size + num_images)
+    io.check_folder(folder, num_bytes=num_bytes, holds=["truth.mrc", *holds], overwrite=overwrite)
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
     with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
         simulation.write(folder, progress)

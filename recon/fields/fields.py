@@ -58,6 +58,11 @@ class Field(Described):
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
         raise NotImplementedError
 
+    @property
+    def has_coarser(self) -> bool:
+        """Whether `coarser` gives a field."""
+        return False
+
     def coarser(self) -> Field | None:
         """This field on a lattice half as fine, by the same parameters: what it learns, this one has learnt. None where it has no
         such lattice."""
@@ -130,9 +135,13 @@ class MultiresolutionField(Field):
             grid = self.grids[max(0, len(self.grids) - 3)]
             grid.copy_(self._raw_of(volume, grid.shape))
 
+    @property
+    def has_coarser(self) -> bool:
+        return len(self.grids) > 1 and type(self) is MultiresolutionField
+
     def coarser(self) -> Field | None:
         """The sum of all grids but the finest; a derived class may make its volume otherwise."""
-        if len(self.grids) < 2 or type(self) is not MultiresolutionField:
+        if not self.has_coarser:
             return None
         depth, width, height = self.grids[-2].shape
         field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)

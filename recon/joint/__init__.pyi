@@ -1,2 +1,2 @@
 from .joint import JointReconstructor as JointReconstructor
-from .joint import Reconstruction as Reconstruction
+from .joint import Settled as Settled

@@ -18,11 +18,11 @@ from noiseflow import (
     SplineFlow,
     detect_digitisation,
 )
+from noiseflow.models.around import as_noise_model
 
 _CLIPPED = 0.02
 _FAR = 0.01  # of the contrast
 _SHARED = 6  # Gaussians of a shape that all signals share: enough for a long tail on one side
-_EXACT_STEPS = 15
 
 
 def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Module]:
@@ -65,22 +65,20 @@ def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
 
 def learns(noise_model: nn.Module) -> bool:
     """Whether a noise model has anything to learn."""
-    return any(parameter.requires_grad for parameter in noise_model.parameters())
+    return as_noise_model(noise_model).learns
 
 
 def num_steps_of(noise_model: nn.Module, usual: int) -> int:
-    """The exact sum over electrons takes long, but it starts at its most likely parameters."""
-    exact = any(isinstance(module, PoissonGaussian) for module in noise_model.modules())
-    return min(usual, _EXACT_STEPS) if exact else usual
+    """Steps of a fit of a noise model to an estimated signal: the usual number, or the most that the model asks for."""
+    most = as_noise_model(noise_model).most_joint_steps
+    return usual if most is None else min(usual, most)
 
 
 def starts_anew(noise_model: nn.Module) -> bool:
-    """Whether it had better start from scratch on a better signal: a Gaussian's width at every signal is read off the residuals,
-    and a fit that went on from the width about a worse signal would hardly move."""
-    return any(isinstance(module, SignalDependentGaussian) for module in noise_model.modules())
+    """Whether a noise model is standardised again on a better signal."""
+    return as_noise_model(noise_model).starts_anew
 
 
 def rate_of(noise_model: nn.Module) -> float:
-    """Models of many parameters overshoot at rates that the others need to keep up with the volume."""
-    rich = any(isinstance(module, SplineFlow | Mixture) for module in noise_model.modules())
-    return 0.01 if rich else 0.03
+    """The rate at which a noise model learns in a joint fit."""
+    return as_noise_model(noise_model).joint_learning_rate

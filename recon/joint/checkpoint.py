@@ -6,10 +6,14 @@ code from it.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,13 +22,16 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
+from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.io import atomic_path
 from recon.joint.stages import Stage
+from recon.joint.state_files import read_state as read_state
+from recon.joint.state_files import write_state as write_state
 
 StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)`` after every step of every fit."""
 
-_FORMAT = "noiseflow checkpoint 1"
+_FORMAT = "noiseflow checkpoint 2"
 _RUN, _CURRENT = "run.json", "current.safetensors"
 _RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
 
@@ -32,8 +39,8 @@ _RESULT = [field.name for field in fields(FitResult) if field.name not in ("nois
 class Journal:
     """Runs the fits and other stages of one reconstruction in order, and keeps what each has reached.
 
-    All else in a reconstruction follows from its settings, its seed and the results of its stages, in order. So a run that
-    goes on repeats the rest, takes the finished stages from the journal, and continues the one that was stopped.
+    All else in a reconstruction follows from its settings, its seed and what its stages reached, each kept under its name. So a
+    run that resumes repeats the rest, takes the finished stages from the journal, and continues the one that was stopped.
 
     Args:
         folder: of the journal; made when there is something to write.
@@ -63,7 +70,6 @@ class Journal:
         self.folder, self.interval, self.report = Path(folder), interval, report
         self.settings = json.loads(json.dumps(settings))
         self.stop_requested = self.abandoned = self.in_fit = False
-        self._num_fits = 0
         self._fresh = not (resume and self.exists)
         if not self._fresh:
             self._check_settings()
@@ -78,58 +84,80 @@ class Journal:
         """Whether this run goes on with an earlier one."""
         return not self._fresh
 
-    def fit(self, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any) -> FitResult:
-        """`noiseflow.fit` with ``digitise=False``, or what it reached earlier; other arguments and errors are the same."""
-        self._num_fits += 1
-        finished, generator = self._finished(self._num_fits), options.get("generator")
+    def fit(
+        self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
+    ) -> FitResult:
+        """`noiseflow.fit`, or what it reached earlier under this name; other arguments and errors are the same."""
+        finished, generator = self._finished(name), options.get("generator")
         models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
         if not self._fresh and finished.exists():
-            return _replay(read_state(finished), models, generator)
-        if options.get("progress") is None:
-            title = "choosing" if isinstance(signal, nn.Module) else "learning the noise"
-            options["progress"] = self.progress(f"{title}, fit {self._num_fits}", options.get("num_steps", 500))
+            return _replay(read_state(finished), models, generator, options.get("tables"))
         options |= {
-            "resume": self._current(),
-            "digitise": False,
-            "checkpoint": self._write_current,
+            "resume": self._current(name),
+            "checkpoint": partial(self._write_current, name),
             "checkpoint_interval": self.interval,
+            "digitise": False,
+            "progress": self._stopping(name, options),
         }
-        self.in_fit = True
-        result = fit(noise_model, signal, observation, **options)
-        self.in_fit = False
+        with self._working():
+            result = fit(noise_model, signal, observation, **options)
+        tables: TableKeeper | None = options.get("tables")
         self._write(
             finished,
-            {name: model.state_dict() for name, model in models.items()}
-            | {"result": {name: getattr(result, name) for name in _RESULT}, "rng": torch.get_rng_state()}
-            | ({"generator": generator.get_state()} if generator is not None else {}),
+            {part: model.state_dict() for part, model in models.items()}
+            | {"result": {part: getattr(result, part) for part in _RESULT}, "rng": torch.get_rng_state()}
+            | ({"generator": generator.get_state()} if generator is not None else {})
+            | ({"tables": tables.state()} if tables is not None else {}),
         )
         (self.folder / _CURRENT).unlink(missing_ok=True)
         return result
 
     def run_stage(self, title: str, stage: Stage) -> None:
-        """Take the steps of a stage that are left, told of and kept as those of a fit."""
-        self._num_fits += 1
-        finished, report = self._finished(self._num_fits), self.progress(title, stage.num_steps)
+        """Take the steps of a stage that are left, reported and kept as those of a fit."""
+        finished, report = self._finished(title), self.progress(title, stage.num_steps)
         if not self._fresh and finished.exists():
             stage.load_state(read_state(finished))
             return
-        current = self._current()
+        current = self._current(title)
         if current is not None:
             stage.load_state(current)
-        self.in_fit, saved = True, time.perf_counter()
-        try:
-            while stage.done < stage.num_steps:
-                note = stage.step()
-                if time.perf_counter() - saved >= self.interval:
-                    self._write_current(stage.state())
-                    saved = time.perf_counter()
-                report(stage.done, note)
-        except KeyboardInterrupt:
-            self._write_current(stage.state())
-            raise
-        self.in_fit = False
+        with self._working():
+            saved = time.perf_counter()
+            try:
+                while stage.done < stage.num_steps:
+                    note = stage.step()
+                    if time.perf_counter() - saved >= self.interval:
+                        self._write_current(title, stage.state())
+                        saved = time.perf_counter()
+                    report(stage.done, note)
+            except KeyboardInterrupt:
+                self._write_current(title, stage.state())
+                raise
         self._write(finished, stage.state())
         (self.folder / _CURRENT).unlink(missing_ok=True)
+
+    @contextmanager
+    def _working(self) -> Iterator[None]:
+        """While a fit or another stage runs, a stop waits for the end of its step; an interrupted one counts as running still."""
+        self.in_fit = True
+        yield
+        self.in_fit = False
+
+    def _stopping(self, name: str, options: dict[str, Any]) -> Callable[[int, str], None]:
+        """The progress report of a fit, which is also where it stops if that is asked for."""
+        total, own = options.get("num_steps", 500), options.get("progress")
+        if own is None:
+            return self.progress(name, total)
+
+        def report(done: int, note: str) -> None:
+            own(done, note)
+            self._stop_if_asked(name, done, total)
+
+        return report
+
+    def _stop_if_asked(self, title: str, done: int, total: int) -> None:
+        if self.stop_requested:
+            raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
 
     def progress(self, title: str, total: int) -> Callable[[int, str], None]:
         """Tells of the steps of one piece of work, and stops it where that is asked for."""
@@ -137,8 +165,7 @@ class Journal:
         def progress(done: int, note: str) -> None:
             if self.report is not None:
                 self.report(title, done, total, note)
-            if self.stop_requested:
-                raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
+            self._stop_if_asked(title, done, total)
 
         return progress
 
@@ -149,22 +176,23 @@ class Journal:
         if self.folder.is_dir() and not any(self.folder.iterdir()):
             self.folder.rmdir()
 
-    def _finished(self, number: int) -> Path:
-        return self.folder / f"fit-{number:03d}.safetensors"
+    def _finished(self, name: str) -> Path:
+        digest = hashlib.blake2b(name.encode(), digest_size=4).hexdigest()
+        return self.folder / f"{re.sub('[^a-z0-9.]+', '-', name.lower())[:60]}-{digest}.safetensors"
 
-    def _current(self) -> dict[str, Any] | None:
+    def _current(self, name: str) -> dict[str, Any] | None:
         if self._fresh or not (self.folder / _CURRENT).exists():
             return None
         kept = read_state(self.folder / _CURRENT)
-        if kept["number"] != self._num_fits:
+        if kept["name"] != name:
             return None
         torch.set_rng_state(kept["rng"])
         state: dict[str, Any] = kept["fit"]
         return state
 
-    def _write_current(self, state: dict[str, Any]) -> None:
+    def _write_current(self, name: str, state: dict[str, Any]) -> None:
         if not self.abandoned:
-            self._write(self.folder / _CURRENT, {"number": self._num_fits, "fit": state, "rng": torch.get_rng_state()})
+            self._write(self.folder / _CURRENT, {"name": name, "fit": state, "rng": torch.get_rng_state()})
 
     def _write(self, path: Path, state: dict[str, Any]) -> None:
         if self._fresh:
@@ -194,66 +222,17 @@ class Journal:
             raise ValueError(f"the checkpoint is of another run: {changes}; {advice}")
 
 
-def _replay(kept: dict[str, Any], models: dict[str, nn.Module], generator: torch.Generator | None) -> FitResult:
+def _replay(
+    kept: dict[str, Any],
+    models: dict[str, nn.Module],
+    generator: torch.Generator | None,
+    tables: TableKeeper | None,
+) -> FitResult:
     for name, model in models.items():
         model.load_state_dict(kept[name])
     if generator is not None:
         generator.set_state(kept["generator"])
+    if tables is not None:
+        tables.table, tables.resume = None, kept["tables"]
     torch.set_rng_state(kept["rng"])
     return FitResult(models["noise_model"], **kept["result"])
-
-
-def write_state(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts and lists of tensors, numbers and strings, all at once or not at all."""
-    from safetensors.torch import save_file
-
-    tensors: dict[str, Tensor] = {}
-    description = json.dumps(_packed(state, tensors))
-    with atomic_path(path) as partial:
-        save_file(tensors, partial, metadata={"format": _FORMAT, "state": description})
-
-
-def read_state(path: Path) -> dict[str, Any]:
-    """Read what `write_state` wrote.
-
-    Raises:
-        ValueError: another file, or a damaged one.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            packed = json.loads((file.metadata() or {})["state"])
-            state: dict[str, Any] = _unpacked(packed, file)
-    except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise ValueError(
-            f"checkpoint {path} is damaged ({type(error).__name__}); leave out --resume to start over"
-        ) from error
-    return state
-
-
-def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
-    if isinstance(value, Tensor):
-        name = str(len(tensors))
-        kept = value.detach().cpu().contiguous()
-        whole = kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
-        shared = any(kept.data_ptr() == other.data_ptr() for other in tensors.values())
-        tensors[name] = kept if whole and not shared else kept.clone()
-        return {"tensor": name}
-    if isinstance(value, dict):
-        return {"dict": [[key, _packed(item, tensors)] for key, item in value.items()]}
-    if isinstance(value, (list, tuple)):
-        return {"list": [_packed(item, tensors) for item in value]}
-    if isinstance(value, (str, int, float, bool, type(None))):
-        return value
-    raise TypeError(f"a checkpoint cannot hold {type(value).__name__}")
-
-
-def _unpacked(value: Any, file: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    if "tensor" in value:
-        return file.get_tensor(value["tensor"])
-    if "dict" in value:
-        return {key: _unpacked(item, file) for key, item in value["dict"]}
-    return [_unpacked(item, file) for item in value["list"]]

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
 from recon.projection.projector import SliceProjector
@@ -23,24 +22,23 @@ class HalfResolution:
     pixel at the edges: good enough for a start.
 
     Args:
-        signal_model: at full resolution; its image formation is shared.
-        full: its projector.
-        field: its field on the lattice half as fine.
+        signal_model: at full resolution; its image formation and its field's parameters are shared.
 
     Attributes:
         signal_model: the one at half the resolution.
     """
 
     @staticmethod
-    def of(signal_model: TomographySignal) -> HalfResolution | None:
-        """None where the field has no lattice half as fine, the projector models defocus, or there are few voxels to save."""
+    def possible(signal_model: TomographySignal) -> bool:
+        """Whether the field has a voxel grid half as fine, the projector has one, and there are voxels enough to save."""
         full = signal_model.projector
-        if not isinstance(full, SliceProjector) or min(full.width, full.detector_width) < _LEAST:
-            return None
-        field = signal_model.field.coarser()
-        return None if field is None else HalfResolution(signal_model, full, field)
+        wide = min(full.width, full.detector_width) >= _LEAST
+        return wide and isinstance(full, SliceProjector) and signal_model.field.has_coarser
 
-    def __init__(self, signal_model: TomographySignal, full: SliceProjector, field: Field) -> None:
+    def __init__(self, signal_model: TomographySignal) -> None:
+        full, field = signal_model.projector, signal_model.field.coarser()
+        if field is None or not isinstance(full, SliceProjector):
+            raise ValueError("this signal model has no half resolution; ask HalfResolution.possible first")
         tilts = np.arange(full.num_tilts)
         # of an odd number, the last pixel along u is left out at some tilts; rows are as many as coarse slices
         self._num_columns, self._first_columns = full.detector_width // 2, tilts % 2

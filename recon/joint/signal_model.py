@@ -17,6 +17,8 @@ from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector, from_columns
 from recon.projection.tiles import Tiles
 
+_RESPONSE_RATE = 0.04  # learning rate of the detector's response, relative to the volume's
+
 
 class TomographySignal(Described):
     """A volume, its projections and the detector's response as one signal model, for `noiseflow.fit`.
@@ -32,9 +34,6 @@ class TomographySignal(Described):
         smoothing: jumps below this, in units of the field's scale, count quadratically.
         learning_rate: of a field of voxels.
         occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a `SliceProjector`.
-
-    Attributes:
-        response_rate: learning rate of the detector's response, relative to the volume's.
 
     Raises:
         ValueError: an occupancy for another projector.
@@ -57,7 +56,6 @@ class TomographySignal(Described):
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
         self.occupancy = occupancy
-        self.response_rate = 0.04
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
         self._tiles_of: tuple[Tensor | None, int] = None, 0
@@ -173,14 +171,16 @@ class TomographySignal(Described):
         formation = self.image_formation
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """Parameters with their learning rates, for Adam."""
+    def parameter_groups(self, *, rate: float = 1.0, offset_rate: float = 1.0) -> list[dict[str, Any]]:
+        """Parameters with their learning rates, for Adam.
+
+        Args:
+            rate: factor on all of them.
+            offset_rate: further factor on that of the detector's response.
+        """
         response = [parameter for parameter in self.image_formation.parameters() if parameter.requires_grad]
+        usual = self.learning_rate * rate
         groups: list[dict[str, Any]] = [
-            {
-                "params": list(self.field.parameters()),
-                "lr": self.learning_rate * self.field.relative_rate,
-                "eps": 1e-15,
-            }
+            {"params": list(self.field.parameters()), "lr": usual * self.field.relative_rate, "eps": 1e-15}
         ]
-        return groups + ([{"params": response, "lr": self.learning_rate * self.response_rate}] if response else [])
+        return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE * offset_rate}] if response else [])

@@ -1,10 +1,6 @@
-from .methods import METHODS as METHODS
-from .methods import Method as Method
-from .methods import Outcome as Outcome
-from .methods import Progress as Progress
-from .methods import Settings as Settings
-from .methods import describe as describe
-from .methods import describe_defocus as describe_defocus
-from .methods import method as method
-from .methods import reconstruct as reconstruct
-from .methods import settings_of as settings_of
+from ._registry import Method as Method
+from ._registry import Settings as Settings
+from ._registry import find_method as find_method
+from ._registry import method_names as method_names
+from ._registry import reconstruct as reconstruct
+from ._registry import settings_of as settings_of

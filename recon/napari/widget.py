@@ -11,10 +11,11 @@ from noiseflow import io
 from recon.napari.files import LayerData
 
 if TYPE_CHECKING:
-    from recon.methods.methods import Progress
+    from recon.joint.run import Progress
 
-_STEPS = 200
+_STEPS = 0  # as many as the method plans
 _BUTTON = "Reconstruct"
+_SHARES = 100
 
 
 def reconstruct_layer(
@@ -38,16 +39,16 @@ def reconstruct_layer(
         mode: ``linear`` or ``transmission``.
         method: one of `recon.methods.METHODS`.
         thickness: voxels along the beam; 0 for the image width.
-        num_steps: of the fit.
+        num_steps: of the fit; 0 for as many as the method plans.
         invert_tilt: flip the sign of the angles.
-        progress: called with the steps done and a note.
+        progress: called with the steps done, those expected, and a note.
 
     Raises:
         ValueError: no angles are known, or the series cannot be reconstructed so.
     """
     import numpy as np
 
-    from recon.methods.methods import reconstruct
+    from recon.methods._registry import reconstruct
     from recon.series.tilt_series import TiltSeries, VolumeGrid
 
     known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
@@ -58,7 +59,7 @@ def reconstruct_layer(
     sign = -1.0 if invert_tilt else 1.0
     series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, mode)  # type: ignore[arg-type]
     grid = VolumeGrid.of(series, thickness or None)
-    outcome = reconstruct(series, grid, method=method, num_steps=num_steps, progress=progress)
+    outcome = reconstruct(series, grid, method=method, num_steps=num_steps or None, progress=progress)
     scale = [pixel_size or 1.0] * 3
     result = {"voxel_size": tuple(scale)} if pixel_size else {}
     return (
@@ -74,7 +75,7 @@ def reconstruct_widget() -> Any:
     from napari.layers import Image
     from napari.viewer import Viewer
 
-    from recon.methods.methods import METHODS
+    from recon.methods import method_names
 
     def start(
         viewer: Viewer,
@@ -90,7 +91,7 @@ def reconstruct_widget() -> Any:
         worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
         button = form.call_button
         button.enabled, button.text = False, "Reconstructing …"
-        worker.yielded.connect(lambda done: setattr(button, "text", f"Reconstructing: step {done}"))
+        worker.yielded.connect(lambda done: setattr(button, "text", f"Reconstructing: {done} %"))
         worker.returned.connect(lambda layer: _show(viewer, tilts, layer))
         worker.finished.connect(lambda: setattr(button, "text", _BUTTON))
         worker.finished.connect(lambda: setattr(button, "enabled", True))
@@ -101,9 +102,9 @@ def reconstruct_widget() -> Any:
         call_button=_BUTTON,
         angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "where the layer has no angles"},
         mode={"choices": ["linear", "transmission"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
-        method={"choices": [name for name in METHODS if name != "joint-supervised"]},
+        method={"choices": [name for name in method_names() if name != "joint-supervised"]},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
-        num_steps={"min": 1, "max": 10_000, "label": "steps"},
+        num_steps={"min": 0, "max": 10_000, "label": "steps (0: as planned)"},
     )
     return form
 
@@ -126,11 +127,18 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
         steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         found: list[LayerData | Exception] = []
 
+        def report(done: int, total: int, note: str) -> None:
+            steps.put(round(_SHARES * done / total))
+
         def fit() -> None:
             try:
                 found.append(
                     reconstruct_layer(
-                        images, metadata, num_steps=num_steps, progress=lambda done, note: steps.put(done), **options
+                        images,
+                        metadata,
+                        num_steps=num_steps,
+                        progress=lambda done, total, note: steps.put(round(_SHARES * done / total)),
+                        **options,
                     )
                 )
             except Exception as error:  # handed on to the viewer, which shows it
@@ -145,4 +153,4 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
             raise found[0]
         return found[0]
 
-    return create_worker(run, _progress={"total": num_steps, "desc": "Reconstruct"})
+    return create_worker(run, _progress={"total": _SHARES, "desc": "Reconstruct"})

@@ -56,14 +56,20 @@ def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp
 def angular_shares(
     tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """The angle (radians) that each tilt stands for: half the way to each neighbour, at the ends as much as inside."""
-    theta = np.deg2rad(np.asarray(tilt_angles, dtype=np.float64))
-    values, back, counts = np.unique(theta, return_inverse=True, return_counts=True)
-    steps = np.diff(values)
-    if steps.size == 0:
-        return np.full(theta.shape, math.pi / theta.size)
-    left, right = np.r_[steps[0], steps], np.r_[steps, steps[-1]]
-    shares = (left + right) / 2
+    """The angle (radians) that each tilt stands for: half the way to each neighbour, at the ends as much as inside.
+
+    Directions count modulo half a turn, where the view repeats; the widest step is the missing wedge, which no tilt stands for.
+    """
+    directions = np.round(np.asarray(tilt_angles, dtype=np.float64) % 180, 9) % 180
+    values, back, counts = np.unique(directions, return_inverse=True, return_counts=True)
+    if values.size == 1:
+        return np.full(directions.shape, math.pi / directions.size)
+    after = np.diff(np.r_[values, values[0] + 180])
+    before, wedge = np.roll(after, 1), int(after.argmax())
+    first = (wedge + 1) % values.size
+    left, right = before.copy(), after.copy()
+    left[first], right[wedge] = after[first], before[wedge]
+    shares = np.deg2rad((left + right) / 2)
     shares *= min(1.0, math.pi / shares.sum())
     return np.asarray((shares / counts)[back])
 

@@ -12,8 +12,8 @@ from noiseflow import io
 from noiseflow.commands.console import invocation
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
-from recon.methods.methods import Outcome
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
+from recon.reconstruction import Reconstruction
 from recon.report.noise import noise_charts
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -31,7 +31,7 @@ _UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per
 
 def reconstruction_report(
     tilt_series: TiltSeries,
-    outcome: Outcome,
+    outcome: Reconstruction,
     figures: Sequence[tuple[str, str]],
     *,
     inputs: Sequence[str | Path] = (),
@@ -91,7 +91,7 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
     return Volume(image.data.astype(np.float32), None if image.voxel_size is None else image.voxel_size[0])
 
 
-def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, str]]:
+def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence): what the user gave, what was left at its default, what the data decided."""
     called = invocation()
     rows = [
@@ -107,7 +107,7 @@ def settings(tilt_series: TiltSeries, outcome: Outcome) -> list[tuple[str, str, 
     return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
 
 
-def _evidence(name: str, outcome: Outcome) -> str:
+def _evidence(name: str, outcome: Reconstruction) -> str:
     tried = outcome.weights_tried
     called = invocation()
     if called is not None and called.options.get(name, (None, False))[1]:
@@ -150,7 +150,7 @@ def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
 
-def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     images, predicted = tilt_series.images.astype(np.float32), outcome.projections
     ends = np.percentile(images, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
@@ -175,7 +175,7 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> Non
     report.widget("tilts", data, caption=caption)
 
 
-def _add_response(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     """Charts of what differs from tilt to tilt; what is one for all stands among the choices."""
     order, charts = np.argsort(tilt_series.tilt_angles), []
     for name, values in outcome.response.items():
@@ -195,7 +195,7 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> 
         report.charts(charts, caption="Estimated from the images, then learnt in the fit.")
 
 
-def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Outcome) -> None:
+def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     if outcome.noise_model is None:
         return
     images = tilt_series.images.astype(np.float32)
@@ -225,7 +225,7 @@ def _in_words(structure: SpatialStructure) -> str:
     return words.partition("; a per-pixel")[0] + "; that is more than chance, and too little to matter"
 
 
-def _add_course(report: Report, outcome: Outcome) -> None:
+def _add_course(report: Report, outcome: Reconstruction) -> None:
     charts = []
     if outcome.fit_result is not None and outcome.fit_result.history:
         history = outcome.fit_result.history

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.series.evidence import Evidence
 from recon.series.tilt_series import TiltSeries, filled
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
@@ -22,13 +23,13 @@ class Alignment:
         tilt_axis: degrees from y towards −x, anticlockwise where y points up (IMOD's rotation angle).
         shifts: (tilt, 2) pixels of the raw images, in the order (y, x): where the aligned middle lies from the raw one.
         tilt_angles: (tilt,) degrees.
-        residual: share of the variance of tilts left out that a volume of the others does not explain; None where none was made.
+        evidence: for this axis and then for its rivals, best first; empty where the axis was given without a search.
     """
 
     tilt_axis: float
     shifts: NDArray[np.float64]
     tilt_angles: NDArray[np.float64]
-    residual: float | None = None
+    evidence: tuple[Evidence, ...] = ()
 
     def apply(self, tilt_series: TiltSeries) -> TiltSeries:
         """The series with the axis along y through the middle; what is not in the raw images is masked.
@@ -54,7 +55,7 @@ class Alignment:
             images = images.astype(tilt_series.images.dtype)
         if mask.mean() < 0.98:
             warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
-        return replace(tilt_series, images=images, mask=None if mask.all() else mask)
+        return replace(tilt_series, images=images, mask=None if mask.all() else mask, tilt_axis=None)
 
     def _moved(
         self, image: NDArray[Any], use: NDArray[np.bool_], shift: NDArray[np.float64]
@@ -76,6 +77,16 @@ class Alignment:
         return filled(moved, mask), mask
 
     @property
+    def residual(self) -> float | None:
+        """Share of the variance of tilts in contiguous gaps that no volume of the others explains; None without a search."""
+        return self.evidence[0].residual if self.evidence else None
+
+    @property
+    def margin(self) -> float | None:
+        """Standard errors by which the axis explains more than the best other direction; None where there is no other."""
+        return self.evidence[0].lead_over(self.evidence[1]) if len(self.evidence) > 1 else None
+
+    @property
     def axis_offset(self) -> float:
         """Pixels from the raw middle to the tilt axis: the shift across it that no place of the object accounts for."""
         theta, axis = np.deg2rad(self.tilt_angles), np.deg2rad(self.tilt_axis)
@@ -90,7 +101,11 @@ class Alignment:
             f"aligned: tilt axis {self.tilt_axis:.2f}°, {self.axis_offset:.2f} pixels off the middle; shifts up to "
             f"{largest:.1f} pixels, {rms:.2f} rms"
         )
-        return words if self.residual is None else f"{words}; tilts left out are explained to {1 - self.residual:.1%}"
+        if self.residual is not None:
+            words += f"; gaps of tilts left out are explained to {1 - self.residual:.1%}"
+        if self.margin is not None:
+            words += f", at {self.evidence[1].axis:.1f}° to {1 - self.evidence[1].residual:.1%}"
+        return words
 
     def choices(self) -> dict[str, float | str]:
         """What a table of results shows of it."""
@@ -108,4 +123,6 @@ class Alignment:
             "tilt_angles_degrees": self.tilt_angles.tolist(),
             "shifts_yx_pixels": self.shifts.tolist(),
             "unexplained_variance": self.residual,
+            "margin_standard_errors": self.margin,
+            "candidates": [evidence.as_dict() for evidence in self.evidence],
         }

@@ -16,12 +16,13 @@ from recon.projection.sirt import sirt
 from recon.series.tilt_series import TiltSeries, block_means
 
 
-def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Transmission | Linear:
+def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
     """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF.
 
     Args:
         tilt_series: the data.
         estimate: whether a fit shall refine the guess.
+        level: detector units, of linear images; the response is that of pixel values above it.
 
     Raises:
         ValueError: bright-field images that are nowhere positive.
@@ -33,7 +34,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True) -> Tran
     if tilt_series.mode == "linear":
         dark, bright = (float(level) for level in np.quantile(means, (0.02, 0.98)))
         span = bright - dark if bright > dark else 1.0
-        return Linear(offset=dark, beam=beam, offset_unit=span, estimate=estimate)
+        return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate)
     if tilt_series.beam is not None:
         means = means / tilt_series.beam[:, None, None]
     intensity = float(np.quantile(means, 0.95))

@@ -16,6 +16,7 @@ from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, block_means
+from recon.series.views import without_level
 
 _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
@@ -23,6 +24,7 @@ _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
 _LEAST_DRIFT = 0.04  # steady beams seem to drift by 0.004 to 0.035, by noise and by what lies outside the volume
 _FEWEST = 8
+_EXCEPTIONS = 0.1  # of the tilts: more, and it is not the tilts that are wrong but what they are compared by
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,15 @@ class Screening:
         beam: (tilts,) incident intensity relative to the median tilt's.
         excess: (tilts,) negative log-likelihood of the coarse image above that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
+        suspect: (tilts,) the same where there are so many that the alignment or the angles of all are in doubt; none is bad then.
+        unexplained: (tilts,) share of the variance of each coarse image that the volume does not explain.
     """
 
     beam: NDArray[np.float64]
     excess: NDArray[np.float64]
     bad: NDArray[np.bool_]
+    suspect: NDArray[np.bool_]
+    unexplained: NDArray[np.float64]
 
     @property
     def drift(self) -> float:
@@ -65,7 +71,13 @@ class Screening:
 
     def as_dict(self) -> dict[str, list[Any]]:
         """All of it, tilt by tilt, for programs."""
-        return {"beam": self.beam.tolist(), "excess_nll": self.excess.tolist(), "bad": self.bad.tolist()}
+        return {
+            "beam": self.beam.tolist(),
+            "excess_nll": self.excess.tolist(),
+            "bad": self.bad.tolist(),
+            "suspect": self.suspect.tolist(),
+            "unexplained": self.unexplained.tolist(),
+        }
 
 
 def screen(tilt_series: TiltSeries) -> Screening:
@@ -74,22 +86,26 @@ def screen(tilt_series: TiltSeries) -> Screening:
     A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. The tilts whose residual
     likelihood stands out most from their neighbours' are taken out and the rest is done again, until none stands out.
     """
-    if tilt_series.num_tilts < _FEWEST:
-        count = tilt_series.num_tilts
-        return Screening(np.ones(count), np.zeros(count), np.zeros(count, dtype=np.bool_))
-    coarse = replace(tilt_series, images=coarse_images(tilt_series, _WIDTH, _HEIGHT), mask=None, beam=None)
-    bad = np.zeros(tilt_series.num_tilts, dtype=np.bool_)
+    count = tilt_series.num_tilts
+    none = np.zeros(count, dtype=np.bool_)
+    if count < _FEWEST:
+        return Screening(np.ones(count), np.zeros(count), none, none, np.zeros(count))
+    lowered, _ = without_level(tilt_series)
+    coarse = replace(lowered, images=coarse_images(lowered, _WIDTH, _HEIGHT), mask=None, beam=None)
+    bad = none
     while True:
         beam, residual, predicted = _fit_beam(coarse, bad)
         nll = _negative_log_likelihood(residual, predicted, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
         spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
         worst = float(excess[~bad].max())
+        unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2)) / max(float(coarse.images.var()), 1e-30)
         if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
-            return Screening(beam, excess, bad)
+            many = bad.sum() > max(1, count * _EXCEPTIONS)
+            return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
         bad = bad | (excess > _OF_WORST * worst)
-        if bad.sum() > tilt_series.num_tilts // 4:  # so many cannot all be exceptions
-            return Screening(beam, excess, np.zeros_like(bad))
+        if bad.sum() > count // 4:  # nothing is gained by going on
+            return Screening(beam, excess, none, bad, unexplained)
 
 
 def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
@@ -157,7 +173,7 @@ def _running_median(
     values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """The median of each tilt's neighbours in angle, the bad ones left out."""
-    order = np.argsort(angles)
+    order = np.argsort(angles, kind="stable")
     good = order[~bad[order]]
     smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")
     return np.asarray(np.interp(angles, angles[good], smooth))

@@ -29,6 +29,8 @@ class TiltSeries:
         mask: (tilt, y, u), True for the pixels to use; None for all. Fits leave the others out; the classical methods take
             them as they stand in `images`, so they should hold something plausible.
         beam: (tilt,) incident intensity relative to the median tilt's, where the beam drifts; a fit starts from it.
+        tilt_axis: direction of the tilt axis in raw images that their file states, degrees from y towards −x, or None; only an
+            alignment starts from it.
 
     Raises:
         ValueError: not a stack, angles, mask or beam that do not match it, pixels or angles that are not finite, a flat stack.
@@ -40,6 +42,7 @@ class TiltSeries:
     mode: Mode = "transmission"
     mask: NDArray[np.bool_] | None = None
     beam: NDArray[np.float64] | None = None
+    tilt_axis: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -64,6 +67,7 @@ class TiltSeries:
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
+        _require_several_views(self.images)
         _check_angles(self.tilt_angles)
 
     def __repr__(self) -> str:
@@ -82,6 +86,10 @@ class TiltSeries:
     def used(self) -> NDArray[np.bool_]:
         """(tilt, y, u), True for the pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
+
+    def rows(self, rows: slice) -> TiltSeries:
+        """Some rows (y) of all images."""
+        return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice."""
@@ -235,10 +243,11 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of so many pixels, image by image; what is left over at the far edges is left out."""
+    """Means of blocks of so many pixels, image by image; what is left over is left out at both edges."""
     height, width = images.shape[1] // down, images.shape[2] // across
-    whole = (image[: height * down, : width * across].astype(np.float32) for image in images)
-    return np.stack([image.reshape(height, down, width, across).mean((1, 3)) for image in whole])
+    top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
+    whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
+    return np.stack([image.reshape(height, down, width, across).mean((1, 3)).astype(np.float32) for image in whole])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
@@ -256,7 +265,19 @@ def write_angles(path: Path, tilt_angles: NDArray[np.floating[Any]]) -> Path:
     return path
 
 
+def _require_several_views(images: NDArray[Any]) -> None:
+    shown = sum(bool(image.min() < image.max()) for image in images)
+    if shown < 2 <= len(images):
+        raise ValueError(
+            f"{len(images) - shown} of {len(images)} images are flat, every pixel of an image the same; a tilt series needs "
+            "two or more that are not: check that the right file was given"
+        )
+
+
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
+    largest = np.abs(angles).max()
+    if largest > io.LARGEST_ANGLE:
+        raise ValueError(f"a tilt angle of {largest:g}° is impossible; angles are degrees within ±{io.LARGEST_ANGLE}")
     values, counts = np.unique(np.round(angles, 6), return_counts=True)
     if len(values) < 2:
         raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")

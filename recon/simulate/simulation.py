@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised, io
+from noiseflow.io.checks import number
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.simulate.noises import CountingNoise, OutlierNoise, SkewedNoise
@@ -121,7 +122,7 @@ def tilt_range(text: str) -> NDArray[np.float64]:
         ValueError: not three numbers, or no angle in the range.
     """
     try:
-        start, stop, step = (float(part) for part in text.split(":"))
+        start, stop, step = (number(part) for part in text.split(":"))
     except ValueError:
         raise ValueError(f"tilts '{text}': give START:STOP:STEP in degrees, such as -60:60:2") from None
     if not (step and np.isfinite([start, stop, step]).all() and (stop - start) / step >= 0):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.io.partials import clear_leftovers, partial_prefix
+from noiseflow.io import locked, partial_folder
+from noiseflow.io.files import reserve
+from noiseflow.io.ownership import signature
+from noiseflow.io.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import write_angles
@@ -78,14 +79,12 @@ class Simulation:
         """
         is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        clear_leftovers(folder / "simulate")
-        partial = Path(tempfile.mkdtemp(dir=folder, prefix=partial_prefix("simulate")))
         try:
-            unit = _Writer(self, partial, progress).run()
-            for path in sorted(partial.iterdir()):
-                path.replace(folder / path.name)
+            with locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
+                unit = _Writer(self, partial, progress).run()
+                for path in sorted(partial.iterdir()):
+                    path.replace(link_target(folder / path.name))
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
             if is_new and not any(folder.iterdir()):
                 folder.rmdir()
         return unit
@@ -148,7 +147,11 @@ class _Writer:
         write_angles(self.folder / "tilts.rawtlt", plan.angles["clean"])
 
     def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
-        return mrcfile.new_mmap(self.folder / f"{name}.mrc", shape, mrc_mode=6 if dtype is np.uint8 else 2, fill=None)
+        path = self.folder / f"{name}.mrc"
+        stack = mrcfile.new_mmap(path, shape, mrc_mode=6 if dtype is np.uint8 else 2, fill=None)
+        reserve(path, path.stat().st_size)
+        stack.add_label(signature())
+        return stack
 
     def _step(self, note: str) -> None:
         self.done += 1

@@ -41,6 +41,11 @@ def whole(series, tmp_path_factory):
     return np.load(folder / "volume.npy"), time.monotonic() - started
 
 
+def finished_fits(folder):
+    """What the journal keeps of fits that are done."""
+    return sorted((folder / "volume.npy.checkpoint").glob("[!c]*.safetensors"))
+
+
 def assert_same(found, expected):
     assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
 
@@ -122,7 +127,7 @@ def test_sirt_goes_on(series, tmp_path):
 def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
     out, log = tmp_path / "volume.npy", tmp_path / "log"
     process = start(command(series, out), log)
-    wait_for(lambda: (tmp_path / "volume.npy.checkpoint" / "fit-002.safetensors").exists(), process)
+    wait_for(lambda: len(finished_fits(tmp_path)) >= 2, process)
     os.kill(process.pid, signal.SIGINT)
     process.join(60)
     assert process.exitcode == 130, log.read_text()
@@ -137,8 +142,8 @@ def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
 def test_ctrl_c_twice_leaves_the_last_checkpoint(series, tmp_path):
     out, log = tmp_path / "volume.npy", tmp_path / "log"
     process = start(command(series, out), log)
-    kept = tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors"
-    wait_for(kept.exists, process)
+    wait_for(lambda: finished_fits(tmp_path), process)
+    kept = finished_fits(tmp_path)[0]
     for _ in range(2):
         os.kill(process.pid, signal.SIGINT)
     process.join(60)
@@ -150,12 +155,12 @@ def test_ctrl_c_twice_leaves_the_last_checkpoint(series, tmp_path):
 def test_another_run_is_not_gone_on_with(series, tmp_path, refused):
     out = tmp_path / "volume.npy"
     process = start(command(series, out), tmp_path / "log")
-    wait_for(lambda: (tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists(), process)
+    wait_for(lambda: finished_fits(tmp_path), process)
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     message = refused(*command(series, out, "--seed", 5, "--resume"))
     assert "seed was 0, now 5" in message
-    assert (tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists()
+    assert finished_fits(tmp_path)
     (tmp_path / "volume.npy.checkpoint" / "run.json").write_text("{")
     assert "damaged" in refused(*command(series, out, "--resume"))
 
@@ -166,8 +171,8 @@ def fits(journal, steps=30):
     generator = torch.Generator().manual_seed(1)
     observation = torch.rand(4, 40, 40, generator=generator) + torch.linspace(0, 1, 40)
     scene, first, second = noiseflow.StaticScene(observation), noiseflow.Gaussian(), noiseflow.RadialFlow()
-    for model in (first, second):
-        journal.fit(model, scene, observation, num_steps=steps, generator=generator)
+    for name, model in (("first", first), ("second", second)):
+        journal.fit(name, model, scene, observation, num_steps=steps, generator=generator)
     return scene.image().detach(), torch.cat([p.detach().flatten() for p in second.parameters()])
 
 
@@ -208,9 +213,9 @@ def test_first_write_of_a_new_run_replaces_the_old_journal(tmp_path):
     fits(Journal(tmp_path / "run", {"seed": 0}), steps=3)
     journal = Journal(tmp_path / "run", {"seed": 1})
     assert not journal.resumed
-    assert len(list((tmp_path / "run").glob("fit-*"))) == 2
-    journal.fit(noiseflow.Gaussian(), torch.rand(200), torch.rand(200), num_steps=2)
-    assert len(list((tmp_path / "run").glob("fit-*"))) == 1
+    assert len(list((tmp_path / "run").glob("[!c]*.safetensors"))) == 2
+    journal.fit("another", noiseflow.Gaussian(), torch.rand(200), torch.rand(200), num_steps=2)
+    assert len(list((tmp_path / "run").glob("[!c]*.safetensors"))) == 1
     assert json.loads((tmp_path / "run" / "run.json").read_text())["settings"] == {"seed": 1}
     journal.discard()
     assert not (tmp_path / "run").exists()

@@ -7,7 +7,8 @@ import torch
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.fitting.selection import select
+from noiseflow.distributions.base import LatentDistribution
+from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
 
 
@@ -36,12 +37,13 @@ def test_resolved_electrons_choose_the_physical_model() -> None:
     assert metrics.kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
 
 
-def test_flow_is_chosen_for_skewed_noise() -> None:
+def test_model_of_learnt_shape_is_chosen_for_skewed_noise() -> None:
     generator = torch.Generator().manual_seed(0)
     signal = torch.rand(20_000, generator=generator)
     gamma = -torch.log(torch.rand((2, *signal.shape), generator=generator)).sum(0)
     found = select(signal, signal + 0.1 * (gamma - 2), num_steps=100)
-    assert "Flow" in found.chosen.name
+    entropy = 2 + math.log(0.1) - (1 - 0.5772156649)  # of a gamma law of shape 2: its digamma is 1 − γ
+    assert found.chosen.nll == pytest.approx(entropy, abs=0.015)
     by_name = {candidate.name: candidate for candidate in found.candidates}
     assert by_name["Gaussian"].excess > 0.05
 
@@ -94,3 +96,128 @@ def test_the_term_that_would_help_is_named(kind: str, remedy: str) -> None:
     assert remedy in found.in_words()
     if kind == "rows":
         assert spatial_structure(noiseflow.ScanNoise(noiseflow.Gaussian(0.1), 0.03), signal, observation).suffices
+
+
+class SlowLogNormal(noiseflow.NoiseModelBase):
+    """Log-normal noise that starts at a width far too large and does not measure the data."""
+
+    def __init__(self, width: float = 30.0) -> None:
+        super().__init__()
+        self.log_width = torch.nn.Parameter(torch.tensor(width).log())
+
+    def forward(self, signal: torch.Tensor) -> "LogNormalDistribution":
+        return LogNormalDistribution(signal, self.log_width.exp())
+
+
+class LogNormalDistribution(LatentDistribution):
+    def __init__(self, signal: torch.Tensor, width: torch.Tensor) -> None:
+        super().__init__(signal.shape)
+        self.signal, self.width = signal, width
+
+    def to_latent(self, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.log(value / self.signal) / self.width, -torch.log(value * self.width)
+
+    def from_latent(self, latent: torch.Tensor) -> torch.Tensor:
+        return self.signal * torch.exp(self.width * latent)
+
+    def _like(self) -> torch.Tensor:
+        return self.signal
+
+
+def test_slow_model_is_not_beaten_by_not_having_converged() -> None:
+    signal = 1 + torch.rand(20_000, generator=torch.Generator().manual_seed(0))
+    observation = SlowLogNormal(0.5)(signal).sample(generator=torch.Generator().manual_seed(1))
+    own = {"Gaussian": noiseflow.Gaussian(), "own": SlowLogNormal()}
+    found = select(signal, observation, candidates=own, num_steps=100)
+    assert found.chosen.name == "own"
+    assert float(found.chosen.model.log_width.detach().exp()) == pytest.approx(0.5, rel=0.03)
+    assert found.chosen.learning_rate > SlowLogNormal().learning_rate
+
+
+def test_own_rate_and_steps_of_a_model_are_used() -> None:
+    class Quick(SlowLogNormal):
+        learning_rate = 0.5
+        num_steps = 200
+
+    signal = 1 + torch.rand(4000, generator=torch.Generator().manual_seed(0))
+    observation = Quick(0.5)(signal).sample(generator=torch.Generator().manual_seed(1))
+    model = Quick()
+    result = noiseflow.fit(model, signal, observation)
+    assert result.num_steps == 200
+    assert float(model.log_width.detach().exp()) == pytest.approx(0.5, rel=0.05)
+
+
+def test_judging_pixels_and_unusable_ones_are_not_learnt_from() -> None:
+    signal, observation = noisy(count=20_000)
+    apart, unused = torch.zeros(20_000, dtype=torch.bool), torch.zeros(20_000, dtype=torch.bool)
+    apart[::4], unused[1::4] = True, True
+    observation[unused] = 1e6
+    wide = torch.where(apart, signal + 3 * (observation - signal), observation)
+    found = select(
+        signal,
+        wide,
+        candidates={"Gaussian": noiseflow.Gaussian()},
+        mask=~unused,
+        held_out=apart,
+        num_steps=20,
+        refit=False,
+    )
+    assert float(found.chosen.model.log_scale.detach().exp()) == pytest.approx(0.1, rel=0.03)
+    width = found.chosen.model.log_scale.detach().double().exp()
+    expected = torch.log(width * math.sqrt(2 * math.pi)) + ((wide - signal)[apart] / width).square().mean() / 2
+    assert found.chosen.nll == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_error_of_pixels_that_err_alike_comes_from_their_blocks() -> None:
+    """Blocks of 50 equal pixels tell no more than one pixel each: the standard error is √50 times larger."""
+    generator = torch.Generator().manual_seed(0)
+    signal = 2 + torch.rand(400, generator=generator).repeat_interleave(50)
+    observation = signal + 0.1 * torch.randn(400, generator=generator).repeat_interleave(50)
+    blocks = torch.arange(400).repeat_interleave(50)
+
+    def error(**options: torch.Tensor) -> float:
+        models = {"narrow": SlowLogNormal(0.05).requires_grad_(False), "true": noiseflow.Gaussian()}
+        found = select(signal, observation, candidates=models, num_steps=5, refit=False, **options)
+        return next(each.excess_error for each in found.candidates if each.excess > 0)
+
+    held_out = torch.arange(20_000) % 100 < 50
+    ratio = error(blocks=blocks, held_out=held_out) / error(held_out=held_out)
+    assert ratio == pytest.approx(math.sqrt(50), rel=0.1)
+
+
+def test_image_models_are_compared_on_whole_rows() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(64, 60, generator=generator)
+    observation = (
+        signal + 0.1 * torch.randn(64, 60, generator=generator) + 0.1 * torch.randn(64, 1, generator=generator)
+    )
+    models = {"Gaussian": noiseflow.Gaussian(), "rows": noiseflow.ScanNoise(noiseflow.Gaussian())}
+    found = select(signal, observation, candidates=models, num_steps=40)
+    assert found.chosen.name == "rows"
+    assert float(found.chosen.model.log_scale.detach().exp()) == pytest.approx(0.1, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("excess", "error", "count", "chosen"),
+    [
+        ((0.0004, 0.0), (0.001, 0.0), 10**6, "simple"),
+        ((0.0004, 0.0), (0.0003, 0.0), 10**6, "best"),
+        ((0.0006, 0.0), (0.001, 0.0), 10**6, "best"),
+        ((0.0006, 0.0), (0.001, 0.0), 10**4, "simple"),
+        ((0.0001, 0.0), (0.0, 0.0), 10**6, "simple"),
+    ],
+)
+def test_one_rule_says_which_model_suffices(excess: tuple, error: tuple, count: int, chosen: str) -> None:
+    named = zip(("simple", "best"), excess, error, strict=True)
+    candidates = [Candidate(name, noiseflow.Gaussian(), 0.0, *figures, 0.0) for name, *figures in named]
+    assert simplest_sufficient(candidates, count).name == chosen
+
+
+def test_selection_asks_for_candidates_that_can_explain_the_data() -> None:
+    signal, observation = noisy(count=2000)
+    with pytest.raises(ValueError, match="no candidates"):
+        select(signal, observation, candidates={})
+    with pytest.raises(ValueError, match="equal"):
+        select(signal, observation[:-1])
+    with pytest.raises(ValueError, match="held_out leaves"):
+        select(signal, observation, held_out=1.0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
+import math
+import pickle
 import sys
 from pathlib import Path
 from typing import Any
@@ -101,16 +102,50 @@ def test_unknown_range_of_signals_is_asked_for(tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_missing_deepinv_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    adapters._deepinv_class.cache_clear()
-    monkeypatch.setitem(sys.modules, "deepinv.physics", None)
-    with pytest.raises(ImportError, match=r"noiseflow\[deepinv\]"):
-        adapters.to_deepinv(noiseflow.Gaussian())
+@pytest.mark.parametrize("name", ["ScanNoise", "WithMaps", "neighbourhood", "PoissonGaussian"])
+def test_every_model_is_written(name: str, tmp_path: Path) -> None:
+    """The law of a single pixel comes near the model's: of its width, with the offsets of rows where there are some."""
+    model, width = {
+        "ScanNoise": (noiseflow.ScanNoise(noiseflow.Digitised(noiseflow.Gaussian(3.0)), 4.0), 5.0),
+        "WithMaps": (noiseflow.WithMaps(noiseflow.Gaussian(3.0), np.full((5, 7), 1.5)), 3.0),
+        "neighbourhood": (noiseflow.SignalDependentGaussian(neighbourhood=3), math.exp(-2.3)),
+        "PoissonGaussian": (noiseflow.PoissonGaussian(0.5, 0.0, 1.0), math.sqrt(0.5 * 100 + 0.25)),
+    }[name]
+    options = {"num_gaussians": 1, "num_coefficients": 2, "num_steps": 150}
+    divergence = adapters.to_pn2v_gmm(model, tmp_path / "a.npz", signal_range=(95, 105), **options)
+    assert abs(divergence) < 5e-3
+    density = mixture_density(np.load(tmp_path / "a.npz"), np.array([100.0]), np.array([100.0]))
+    assert density == pytest.approx(1 / (width * math.sqrt(2 * math.pi)), rel=0.03)
+
+
+def test_missing_deepinv_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "noiseflow.interop.deepinv", raising=False)
+    monkeypatch.setitem(sys.modules, "deepinv", None)
+    monkeypatch.setitem(sys.modules, "deepinv.optim", None)
+    for export in (adapters.to_deepinv, adapters.to_deepinv_fidelity):
+        with pytest.raises(ImportError, match=r"noiseflow\[deepinv\]"):
+            export(noiseflow.Gaussian())
+
+
+def test_deepinv_models_survive_pickling_and_give_the_likelihood() -> None:
+    deepinv = pytest.importorskip("deepinv")
+    model = noiseflow.SplineFlow()
+    clean = torch.rand(3, 1, 8, 8, generator=torch.Generator().manual_seed(0))
+    noise = pickle.loads(pickle.dumps(adapters.to_deepinv(model)))
+    noisy = noise(clean, seed=1)
+    fidelity = adapters.to_deepinv_fidelity(model)
+    assert isinstance(fidelity, deepinv.optim.DataFidelity)
+    physics = deepinv.physics.Denoising(noise)
+    expected = -model(clean).log_prob(noisy).sum((1, 2, 3))
+    assert torch.allclose(fidelity(clean, noisy, physics), expected, rtol=1e-5)
+    step = 1e-3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2)).double()
+    fidelity, double, seen = fidelity.double(), clean.double(), noisy.double()
+    slope = (fidelity.grad(double.clone(), seen, physics) * step).sum((1, 2, 3))
+    change = (fidelity(double + step / 2, seen, physics) - fidelity(double - step / 2, seen, physics)).detach()
+    assert torch.allclose(slope.detach(), change, rtol=1e-3)
 
 
 def test_deepinv_puts_the_noise_on_its_images() -> None:
-    with contextlib.suppress(ImportError):
-        adapters._deepinv_class.cache_clear()
     deepinv = pytest.importorskip("deepinv")
     noise = adapters.to_deepinv(noiseflow.Gaussian(0.1))
     physics = deepinv.physics.Denoising(noise)

@@ -92,3 +92,39 @@ def test_unknown_models_cannot_be_saved(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not a known kind"):
         noiseflow.save(torch.nn.Linear(1, 1), tmp_path / "model.safetensors")
     assert not list(tmp_path.iterdir())
+
+
+def test_registered_model_is_saved_and_loaded_inside_others_too(tmp_path: Path) -> None:
+    @noiseflow.register
+    class Doubled(noiseflow.NoiseModelBase):
+        """Gaussian noise of a width given by its doubled logarithm."""
+
+        def __init__(self, offset: float = 0.0) -> None:
+            super().__init__()
+            self.offset, self.half_log = offset, torch.nn.Parameter(torch.tensor(-1.0))
+
+        def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
+            return noiseflow.Gaussian(float(torch.exp(2 * self.half_log)))(signal + self.offset)
+
+        def config(self) -> dict[str, float]:
+            return {"offset": self.offset}
+
+    model = noiseflow.Digitised(Doubled(0.25), 0.1)
+    with torch.no_grad():
+        model.model.half_log.fill_(-0.5)
+    again = noiseflow.load(noiseflow.save(model, tmp_path / "model.safetensors"))
+    assert type(again.model) is Doubled
+    assert torch.equal(again(SIGNAL).log_prob(SIGNAL), model(SIGNAL).log_prob(SIGNAL))
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "message"),
+    [
+        (torch.nn.Linear, TypeError, "NoiseModelBase"),
+        (noiseflow.NoiseModelBase, TypeError, "forward"),
+        (type("Gaussian", (noiseflow.Poisson,), {}), ValueError, "name of noiseflow"),
+    ],
+)
+def test_only_noise_models_of_a_free_name_are_registered(kind: type, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        noiseflow.register(kind)

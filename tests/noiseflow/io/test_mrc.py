@@ -138,3 +138,14 @@ def test_claims_of_any_size_are_refused_before_memory_is_taken(tmp_path: Path) -
         path = write(tmp_path / "a.mrc", STACK.astype("f4"), 2, nx=nx, nz=nz, nsymbt=nsymbt)
         with pytest.raises(ValueError, match="header claims"):
             io.read(path)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int16, np.float64])
+@pytest.mark.parametrize("shape", [(7, 8, 9), (8, 9)])
+def test_header_statistics_are_those_of_the_pixels(kind, shape, tmp_path):
+    data = (1000 * np.random.default_rng(0).normal(3.0, 1.0, shape)).astype(kind)
+    io.write(tmp_path / "stack.mrc", data)
+    with mrcfile.open(tmp_path / "stack.mrc") as file:
+        header = file.header
+        found = [float(header[name]) for name in ("dmin", "dmax", "dmean", "rms")]
+    np.testing.assert_allclose(found, [data.min(), data.max(), data.mean(), data.std()], rtol=1e-5)

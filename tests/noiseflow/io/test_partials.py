@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
-from noiseflow.io.partials import partial_prefix
+from noiseflow.io.partials import REPLACED, _prefix, clear_all_leftovers
 from tests.processes import FORK
 
 
@@ -51,10 +51,10 @@ def test_files_of_running_programs_and_other_names_stay(tmp_path):
     path, other = tmp_path / "volume.mrc", tmp_path / "volume-2.mrc"
     stay = [
         killed_while_writing(other),
-        tmp_path / ".volume-abcdefgh.mrc",
-        tmp_path / ".volume-00000000-999999999-abcdefgh.mrc",
+        tmp_path / ".volume-abcdefgh.mrc.part",
+        tmp_path / ".volume-00000000-999999999-abcdefgh.mrc.part",
     ]
-    stay += [tmp_path / f"{partial_prefix('volume')}abcdefgh.mrc", tmp_path / ".volume-notes.mrc"]
+    stay += [tmp_path / f"{_prefix('volume')}abcdefgh.mrc.part", tmp_path / ".volume-notes.mrc"]
     for file in stay[1:]:
         file.touch()
     io.check_output(path)
@@ -64,9 +64,10 @@ def test_files_of_running_programs_and_other_names_stay(tmp_path):
 def test_a_folder_that_was_being_replaced_is_put_back(tmp_path):
     path = tmp_path / "volume.zarr"
     leftover = killed_while_writing(path, folder=True)
-    old = leftover.with_name(leftover.name + ".old")
-    old.mkdir()
-    (old / "whole").touch()
+    (leftover / REPLACED).mkdir()
+    (leftover / REPLACED / "whole").touch()
+    clear_all_leftovers(tmp_path)
+    assert leftover.exists()
     io.files.clear_leftovers(path)
     assert (path / "whole").exists()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
@@ -76,3 +77,50 @@ def test_names_nearly_as_long_as_the_disk_allows_are_written(tmp_path):
     path = tmp_path / ("雑" * 80 + ".mrc")
     io.write(path, np.zeros((3, 4), np.float32))
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_all_leftovers_of_dead_programs_in_a_folder_are_cleared_and_nothing_else(tmp_path):
+    for name in ("fit-001.safetensors", "run.json"):
+        killed_while_writing(tmp_path / name)
+    stay = [tmp_path / f"{_prefix('volume')}abcdefgh.mrc.part", tmp_path / "notes.part"]
+    for file in stay:
+        file.mkdir()
+    clear_all_leftovers(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(stay)
+
+
+def test_what_libraries_leave_beside_their_file_is_cleared_too(tmp_path):
+    """safetensors writes to a name of its own, which a killed run would leave for ever."""
+    path = tmp_path / "current.safetensors"
+    leftover = killed_while_writing(path)
+    (leftover / ".tmpAbCdEf").touch()
+    io.check_output(path, suffixes=frozenset({".safetensors"}))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_old_file_is_there_whole_until_the_new_one_is(tmp_path):
+    """Renamed, not copied: whoever has the old file open goes on reading it, and nobody sees half a file."""
+    path = tmp_path / "volume.npy"
+    io.write(path, np.zeros((3, 4), np.float32))
+    number = path.stat().st_ino
+    with path.open("rb") as old:
+        before = old.read()
+        io.write(path, np.ones((3, 4), np.float32))
+        old.seek(0)
+        assert old.read() == before
+    assert path.stat().st_ino != number
+
+
+def test_a_link_stays_a_link_and_its_target_is_written(tmp_path):
+    (tmp_path / "disk").mkdir()
+    for name, target in (("volume.mrc", "disk/data.mrc"), ("volume.zarr", "disk/data.zarr"), ("new.tif", "disk/new")):
+        link = tmp_path / name
+        link.symlink_to(target)
+        if "new" not in name:
+            io.write(tmp_path / target, np.zeros((3, 4), np.float32))
+        io.write(link, np.ones((3, 4), np.float32))
+        assert link.is_symlink()
+        assert not (tmp_path / target).is_symlink()
+        assert (io.read(link).data == 1).all()
+    assert len(list(tmp_path.iterdir())) == 4
+    assert len(list((tmp_path / "disk").iterdir())) == 3

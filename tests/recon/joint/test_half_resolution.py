@@ -8,15 +8,14 @@ import pytest
 import torch
 from torch.nn import functional
 
-from noiseflow import Gaussian, SplineFlow
-from noiseflow.fitting.loop import FitResult
+from noiseflow import Gaussian
 from recon.benchmarks.scenes import make_scene
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
-from recon.joint.alternation import Alternation
+from recon.joint import half_resolution
 from recon.joint.checkpoint import Journal
 from recon.joint.half_resolution import HalfResolution
-from recon.joint.joint import JointReconstructor, half_resolution
+from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import with_defocus
@@ -63,7 +62,7 @@ def images_of(model):
 @pytest.mark.parametrize("shape", _SHAPES)
 def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
     model = smooth_model(shape, occupancy=occupancy, offset=offset, detector_width=shape[2] + 5)
-    half = HalfResolution.of(model)
+    half = HalfResolution(model)
     seen, expected = images_of(half.signal_model), half.pixels(images_of(model))
     assert seen.shape == expected.shape
     assert 4 * seen.numel() <= 1.1 * model.num_pixels
@@ -79,12 +78,12 @@ def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
 def test_total_variation_weighs_as_much():
     model = smooth_model((64, 64, 64))
     model.smoothing = 1e-3
-    half = HalfResolution.of(model).signal_model
+    half = HalfResolution(model).signal_model
     assert float(half.penalty()) == pytest.approx(float(model.penalty()), rel=0.08)
 
 
 def test_pixels_come_from_everywhere_and_are_as_they_were():
-    half = HalfResolution.of(smooth_model(_SHAPES[0]))
+    half = HalfResolution(smooth_model(_SHAPES[0]))
     images = torch.arange(len(_ANGLES) * 64 * 40).view(len(_ANGLES), 64, 40)
     picked = half.pixels(images)
     columns, rows = picked // 40 % 64, picked % 40
@@ -98,7 +97,7 @@ def test_pixels_come_from_everywhere_and_are_as_they_were():
 
 def test_what_is_learnt_is_learnt_for_both():
     model = smooth_model(_SHAPES[1])
-    half = HalfResolution.of(model).signal_model
+    half = HalfResolution(model).signal_model
     before = model.volume()
     (half.signal().mean() + half.penalty()).backward()
     assert model.field.grids[-1].grad is None
@@ -111,7 +110,7 @@ def test_what_is_learnt_is_learnt_for_both():
 
 def test_the_full_resolution_begins_around_what_was_found():
     model = smooth_model(_SHAPES[0], occupancy=True)
-    HalfResolution.of(model).hand_over()
+    HalfResolution(model).hand_over()
     something = (model.field.volume() > 0.3 * model.field.scale).transpose(1, 2)
     assert something.any()
     assert model.occupancy.mask[something].all()
@@ -120,35 +119,12 @@ def test_the_full_resolution_begins_around_what_was_found():
 
 def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
     model = smooth_model(_SHAPES[0])
-    assert HalfResolution.of(model)
+    assert HalfResolution.possible(model)
     small = smooth_model((24, 24, half_resolution._LEAST - 1))
     voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
     blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
     for other in (small, voxels, blurred):
-        assert HalfResolution.of(other) is None
-
-
-@pytest.mark.parametrize(
-    ("noise_model", "coarse_to_fine", "sizes"),
-    [
-        (Gaussian(), True, [(32, 20), (32, 20)]),
-        (Gaussian(), False, [(64, 40)]),
-        (SplineFlow(neighbourhood=3), True, [(64, 40)]),
-    ],
-)
-def test_a_fit_begins_at_half_the_resolution_where_it_can(noise_model, coarse_to_fine, sizes):
-    seen = []
-
-    def run_fit(noise_model, signal, observation, **options):
-        assert options["mask"].shape == options["held_out"].shape == observation.shape
-        seen.append(tuple(observation.shape[1:]))
-        return FitResult(noise_model)
-
-    model = smooth_model(_SHAPES[0])
-    images, use = images_of(model), torch.ones(len(_ANGLES), 64, 40, dtype=torch.bool)
-    task = Alternation(model, images, use, 0, run_fit, coarse_to_fine=coarse_to_fine)
-    assert task.begin(Gaussian(), noise_model, num_steps=40) == 10 * len(sizes)
-    assert seen == sizes
+        assert not HalfResolution.possible(other)
 
 
 def slices(phantom, seed=0):
@@ -170,17 +146,17 @@ def test_half_the_steps_at_half_the_resolution_lose_nothing():
 
 def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
     _, noisy, _ = slices("shells")
-    fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16)
+    fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16, slab=4)
     stopped = []
 
-    def stop(title, done, total, note):
-        if title == "fitting the volume" and done == 2:
+    def stop(done, total, note):
+        if note.startswith("begin"):
             stopped.append(done)
             raise KeyboardInterrupt
 
-    journal = Journal(tmp_path, {}, report=stop)
+    journal = Journal(tmp_path, {})
     with pytest.raises(KeyboardInterrupt):
-        replace(fit, run_fit=journal.fit)(noisy, progress=journal.progress("fitting the volume", 16))
+        replace(fit, run_fit=journal.fit)(noisy, progress=stop)
     assert stopped
     resumed = replace(fit, run_fit=Journal(tmp_path, {}, resume=True).fit)(noisy).volume.attenuation
     np.testing.assert_allclose(resumed, fit(noisy).volume.attenuation, rtol=1e-5, atol=1e-5 * resumed.max())

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from noiseflow import Digitised, PoissonGaussian
-from recon.methods.denoise import DENOISERS, best_strength, find_denoiser
-from recon.methods.stabilise import anscombe, estimated, of_noise_model
+from recon.denoise.denoisers import DENOISERS, best_strength, find_denoiser
+from recon.denoise.stabilise import anscombe, estimated, of_noise_model
 from recon.simulate.noises import SkewedNoise
 
 

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow import RadialFlow, fit
-from recon.commands import cli
-from recon.methods import methods
-from recon.methods.classical import best_num_iterations, best_window
+from noiseflow import Gaussian, RadialFlow, fit
+from recon.joint.laplace import Laplace
+from recon.methods import find_method, method_names, reconstruct
+from recon.methods._classical import LineIntegralProblem, best_num_iterations, best_window
 from recon.methods.kniesel2022.presets import PRESETS
-from recon.methods.laplace import Laplace
 from recon.metrics.metrics import compare
+from recon.projection.sirt import sirt
+from recon.projection.wbp import wbp
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -25,14 +26,14 @@ def scene():
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in methods.METHODS if "auto" not in name and "joint" not in name and name not in PRESETS]
+    "name", [name for name in method_names() if "auto" not in name and "joint" not in name and name not in PRESETS]
 )
 def test_every_method_is_far_better_than_an_empty_volume(scene, name):
     truth, _, noisy = scene
     settings = {} if name in ("sirt", "wbp", "wbp-denoised") else {"num_steps": 40}
     if name not in ("explicit", "sirt", "wbp", "wbp-denoised"):
         settings["weight"] = 0.3
-    outcome = methods.reconstruct(noisy, VolumeGrid.of(noisy), method=name, **settings)
+    outcome = reconstruct(noisy, VolumeGrid.of(noisy), method=name, **settings)
     assert outcome.method == name
     assert outcome.projections.shape == noisy.images.shape
     empty = compare(np.zeros_like(truth), truth).psnr
@@ -45,48 +46,69 @@ def test_supervised_fit_keeps_the_noise_model_as_it_is(scene):
     fit(model, torch.from_numpy(clean.images), torch.from_numpy(noisy.images), num_steps=60)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     grid = VolumeGrid.of(noisy)
-    outcome = methods.reconstruct(noisy, grid, method="joint-supervised", noise_model=model, weight=0.3, num_steps=20)
+    outcome = reconstruct(noisy, grid, method="joint-supervised", noise_model=model, weight=0.3, num_steps=20)
     assert all(torch.equal(value, before[name]) for name, value in outcome.noise_model.state_dict().items())
     with pytest.raises(ValueError, match="--noise-model"):
-        methods.reconstruct(noisy, grid, method="joint-supervised")
+        reconstruct(noisy, grid, method="joint-supervised")
 
 
 def test_chosen_settings_are_nearly_the_best(scene):
     truth, _, noisy = scene
     grid = VolumeGrid.of(noisy)
-    problem = methods.LineIntegralProblem.of(noisy, grid)
+    problem = LineIntegralProblem.of(noisy, grid)
 
     def error(volume):
         return compare(volume.numpy(), truth, scaling="affine").psnr
 
     count = best_num_iterations(noisy, grid)
-    runs = {
-        n: error(methods.sirt(problem.line_integrals, problem.projector, num_iterations=n)) for n in (2, 8, 32, 128)
-    }
-    assert (
-        error(methods.sirt(problem.line_integrals, problem.projector, num_iterations=count)) > max(runs.values()) - 0.5
-    )
+    runs = {n: error(sirt(problem.line_integrals, problem.projector, num_iterations=n)) for n in (2, 8, 32, 128)}
+    assert error(sirt(problem.line_integrals, problem.projector, num_iterations=count)) > max(runs.values()) - 0.5
     window, cutoff = best_window(noisy, grid)
-    chosen = methods.wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
-    ramp = methods.wbp(problem.line_integrals, problem.projector)
+    chosen = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
+    ramp = wbp(problem.line_integrals, problem.projector)
     assert error(chosen) > error(ramp) + 0.5
 
 
-def test_a_method_is_one_registered_function(scene, monkeypatch):
-    monkeypatch.setattr(methods, "METHODS", dict(methods.METHODS))
+_MINE = """
+import numpy as np
+from recon.methods import Method
+from recon.reconstruction import Reconstruction
+from recon.series.tilt_series import Volume
 
-    @methods.method("mine")
-    def mine(tilt_series, grid, settings):
-        return methods.Outcome(None, tilt_series.images, "mine", None, None, {"seed": settings.seed})
+def run(tilt_series, grid, settings):
+    return Reconstruction(Volume(np.zeros(grid.shape, np.float32)), tilt_series.images, "mine", choices={"seed": settings.seed})
 
-    assert methods.reconstruct(scene[2], VolumeGrid.of(scene[2]), method="mine", seed=7).choices == {"seed": 7}
-    with pytest.raises(ValueError, match=r"choose one of auto, joint, .*mine"):
-        methods.reconstruct(scene[2], VolumeGrid.of(scene[2]), method="magic")
+METHOD = Method("mine", "An empty volume.", run)
+"""
 
 
-def test_help_names_every_method():
-    text = cli.reconstruct.__annotations__["method"]
-    assert all(name in text for name in set(methods.METHODS) - set(PRESETS))
+def test_a_method_of_another_package_is_one_file_and_one_entry_point(scene, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(_MINE)
+    (tmp_path / "mine-1.0.dist-info").mkdir()
+    (tmp_path / "mine-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (tmp_path / "mine-1.0.dist-info" / "entry_points.txt").write_text("[noiseflow.methods]\nmine = mine:METHOD\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "mine" in method_names()
+    assert reconstruct(scene[2], method="mine", seed=7).choices == {"seed": 7}
+    with pytest.raises(ValueError, match="method mine models none"):
+        reconstruct(scene[2], method="mine", defocus=0.1)
+    find_method.cache_clear()
+
+
+def test_unknown_methods_and_settings_without_use_are_refused(scene):
+    with pytest.raises(ValueError, match=r"choose one of auto, explicit, joint"):
+        reconstruct(scene[2], method="magic")
+    with pytest.raises(ValueError, match=r"l2 has no use for one"):
+        reconstruct(scene[2], method="l2", noise_model=Gaussian())
+    with pytest.raises(ValueError, match="needs scratch"):
+        reconstruct(scene[2], method="sirt", slices_at_once=3)
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_every_method_says_what_it_is(name):
+    method = find_method(name)
+    assert method.name == name
+    assert method.description.endswith(".")
 
 
 def test_laplace_noise_keeps_the_contract_of_noise_models():

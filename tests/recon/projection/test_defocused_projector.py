@@ -9,12 +9,11 @@ import torch
 from recon.benchmarks.defocus import defocused_scene
 from recon.benchmarks.scenes import make_scene
 from recon.joint.joint import JointReconstructor
-from recon.methods import methods
+from recon.methods import _registry as methods
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import DefocusedProjector, jittered_projection, with_defocus
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
-from recon.scale.blocks import reconstruct_in_blocks
 from recon.series.tilt_series import VolumeGrid
 
 ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]
@@ -123,13 +122,15 @@ def test_methods_model_it_or_refuse_and_say_what_they_did(tmp_path):
     assert outcome.choices["defocus"].startswith("0.3, blurs up to 2.")
     left_out = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.001, **options)
     assert "left out" in left_out.choices["defocus"]
-    blocks = reconstruct_in_blocks(
-        defocused.noisy, grid, tmp_path / "v.npy", method="l2", rows_at_once=8, defocus=0.3, **options
+    blocks = methods.reconstruct(
+        defocused.noisy, grid, scratch=tmp_path / "v.npy", method="l2", slices_at_once=8, defocus=0.3, **options
     )
     assert blocks.choices["defocus"] == outcome.choices["defocus"]
     with pytest.raises(ValueError, match="--defocus"):
         methods.reconstruct(defocused.noisy, grid, method="sirt", defocus=0.3)
     with pytest.raises(ValueError, match="--defocus"):
-        reconstruct_in_blocks(defocused.noisy, grid, tmp_path / "w.npy", method="wbp", rows_at_once=9, defocus=0.3)
+        methods.reconstruct(
+            defocused.noisy, grid, scratch=tmp_path / "w.npy", method="wbp", slices_at_once=9, defocus=0.3
+        )
     with pytest.raises(ValueError, match="0 to 1"):
         methods.reconstruct(defocused.noisy, grid, method="l2", defocus=-0.1)

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from recon.fields.fields import VoxelField
 from recon.joint.joint import JointReconstructor
-from recon.methods.methods import Outcome
+from recon.joint.signal_model import TomographySignal
 from recon.metrics.metrics import compare
 from recon.projection.image_formation import Linear, Transmission
+from recon.projection.projector import SliceProjector
+from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.screening import screen
 from recon.series.tilt_series import Volume
@@ -98,9 +101,11 @@ def test_intensity_and_offset_of_every_tilt_are_in_the_report(tmp_path):
     assert response.per_tilt(2) == {"relative intensity": pytest.approx([0.5, 2.0]), "offset": [1.0, 3.0]}
     assert Transmission(4.0, offset=1.0).per_tilt(2) == {"intensity": pytest.approx([4.0, 4.0]), "offset": [1.0, 1.0]}
     _, clean, _ = scene(size=16)
-    volume, steady = Volume(np.zeros((16, 16, 16), np.float32)), [0.0] * clean.num_tilts
-    for changing, found in ((steady, False), (np.linspace(1, 2, clean.num_tilts).tolist(), True)):
-        outcome = Outcome(volume, clean.images, "l2", None, None, {}, {}, {"intensity": changing, "offset": steady})
+    volume = Volume(np.zeros((16, 16, 16), np.float32))
+    projector = SliceProjector(tilt_angles=clean.tilt_angles, depth=4, width=4)
+    for intensity, found in ((torch.ones(clean.num_tilts), False), (torch.linspace(1, 2, clean.num_tilts), True)):
+        model = TomographySignal(VoxelField((4, 16, 4)), projector, Transmission(intensity))
+        outcome = Reconstruction(volume, clean.images, "l2", signal_model=model)
         page = reconstruction_report(clean, outcome, []).save(tmp_path / "page.html")
         assert ("Beam and detector" in page.read_text(encoding="utf-8")) is found
 

@@ -9,7 +9,7 @@ import torch
 from recon.commands.options import method_of
 from recon.joint.checkpoint import read_state, write_state
 from recon.joint.stages import run_stage
-from recon.methods import methods
+from recon.methods import method_names
 from recon.methods.kniesel2022.network import CoordinateDensity, PaperFlow, by_density
 from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022, PresetState
 from recon.metrics.metrics import compare
@@ -128,7 +128,7 @@ def test_a_state_goes_on_as_if_never_stopped(tmp_path):
 
 
 def test_presets_are_methods():
-    assert set(PRESETS) <= set(methods.METHODS)
+    assert set(PRESETS) <= set(method_names())
 
 
 def test_command_line_takes_a_preset_or_a_method():

@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
+from recon.methods._registry import Finish
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp
+from recon.reconstruction import Reconstruction
+from recon.scale.blocks import Images, Solve
 from recon.series.first_guess import contrast_slab, estimate_response
-from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.views import every_nth_view, level_of, view_numbers, without_level
 
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
@@ -31,16 +35,19 @@ class LineIntegralProblem:
     Attributes:
         line_integrals: (tilt, y, u).
         projector: the operator.
-        response: from line integrals to the detector's readings.
+        response: from line integrals to pixel values above `level`.
+        level: of linear images, detector units; kept apart because float32 cannot hold a large one beside the image.
     """
 
     line_integrals: Tensor
     projector: SliceProjector
     response: Transmission | Linear
+    level: float = 0.0
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, grid: VolumeGrid, device: torch.device | str = "cpu") -> LineIntegralProblem:
         """The problem of reconstructing `tilt_series` on `grid`."""
+        tilt_series, level = without_level(tilt_series)
         response = estimate_response(tilt_series).to(device)
         projector = SliceProjector(
             tilt_angles=tilt_series.tilt_angles,
@@ -49,22 +56,62 @@ class LineIntegralProblem:
             detector_width=tilt_series.images.shape[2],
             device=device,
         )
-        images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32)).to(device)
+        images = torch.from_numpy(tilt_series.images).to(device)
         with torch.no_grad():
-            return cls(response.invert(images).contiguous(), projector, response)
+            return cls(response.invert(images).contiguous(), projector, response, level)
 
     def predict(self, volume: Tensor) -> NDArray[np.float32]:
         """The images (tilt, y, u) that a volume (z, y, x) predicts, detector units."""
         with torch.no_grad():
             images = self.response(self.projector(volume).transpose(1, 2)).transpose(1, 2)
-            return np.asarray(images.contiguous().cpu().numpy())
+            return np.asarray(images.contiguous().cpu().numpy() + np.float32(self.level))
+
+
+def classical(
+    name: str, problem: LineIntegralProblem, volume: Tensor, grid: VolumeGrid, choices: dict[str, float | str]
+) -> Reconstruction:
+    """The result of a method that fits nothing."""
+    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
+    return Reconstruction(result, problem.predict(volume), name, choices=choices)
+
+
+def in_blocks(
+    name: str,
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    device: torch.device | str,
+    solve_problem: Callable[[LineIntegralProblem], Tensor],
+    choices: dict[str, float | str],
+) -> tuple[Solve, Finish]:
+    """A method whose slices do not depend on each other, block by block, under the response of the whole series."""
+    level = level_of(tilt_series)
+    response = estimate_response(tilt_series, level=level).to(device)
+    projector = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles,
+        depth=grid.depth,
+        width=grid.width,
+        detector_width=tilt_series.images.shape[2],
+        device=device,
+    )
+
+    def solve(rows: slice) -> tuple[Images, Images]:
+        lowered = np.asarray(tilt_series.images[:, rows] - np.float64(level), dtype=np.float32)
+        images = torch.from_numpy(lowered).to(device)
+        problem = LineIntegralProblem(response.invert(images).contiguous().detach(), projector, response, level)
+        volume = solve_problem(problem)
+        return volume.cpu().numpy(), problem.predict(volume)
+
+    def finish(volume: Volume, projections: Images) -> Reconstruction:
+        return Reconstruction(volume, projections, name, choices=choices)
+
+    return solve, finish
 
 
 def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
 ) -> tuple[str, float]:
     """Window and cutoff of the back-projection that best predicts tilts left out; with few tilts, the first and 1."""
-    if tilt_series.num_tilts < _FEWEST:
+    if _num_views(tilt_series) < _FEWEST:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
     tried = {
@@ -80,7 +127,7 @@ def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage:
 
     With few tilts, 32.
     """
-    if tilt_series.num_tilts < _FEWEST:
+    if _num_views(tilt_series) < _FEWEST:
         return 32
     choice = _IterationChoice(*_left_out(tilt_series, grid))
     run_stage("choosing the number of iterations", choice)
@@ -122,10 +169,18 @@ class _IterationChoice:
         self.done, self.num_steps = state["done"], state["num_steps"]
 
 
+def _num_views(tilt_series: TiltSeries) -> int:
+    return int(view_numbers(tilt_series.tilt_angles).max()) + 1
+
+
 def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
-    """A slab without every fifth tilt, and a judge: how well a volume's projections correlate with the tilts left out."""
+    """A slab without every fifth view, and a judge: how well a volume's projections correlate with the tilts left out.
+
+    Views are counted by angle and left out with all their twins, for a twin that stays gives the noise away.
+    """
+    tilt_series, _ = without_level(tilt_series)
     rows = contrast_slab(tilt_series, _SLAB)
-    out = np.arange(tilt_series.num_tilts) % _LEAVE_OUT == _LEAVE_OUT // 2
+    out = every_nth_view(tilt_series.tilt_angles, _LEAVE_OUT)
     slab = replace(grid, height=rows.stop - rows.start)
     rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
     judge = SliceProjector(

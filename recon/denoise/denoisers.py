@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from recon.methods import stabilise
+from recon.denoise import stabilise
 
 Array = NDArray[Any]
 Denoiser = Callable[[Array], Array]

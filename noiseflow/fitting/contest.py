@@ -1,0 +1,168 @@
+"""Noise models on their way to be chosen from: short fits, long fits, and more of them where one has not converged."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from noiseflow.fitting.fit import fit
+from noiseflow.fitting.judged_pixels import JudgedPixels
+from noiseflow.models.base import NoiseModelBase
+
+Progress = Callable[[int, str], None]
+_SCREENING_PIXELS = 32768
+_SCREENING_SHARE = 0.2  # of a model's steps
+_HOPELESS = 0.02  # nats per pixel; about ten times what the long fit still gains on the short one
+_SHARE_FROM_MAXIMUM = 0.1  # of the steps, for a model that starts at its most likely parameters
+_WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; a slower pace needs ten more of them
+_STILL_FAR = (
+    1.5  # times what the round before gained: at twice the rate, a model that has far to go gains twice as much
+)
+_SETTLED = (
+    5e-4  # nats per pixel gained in the second half of a fit, whose rates are small; a tenth of the path lies there
+)
+_MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
+
+
+class Contest:
+    """Models with their log-likelihoods of the judging pixels, `scores`, and the rates at which they were fitted, `rates`."""
+
+    def __init__(
+        self,
+        models: Mapping[str, NoiseModelBase],
+        pixels: JudgedPixels,
+        seed: int,
+        num_steps: int | None,
+        progress: Progress | None,
+    ) -> None:
+        self.models, self.pixels, self.seed = models, pixels, seed
+        self.steps = {name: model.num_steps if num_steps is None else num_steps for name, model in models.items()}
+        self.scores: dict[str, Tensor] = {}
+        self.starts: dict[str, dict[str, Any]] = {}
+        self.rates = {name: model.learning_rate for name, model in models.items()}
+        self.seconds = dict.fromkeys(models, 0.0)
+        self.screened_out: set[str] = set()
+        self._gained = dict.fromkeys(models, 0.0)  # in the last fit, nats per pixel
+        self._went_on: set[str] = set()
+        self._progress, self._done = progress, 0
+
+    def screen(self) -> None:
+        """A short fit of every model to some pixels; those far behind the best that do not catch up are screened out."""
+        for name, model in self.models.items():
+            started, short = time.perf_counter(), self._short(name)
+            pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
+            self._fit(name, pixels, 0, standardise=True)
+            self.starts[name] = copy.deepcopy(model.state_dict())
+            if not model.starts_most_likely:
+                self._fit(name, pixels, short)
+            self._score(name, started)
+        for name, model in self.models.items():
+            pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
+            if self._is_hopeless(name) and not model.starts_most_likely:
+                self._go_on(name, pixels, self._short(name))
+        self.screened_out = {name for name in self.models if self._is_hopeless(name)}
+
+    def finish(self) -> None:
+        """The long fit of those that are left, and a longer one of those that are still gaining."""
+        for name, model in self.models.items():
+            if name in self.screened_out:
+                continue
+            started, pixels = time.perf_counter(), self.pixels.training(model)
+            late = self._fit_anew(name, pixels)
+            self._score(name, started)
+            if not model.starts_most_likely and late > max(_SETTLED, _WORTH_GOING_ON * self._gap(name)):
+                self._go_on(name, pixels, self.steps[name])
+
+    def learn_all(self, name: str) -> None:
+        """Fit a model to all pixels but a few that judge again; where these like it less, it stays as it was."""
+        model, judge = self.models[name], self.pixels.judge_again
+        before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
+        self._fit_anew(name, self.pixels.everything(model))
+        loss, error = mean_and_error(before - self.pixels.score(model, judge))
+        if not loss <= error:
+            model.load_state_dict(kept)
+
+    def best(self) -> Tensor:
+        """Log-likelihoods of the judging pixels under the best model."""
+        return max(self.scores.values(), key=lambda score: float(score.mean()))
+
+    def _gap(self, name: str) -> float:
+        return float((self.best() - self.scores[name]).nan_to_num(nan=0.0, posinf=math.inf).mean())
+
+    def _is_hopeless(self, name: str) -> bool:
+        excess, error = mean_and_error(self.best() - self.scores[name], self.pixels.judging_blocks)
+        return not excess <= max(_HOPELESS, 3 * error)
+
+    def _short(self, name: str) -> int:
+        return max(1, round(_SCREENING_SHARE * self.steps[name]))
+
+    def _go_on(self, name: str, pixels: dict[str, Any], num_steps: int) -> None:
+        """Rounds from where the model is, each at twice the rate, while they close a tenth of the gap or gain ever more."""
+        model = self.models[name]
+        for _ in range(_MOST_ROUNDS):
+            started, before, rate = time.perf_counter(), self.scores[name], self.rates[name]
+            least = _WORTH_GOING_ON * max(self._gap(name), _SETTLED)
+            least, kept = min(least, _STILL_FAR * self._gained[name]), copy.deepcopy(model.state_dict())
+            self.rates[name] = 2 * rate
+            self._fit(name, pixels, num_steps)
+            self._score(name, started)
+            gained = float(self.scores[name].mean() - before.mean())
+            if not gained > 0:  # too fast, or nothing to gain
+                model.load_state_dict(kept)
+                self.scores[name], self.rates[name] = before, rate
+                return
+            self._went_on.add(name)
+            if gained < least:
+                return
+
+    def _fit_anew(self, name: str, pixels: dict[str, Any]) -> float:
+        """A fit from the standardised start, or from where a model is that had far to go from there; a few steps where the start
+        is nearly the end. What was gained in its second half, nats per pixel."""
+        num_steps = self.steps[name]
+        if self.models[name].starts_most_likely:
+            num_steps = max(1, round(_SHARE_FROM_MAXIMUM * num_steps))
+        elif (
+            name not in self._went_on
+        ):  # not on from the short fit: fresh steps of the optimiser leave what weights have learnt
+            self.models[name].load_state_dict(self.starts[name])
+        return self._fit(name, pixels, num_steps)
+
+    def _fit(self, name: str, pixels: dict[str, Any], num_steps: int, *, standardise: bool = False) -> float:
+        options: dict[str, Any] = {
+            "generator": torch.Generator().manual_seed(self.seed),
+            "digitise": False,
+            "standardise": standardise,
+        }
+        options |= {"num_steps": num_steps, "learning_rate": self.rates[name]}
+        result = fit(self.models[name], **pixels, **options)
+        history = list(result.history.values()) or [0.0]
+        self._gained[name] = history[0] - history[-1]
+        late = [nll for step, nll in result.history.items() if step >= result.num_steps / 2] or [0.0]
+        return late[0] - late[-1]
+
+    def _score(self, name: str, started: float) -> None:
+        self.scores[name] = self.pixels.score(self.models[name])
+        self.seconds[name] += time.perf_counter() - started
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, name)
+
+
+def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[float, float]:
+    """Mean of (N,) differences and its standard error, from the scatter of whole blocks where there are some."""
+    # −inf − −inf: pixels that both models call impossible do not tell them apart
+    difference = torch.nan_to_num(difference, nan=0.0, posinf=math.inf)
+    mean = float(difference.mean())
+    if not math.isfinite(mean):
+        return mean, math.inf
+    if blocks is None:
+        return mean, float(difference.std(correction=0)) / math.sqrt(difference.numel())
+    _, number = torch.unique(blocks, return_inverse=True)
+    departure = torch.zeros(int(number.max()) + 1, dtype=difference.dtype).index_add_(0, number, difference - mean)
+    return mean, float(departure.square().sum().sqrt()) / difference.numel()

@@ -1,0 +1,149 @@
+"""The pixels that noise models are compared on: which train and which judge, the same for every model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from noiseflow.arrays import as_tensor
+from noiseflow.metrics.evaluation import pixel_log_prob
+from noiseflow.models.base import NoiseModelBase
+
+_JUDGING_AGAIN = 0.1  # of the pixels, in the last fit of the chosen model
+
+
+@dataclass(frozen=True)
+class JudgedPixels:
+    """Pixels of known signals, divided into those that train and those that judge.
+
+    Attributes:
+        signal, observation: shaped as given, floating.
+        use, judge, judge_again: (N,) boolean: usable pixels, those that judge, and the few of them that judge the last fit.
+        blocks: (N,) number of each pixel's block, or None where pixels err independently.
+    """
+
+    signal: Tensor
+    observation: Tensor
+    use: Tensor
+    judge: Tensor
+    judge_again: Tensor
+    blocks: Tensor | None
+
+    @staticmethod
+    def of(
+        signal: Tensor,
+        observation: Tensor,
+        models: Sequence[NoiseModelBase],
+        mask: Tensor | NDArray[np.bool_] | None,
+        held_out: float | Tensor | NDArray[np.bool_],
+        blocks: Tensor | NDArray[np.integer[Any]] | None,
+        seed: int,
+    ) -> JudgedPixels:
+        """Divide the pixels: by `held_out` where it says which, else whole blocks or lines at random.
+
+        Raises:
+            ValueError: sizes differ, or no pixels judge or train.
+        """
+        if signal.shape != observation.shape:
+            raise ValueError(
+                f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
+            )
+        use = _flat(mask, observation, "mask")
+        use = torch.ones(observation.numel(), dtype=torch.bool) if use is None else use.bool().cpu()
+        block = _flat(blocks, observation, "blocks")
+        group = _lines(observation.shape, models) if block is None else block.cpu()
+        if isinstance(held_out, float | int):
+            # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge
+            draw = _drawn(group, observation.numel(), seed)
+            judge, again = draw < held_out, draw < min(held_out, _JUDGING_AGAIN)
+        else:
+            chosen = _flat(held_out, observation, "held_out")
+            judge = torch.zeros_like(use) if chosen is None else chosen.bool().cpu()
+            again = judge & (_drawn(group, observation.numel(), seed) < 0.5)
+        if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
+            raise ValueError("held_out leaves no pixels to judge or too few to fit; give a fraction between 0 and 1")
+        use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
+        block = None if block is None else block.to(observation.device)
+        return JudgedPixels(signal.float(), observation.float(), use, judge, again, block)
+
+    @property
+    def num_judging(self) -> int:
+        """How many pixels judge."""
+        return int(self.judge.sum())
+
+    @property
+    def judging_blocks(self) -> Tensor | None:
+        """The block of each judging pixel."""
+        return None if self.blocks is None else self.blocks[self.judge].cpu()
+
+    def training(self, model: NoiseModelBase, *, most: int | None = None) -> dict[str, Any]:
+        """Arguments of a fit of a model to the training pixels, or to about so many of them."""
+        train = self.use & ~self.judge
+        if model.needs_image:
+            return {"signal": self.signal, "observation": self.observation, "mask": train.reshape(self.signal.shape)}
+        part = slice(None, None, 1 if most is None else max(1, int(train.sum()) // most))
+        return {name: value.reshape(-1)[train][part] for name, value in self._values().items()}
+
+    def everything(self, model: NoiseModelBase) -> dict[str, Any]:
+        """Arguments of a fit of a model to all pixels but those that judge again."""
+        if model.needs_image:
+            whole = {
+                "mask": self.use.reshape(self.signal.shape),
+                "held_out": self.judge_again.reshape(self.signal.shape),
+            }
+            return self._values() | whole
+        chosen = {name: value.reshape(-1)[self.use] for name, value in self._values().items()}
+        return chosen | {"held_out": self.judge_again[self.use]}
+
+    def _values(self) -> dict[str, Any]:
+        return {"signal": self.signal, "observation": self.observation}
+
+    @torch.no_grad()
+    def score(self, model: NoiseModelBase, judge: Tensor | None = None) -> Tensor:
+        """Log-likelihood of each judging pixel, float64, on the CPU."""
+        judge = self.judge if judge is None else judge
+        if not model.needs_image:
+            found: Tensor = pixel_log_prob(model, *(value.reshape(-1)[judge] for value in self._values().values()))
+            return found
+        missing = ~judge.reshape(self.signal.shape)
+        observation = (
+            self.observation if model.shared_axis is None else self.observation.masked_fill(missing, torch.nan)
+        )
+        scores: Tensor = model(self.signal).log_prob(observation).reshape(-1)[judge].double().cpu()
+        return scores
+
+
+def _flat(given: Any, observation: Tensor, name: str) -> Tensor | None:
+    if given is None:
+        return None
+    flat = as_tensor(given).reshape(-1)
+    if flat.numel() != observation.numel():
+        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    return flat
+
+
+def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None:
+    """The line of each pixel, where pixels of a line share an offset under some model; None where pixels are independent."""
+    axes = {model.shared_axis for model in models if model.needs_image}
+    if not axes or len(shape) < 2:
+        return None
+    axis = next((each for each in axes if each is not None), -1)
+    length = shape.numel() // shape[axis]
+    moved = shape[:-1] if axis == -1 else torch.Size([*shape[:-2], shape[-1]])
+    lines = torch.arange(length).reshape(moved)
+    return lines.unsqueeze(axis).expand(shape).reshape(-1)
+
+
+def _drawn(group: Tensor | None, count: int, seed: int) -> Tensor:
+    """A uniform number for each pixel, the same for all pixels of a group."""
+    random = np.random.default_rng(seed)
+    if group is None:
+        return torch.from_numpy(random.random(count))
+    _, number = torch.unique(group, return_inverse=True)
+    return torch.from_numpy(random.random(int(number.max()) + 1))[number]

@@ -1,0 +1,93 @@
+"""Which files this program wrote: each carries its mark, and what carries none is not overwritten unasked.
+
+The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` among a Zarr group's attributes,
+the format's name in a safetensors file, and ``generator`` in a page. An ``.npy`` header has no place for words: ours is padded
+to 1024 bytes, which every reader skips and no other program writes. Angles belong to the stack beside them.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from noiseflow.io.image_file import MRC_SUFFIXES, TIFF_SUFFIXES
+
+MARK = "noiseflow"
+NPY_HEADER_BYTES = 1024
+_PAGE_HEAD = 1000
+
+
+def signature() -> str:
+    """The mark with the version: ``noiseflow 0.1.0``."""
+    return f"{MARK} {version('noiseflow')}"
+
+
+def require_own(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a file that this program did not write.
+
+    Args:
+        path: an output; one that does not exist, or is empty, is free.
+        overwrite: replace it nevertheless.
+
+    Raises:
+        FileExistsError: the file is not ours.
+    """
+    if not overwrite and path.exists() and not is_own(path):
+        raise FileExistsError(
+            f"{path} exists and was not written by noiseflow; name another output, or replace it with --overwrite"
+        )
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file or Zarr folder carries the mark of this program, or is an empty file."""
+    kind = path.suffix.lower()
+    try:
+        if path.is_dir():
+            return kind == ".zarr" and _zarr_is_own(path)
+        if path.stat().st_size == 0:
+            return True
+        if kind in (".rawtlt", ".tlt"):
+            return (stack := path.with_suffix(".mrc")).is_file() and is_own(stack)
+        if kind in TIFF_SUFFIXES:
+            return _tiff_is_own(path)
+        if kind == ".safetensors":
+            return _tensors_are_own(path)
+        with path.open("rb") as stream:
+            head = stream.read(1024)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+    if kind in MRC_SUFFIXES:
+        last = 224 + 80 * (int.from_bytes(head[220:224], "little") - 1)
+        return head[last : last + 80].startswith(MARK.encode())
+    if kind == ".npy":
+        return head[:10] == npy_start()
+    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
+
+
+def npy_start() -> bytes:
+    """The first bytes of our ``.npy`` files: NumPy's magic, version 1.0 and the length of the header."""
+    return b"\x93NUMPY\x01\x00" + (NPY_HEADER_BYTES - 10).to_bytes(2, "little")
+
+
+def _zarr_is_own(path: Path) -> bool:
+    description: dict[str, Any] = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    return str(description["attributes"]["_creator"]["name"]) == MARK
+
+
+def _tiff_is_own(path: Path) -> bool:
+    import tifffile
+
+    with tifffile.TiffFile(path) as tiff:
+        tags: Any = tiff.pages.first.tags
+        return str(tags["Software"].value).startswith(MARK)
+
+
+def _tensors_are_own(path: Path) -> bool:
+    with path.open("rb") as stream:
+        length = int.from_bytes(stream.read(8), "little")
+        if length > path.stat().st_size:
+            return False
+        header: dict[str, Any] = json.loads(stream.read(length))
+    return str(header["__metadata__"]["format"]).startswith(MARK)

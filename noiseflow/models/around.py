@@ -1,0 +1,120 @@
+"""Noise models around other noise models, and modules of other libraries as noise models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor, nn
+
+from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.picked import Signal, values_of
+from noiseflow.models.base import NoiseModelBase
+
+
+class ModelAround(NoiseModelBase):
+    """A noise model with another one inside, whose traits it shares where it does not say otherwise.
+
+    Args:
+        model: the noise model inside.
+
+    Raises:
+        TypeError: `model` is not a module.
+    """
+
+    model: NoiseModelBase
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = as_noise_model(model)
+
+    @property
+    def needs_image(self) -> bool:
+        return self.model.needs_image
+
+    @property
+    def neighbourhood(self) -> int:
+        return self.model.neighbourhood
+
+    @property
+    def shared_axis(self) -> int | None:
+        return self.model.shared_axis
+
+    @property
+    def describes_single_readings(self) -> bool:
+        return self.model.describes_single_readings
+
+    @property
+    def tabulate(self) -> bool:
+        return self.model.tabulate
+
+    @tabulate.setter
+    def tabulate(self, value: bool) -> None:
+        self.model.tabulate = value
+
+    @property
+    def one_pixel(self) -> NoiseModelBase:
+        return self.model.one_pixel
+
+    @property
+    def starts_most_likely(self) -> bool:
+        return self.model.starts_most_likely
+
+    @property
+    def learning_rate(self) -> float:
+        return self.model.learning_rate
+
+    @property
+    def num_steps(self) -> int:
+        return self.model.num_steps
+
+    @property
+    def joint_learning_rate(self) -> float:
+        return self.model.joint_learning_rate
+
+    @property
+    def most_joint_steps(self) -> int | None:
+        return self.model.most_joint_steps
+
+    @property
+    def starts_anew(self) -> bool:
+        return self.model.starts_anew
+
+    @property
+    def fitted_range(self) -> tuple[float, float] | None:
+        return self.model.fitted_range
+
+
+class ForeignModel(NoiseModelBase):
+    """Any module that returns a distribution for signals, with the traits of a noise model at their defaults.
+
+    Args:
+        module: called with signals; returns a distribution of one observation for each.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        found: NoiseDistribution = self.module(values_of(signal))
+        return found
+
+    def standardise(self, signal: Signal, observation: Tensor) -> None:
+        """That of the module, where it has one of its own."""
+        own: Callable[..., Any] | None = getattr(self.module, "standardise", None)
+        if own is not None:
+            own(values_of(signal), observation)
+
+
+def as_noise_model(module: nn.Module) -> NoiseModelBase:
+    """The module itself where it is a noise model, or else a `ForeignModel` around it.
+
+    Raises:
+        TypeError: not a module.
+    """
+    if not isinstance(module, nn.Module):
+        raise TypeError(
+            f"a noise model is a torch module, and this is {type(module).__name__}; derive it from noiseflow.NoiseModelBase"
+        )
+    return module if isinstance(module, NoiseModelBase) else ForeignModel(module)

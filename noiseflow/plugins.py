@@ -1,0 +1,51 @@
+"""Plug-ins of other packages, by entry point; one that is broken costs nobody else anything."""
+
+from __future__ import annotations
+
+import warnings
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+GROUPS = ("noiseflow.commands", "noiseflow.methods", "noiseflow.noise_models", "noiseflow.self_tests")
+_OWN = "noiseflow"
+
+
+def plugins(group: str) -> dict[str, EntryPoint]:
+    """The entry points of a group by name, without loading them; those of noiseflow itself come first."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=group):
+        if point.name not in found or package_of(point) == _OWN:
+            found[point.name] = point
+    return found
+
+
+def package_of(point: EntryPoint) -> str:
+    """The name of the installed package that an entry point belongs to."""
+    return point.dist.name if point.dist is not None else "an unknown package"
+
+
+def load_plugin(point: EntryPoint) -> Any:
+    """What an entry point names.
+
+    Raises:
+        ImportError: it cannot be loaded, whatever the reason; the message names package and reason.
+    """
+    try:
+        return point.load()
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ImportError(
+            f"'{point.name}' of the package {package_of(point)} cannot be loaded ({reason[:300]}); "
+            "mend, update or uninstall that package"
+        ) from error
+
+
+def load_plugins(group: str) -> dict[str, Any]:
+    """All of a group by name; a warning names each that cannot be loaded."""
+    loaded = {}
+    for name, point in plugins(group).items():
+        try:
+            loaded[name] = load_plugin(point)
+        except ImportError as error:
+            warnings.warn(str(error), stacklevel=2)
+    return loaded

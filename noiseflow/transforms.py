@@ -1,0 +1,134 @@
+"""Noise as a data-augmentation transform: `AddNoise`, in the manner of torchvision's transforms, version 2.
+
+Up to version 0.1 this was the module of increasing maps that flows are made of: see ``noiseflow.distributions.transforms``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import get_worker_info
+
+from noiseflow.arrays import is_array
+from noiseflow.models.around import as_noise_model
+
+
+class AddNoise(nn.Module):
+    """Put the noise of a model on clean images, as one step of a data pipeline.
+
+    Called with images, or with any nesting of tuples, lists and dictionaries that hold some; the same nesting comes back. Where
+    there are ``torchvision.tv_tensors.Image`` or ``Video`` in it, those are made noisy, and else the first tensor or array;
+    masks, boxes, labels and everything else pass unchanged.
+
+    Draws come from torch's global generator, which a `DataLoader` seeds anew for each worker and epoch. With `seed` they are
+    reproducible: one stream in the main process, and one for every worker and epoch, from `seed` and the worker's own seed
+    (``torch.manual_seed`` or the loader's ``generator`` settles that).
+
+    Args:
+        model: the noise model; images are in its detector units. It can be pickled, for workers that are spawned.
+        seed: of the transform's own streams of random numbers; None for torch's global generator.
+        keep_clean: return pairs (noisy, clean) in place of noisy images, for supervised training.
+    """
+
+    def __init__(self, model: nn.Module, *, seed: int | None = None, keep_clean: bool = False) -> None:
+        super().__init__()
+        self.model, self.seed, self.keep_clean = as_noise_model(model), seed, keep_clean
+        self._generator: torch.Generator | None = None
+        self._stream: tuple[int, ...] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the stream: every process has its own."""
+        return self.__dict__ | {"_generator": None, "_stream": None}
+
+    def forward(self, *inputs: Any) -> Any:
+        """Noisy images in the same nesting.
+
+        Args:
+            *inputs: images, any shape, detector units; integers become floating.
+        """
+        given = inputs if len(inputs) > 1 else inputs[0]
+        leaves = list(_leaves(given))
+        marked = [leaf for leaf in leaves if _is_marked_image(leaf)]
+        plain = [leaf for leaf in leaves if type(leaf) is Tensor or (is_array(leaf) and np.ndim(leaf) > 1)]
+        chosen = marked or plain[:1]
+        if not chosen:
+            raise ValueError(
+                "AddNoise found no image in its input; give a tensor, an array, or a nesting that holds one"
+            )
+        return _mapped(given, lambda leaf: self._noisy(leaf) if any(leaf is each for each in chosen) else leaf)
+
+    @torch.no_grad()
+    def _noisy(self, image: Any) -> Any:
+        if not isinstance(image, Tensor):
+            noisy = self.model(image).sample(generator=self._own_generator(self.model.device))
+            return (noisy, image) if self.keep_clean else noisy
+        clean = image.as_subclass(Tensor)
+        clean = clean if clean.is_floating_point() else clean.to(torch.get_default_dtype())
+        noisy = self.model(clean).sample(generator=self._own_generator(clean.device))
+        noisy = noisy if type(image) is Tensor else _wrapped_like(noisy, image)
+        return (noisy, image) if self.keep_clean else noisy
+
+    def _own_generator(self, device: torch.device) -> torch.Generator | None:
+        if self.seed is None:
+            return None
+        worker = get_worker_info()
+        stream = (self.seed,) if worker is None else (self.seed, worker.seed)
+        if self._generator is None or stream != self._stream or self._generator.device != device:
+            own = np.random.SeedSequence(stream).generate_state(1, np.uint64)[0] >> 1
+            self._generator, self._stream = torch.Generator(device).manual_seed(int(own)), stream
+        return self._generator
+
+    def extra_repr(self) -> str:
+        return f"seed={self.seed}, keep_clean={self.keep_clean}"
+
+
+def _leaves(given: Any) -> Any:
+    if isinstance(given, dict):
+        given = given.values()
+    elif not isinstance(given, tuple | list):
+        yield given
+        return
+    for each in given:
+        yield from _leaves(each)
+
+
+def _mapped(given: Any, function: Callable[[Any], Any]) -> Any:
+    if isinstance(given, dict):
+        return type(given)((key, _mapped(value, function)) for key, value in given.items())
+    if isinstance(given, tuple) and hasattr(given, "_fields"):
+        return type(given)(*(_mapped(each, function) for each in given))
+    if isinstance(given, tuple | list):
+        return type(given)(_mapped(each, function) for each in given)
+    return function(given)
+
+
+def _is_marked_image(leaf: Any) -> bool:
+    """Whether this is a torchvision image or video; torchvision is not needed to know."""
+    return isinstance(leaf, Tensor) and any(
+        kind.__module__.startswith("torchvision.tv_tensors") and kind.__name__ in ("Image", "Video")
+        for kind in type(leaf).__mro__
+    )
+
+
+def _wrapped_like(noisy: Tensor, image: Tensor) -> Tensor:
+    from torchvision import tv_tensors
+
+    wrapped: Tensor = tv_tensors.wrap(noisy, like=image)
+    return wrapped
+
+
+def __getattr__(name: str) -> Any:
+    """Names of the module that had this one's path before, for one version."""
+    from noiseflow.distributions import transforms as increasing_maps
+
+    if name.startswith("_") or not hasattr(increasing_maps, name):
+        raise AttributeError(f"module 'noiseflow.transforms' has no attribute {name!r}")
+    warnings.warn(
+        f"{name} has moved; import it from noiseflow.distributions.transforms", DeprecationWarning, stacklevel=2
+    )
+    return getattr(increasing_maps, name)

@@ -1,0 +1,1 @@
+"""Denoisers of single images, and the variance stabilisation they work in."""

@@ -1,0 +1,209 @@
+"""What a joint fit will do: a list of stages, made from what is known of the series and what the user settled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from noiseflow.described import described
+
+Kind = Literal["signal", "noise", "candidates", "weights"]
+Where = Literal["slab", "whole"]
+Noise = Literal["simple", "chosen"]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a series before any fit.
+
+    Attributes:
+        choose_noise: whether the noise model is chosen among candidates.
+        learn_noise: whether the noise model that the volume ends with has anything to learn.
+        simple_is_final: whether that model is the simple one that every fit begins with (least squares).
+        choose_weight: whether the weight of the regulariser is chosen.
+        whole_slab: whether the slab that choices are made on is the whole volume.
+        can_halve: whether the field has a voxel grid half as fine that is worth using.
+        hidden_offset: whether no vacuum shows the offset of a linear response.
+        settled: whether noise model, weight and response are known from other slices of the same series.
+        quiet: whether the noise model is chosen, and noise is small beside the contrast: most of what a fit leaves is then
+            misfit, which a width that follows the signal would excuse where it is bright. The volume is fitted by least squares,
+            weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and the noise model describes
+            what is left.
+        hold_offset: whether the offset of a linear response stays as the coarse reconstruction found it: without noise, a haze
+            over a lower offset looks as good as vacuum to least squares, and absorbs misfit.
+    """
+
+    choose_noise: bool = True
+    learn_noise: bool = True
+    simple_is_final: bool = False
+    choose_weight: bool = True
+    whole_slab: bool = False
+    can_halve: bool = False
+    hidden_offset: bool = False
+    settled: bool = False
+    quiet: bool = False
+    hold_offset: bool = False
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Numbers of steps and learning rates; `docs/benchmarks/ablations.md` has a row for each.
+
+    Attributes:
+        settle: signal steps on the slab before noise models are compared.
+        candidate: steps of each candidate noise model; its likelihood then differs from where it would end by less than the
+            tolerance of the choice.
+        adapt: signal steps on the slab under the chosen noise model.
+        refine: noise-model steps on a signal that has become better.
+        trial: signal steps that compare weights, from a state fitted at the first one.
+        whole: signal steps of the volume from a coarse start, unless the user gives their number.
+        polish: the same where the slab was the whole volume.
+        quiet: the same where noise is small: there is more to fit.
+        later_rate: learning rate of a signal that is not a rough start, relative to one that is: the first steps of Adam are as
+            large where little is left.
+        offset_rate: factor on the rate of an offset that no vacuum shows, from a rough start.
+    """
+
+    settle: int = 40
+    candidate: int = 60
+    adapt: int = 30
+    refine: int = 60
+    trial: int = 30
+    whole: int = 100
+    polish: int = 40
+    quiet: int = 240
+    later_rate: float = 0.5
+    offset_rate: float = 4.0
+
+
+@described(rate="of a rough start's learning rate")
+@dataclass(frozen=True)
+class FitStage:
+    """One stage of a joint fit.
+
+    Attributes:
+        name: unique within a plan; the journal keeps what the stage reached under it.
+        kind: ``signal`` fits the volume and response under a fixed noise model; ``noise`` fits the noise model to a fixed signal;
+            ``candidates`` fits several noise models and takes one; ``weights`` compares weights of the regulariser.
+        where: the slab that choices are made on, or the whole volume.
+        noise: the simple noise model that every fit begins with, or the model of choice.
+        num_steps: optimisation steps; of each fit, where there are several.
+        rate: learning rate of the signal, relative to a rough start's.
+        half: at half the resolution.
+        offset_rate: factor on the learning rate of the offset.
+        standardise: measure the noise model's scaling first.
+        fits: how many fits the stage is expected to make.
+    """
+
+    name: str
+    kind: Kind
+    where: Where
+    noise: Noise
+    num_steps: int
+    rate: float = 1.0
+    half: bool = False
+    offset_rate: float = 1.0
+    standardise: bool = False
+    fits: int = 1
+
+
+_START = (
+    10  # steps of a noise model that is measured rather than fitted: of one parameter, or one width at every signal
+)
+_TRIALS, _CANDIDATES = 5, 2  # fits that these stages usually make, for the progress bar
+
+
+def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | None = None) -> list[FitStage]:
+    """The stages of a joint fit.
+
+    Args:
+        facts: what is known of the series.
+        num_steps: signal steps of the whole volume; by default as the schedule says.
+        schedule: numbers of steps and learning rates.
+    """
+    schedule = Schedule() if schedule is None else schedule
+    choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
+    stages = _on_the_slab(facts, schedule) if choosing else []
+    if not choosing and not facts.settled:
+        stages.append(FitStage("start noise", "noise", "whole", "simple", _START, standardise=True))
+    warm = choosing and facts.whole_slab
+    usual = schedule.quiet if facts.quiet else schedule.polish if warm else schedule.whole
+    stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps, warm=warm)
+    if facts.quiet and not facts.settled:
+        stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.refine, standardise=True))
+    return stages
+
+
+def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
+    noise: Noise = "simple" if facts.simple_is_final else "chosen"
+    usual = 0.0 if facts.hold_offset else 1.0
+    hasten = usual * (schedule.offset_rate if facts.hidden_offset else 1.0)
+    stages = [
+        FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
+        FitStage("settle", "signal", "slab", "simple", schedule.settle, offset_rate=hasten),
+    ]
+    if facts.choose_noise:
+        stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
+    elif facts.learn_noise:
+        stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
+    later = schedule.later_rate
+    stages.append(FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later, offset_rate=usual))
+    if facts.learn_noise:
+        stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
+    if facts.choose_weight:
+        stages.append(
+            FitStage(
+                "choose weight", "weights", "slab", noise, schedule.trial, rate=later, offset_rate=usual, fits=_TRIALS
+            )
+        )
+        if facts.learn_noise:
+            stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
+    return stages
+
+
+def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int, *, warm: bool) -> list[FitStage]:
+    noise: Noise = "simple" if facts.simple_is_final else "chosen"
+    later, left, stages = schedule.later_rate, num_steps, list[FitStage]()
+    usual = 0.0 if facts.hold_offset else 1.0
+    if not warm:
+        hasten = usual * (schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0)
+        begin = num_steps // 4  # the simple noise pulls at a rough signal steadily
+        if begin:
+            stages.append(
+                FitStage("begin", "signal", "whole", "simple", begin, half=facts.can_halve, offset_rate=hasten)
+            )
+            left -= begin
+        if begin and facts.can_halve:
+            stages.append(FitStage("coarse", "signal", "whole", noise, begin, rate=later, offset_rate=usual, half=True))
+            left -= begin
+    if not facts.learn_noise or facts.settled or left < 2:
+        return [*stages, FitStage("fit", "signal", "whole", noise, left, rate=later, offset_rate=usual)]
+    last = max(1, left // 3)
+    return [
+        *stages,
+        FitStage("fit", "signal", "whole", noise, left - last, rate=later, offset_rate=usual),
+        FitStage("refine noise on the volume", "noise", "whole", noise, schedule.refine),
+        FitStage("finish", "signal", "whole", noise, last, rate=later / 2, offset_rate=usual),
+    ]
+
+
+def total_steps(stages: Sequence[FitStage]) -> int:
+    """Steps of all fits that a plan expects."""
+    return sum(stage.num_steps * stage.fits for stage in stages)
+
+
+def describe(stages: Sequence[FitStage]) -> str:
+    """A plan as lines of text: where, name, kind, steps, and how."""
+    lines = []
+    for stage in stages:
+        steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
+        how: list[str] = [stage.noise]
+        if stage.kind in ("signal", "weights"):
+            how.append(f"rate {stage.rate:g}")
+        if stage.offset_rate != 1 and stage.kind in ("signal", "weights"):
+            how.append(f"offset x {stage.offset_rate:g}" if stage.offset_rate else "offset held")
+        if stage.half:
+            how.append("half resolution")
+        lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")
+    return "\n".join(lines)

@@ -1,0 +1,208 @@
+"""The runner of a plan: carries its stages out one by one, each kept under its name by the journal."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow import FitResult, fit
+from noiseflow.fitting.observation_table import ObservationTable
+from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
+from recon.joint.plan import FitStage
+from recon.joint.task import Task
+from recon.joint.weight import WeightChoice, choose_weight
+
+Progress = Callable[[int, int, str], None]
+"""``progress(steps done, steps expected, note)``."""
+
+_BATCH = 4096  # pixels per noise-model step
+_WARM_UP = 0.1  # share of the steps, except from a rough start
+_TOLERATED = (
+    0.003  # nats per pixel; what a richer noise model gains below that may be a bias of the signal that it absorbed
+)
+_TABULATED = 0.05  # nats per pixel
+
+
+class RunFit(Protocol):
+    """Runs one fit; a journal also keeps what it reached under its name."""
+
+    def __call__(
+        self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
+    ) -> FitResult: ...
+
+
+def run_fit(
+    name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
+) -> FitResult:
+    """`noiseflow.fit` as a `RunFit` that keeps nothing."""
+    del name
+    return fit(noise_model, signal, observation, **options)
+
+
+class Runner:
+    """Carries out the stages of a plan.
+
+    Args:
+        tasks: signal models and pixels, of the ``slab`` and of the ``whole``.
+        models: the ``simple`` noise model, and the ``chosen`` one where it is known; fitted in place.
+        candidates: noise models to choose from, simplest first.
+        first_weight: where the search for a weight starts.
+        generator: source of the random choices.
+        run_fit: runs every fit.
+        prefix: of the names under which fits are kept.
+        expected: steps of the whole plan.
+        progress: called with the steps done, those expected and a note.
+
+    Attributes:
+        weight_choice: the weights tried, once they were compared.
+        result: of the last fit of a signal.
+    """
+
+    def __init__(
+        self,
+        tasks: Mapping[str, Task],
+        models: dict[str, nn.Module],
+        *,
+        candidates: Sequence[nn.Module] = (),
+        first_weight: float,
+        generator: torch.Generator,
+        run_fit: RunFit = run_fit,
+        prefix: str = "",
+        expected: int = 0,
+        progress: Progress | None = None,
+    ) -> None:
+        self.tasks, self.models, self.candidates = tasks, models, candidates
+        self.first_weight, self.generator, self.run_fit = first_weight, generator, run_fit
+        self.prefix, self.progress = prefix, progress
+        self.weight_choice: WeightChoice | None = None
+        self.result = FitResult(models["simple"])
+        self._done, self._expected = 0, expected
+
+    def run(self, stages: Sequence[FitStage]) -> None:
+        """Carry out all stages, in order."""
+        carry_out = {
+            "signal": self._signal,
+            "noise": self._noise,
+            "candidates": self._candidates,
+            "weights": self._weights,
+        }
+        for stage in stages:
+            before = self._done
+            carry_out[stage.kind](stage, self.tasks[stage.where])
+            # a stage that needed more or fewer fits than expected corrects the total, not the count
+            self._expected += self._done - before - stage.num_steps * stage.fits
+
+    def _signal(self, stage: FitStage, task: Task) -> None:
+        if not stage.half:
+            self.result = self._fit_signal(stage, task, stage.name)
+            return
+        with task.halved() as half:
+            self.result = self._fit_signal(stage, half, stage.name)
+
+    def _noise(self, stage: FitStage, task: Task) -> None:
+        model = self.models[stage.noise]
+        if learns(model):
+            standardise = stage.standardise or starts_anew(model)
+            self._fit_noise(stage.name, model, task, task.signal(), stage.num_steps, standardise=standardise)
+
+    def _candidates(self, stage: FitStage, task: Task) -> None:
+        """The simplest that predicts held-out pixels nearly as well as the richest. One of which no table can be made is left
+        out: it has a peak for every electron, far narrower than their distance, to which noise without such peaks was bent."""
+        *simpler, richest = (model.to(task.observation.device) for model in self.candidates)
+        signal, found = task.signal(), dict[nn.Module, float]()
+
+        def nll(model: nn.Module) -> float:
+            name = f"{stage.name} {len(found) + 1}"
+            result = self._fit_noise(name, model, task, signal, stage.num_steps, standardise=True)
+            return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
+
+        found[richest] = lowest = nll(richest)
+        for model in simpler:
+            found[model] = nll(model)
+            if found[model] <= lowest + _TOLERATED:
+                break
+        good_enough = min(found.values()) + _TOLERATED
+        self.models["chosen"] = next(
+            model for model in [*simpler, richest] if found.get(model, math.inf) <= good_enough
+        )
+
+    def _weights(self, stage: FitStage, task: Task) -> None:
+        """Compare weights by fits that all begin in the same state: steps that another weight has taken count for none. The task
+        is left in the likeliest state."""
+        model = task.signal_model
+        start = likeliest = copy.deepcopy(model.state_dict())
+        lowest = math.inf
+
+        def held_out_nll(weight: float) -> float:
+            nonlocal likeliest, lowest
+            model.load_state_dict(start)
+            model.weight = weight
+            history = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").history
+            nll = list(history.values())[-1]
+            if nll < lowest:
+                lowest, likeliest = nll, copy.deepcopy(model.state_dict())
+            return nll
+
+        self.weight_choice = choose_weight(held_out_nll, self.first_weight)
+        model.load_state_dict(likeliest)
+        for each in self.tasks.values():
+            each.signal_model.weight = self.weight_choice.weight
+
+    def _fit_signal(self, stage: FitStage, task: Task, name: str) -> FitResult:
+        """Fit volume and response under a noise model that stays as it is."""
+        noise_model, model = self.models[stage.noise], task.signal_model
+        try:
+            return self._run(
+                name,
+                noise_model,
+                model,
+                task,
+                num_steps=stage.num_steps,
+                train_noise=False,
+                standardise=False,
+                parameter_groups=model.parameter_groups(rate=stage.rate, offset_rate=stage.offset_rate),
+                warm_up=_WARM_UP if stage.rate < 1 else 0.0,
+                tables=task.tables(noise_model),
+            )
+        finally:
+            model.release()
+
+    def _fit_noise(
+        self, name: str, model: nn.Module, task: Task, signal: Tensor, num_steps: int, *, standardise: bool
+    ) -> FitResult:
+        for each in self.tasks.values():
+            each.forget(model)
+        options = {"learning_rate": rate_of(model), "num_steps": num_steps_of(model, num_steps)}
+        return self._run(name, model, signal, task, standardise=standardise, **options)
+
+    def _run(
+        self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, task: Task, **options: Any
+    ) -> FitResult:
+        begun = self._done
+
+        def report(step: int, note: str) -> None:
+            self._done = begun + step
+            if self.progress is not None:
+                self.progress(self._done, max(self._expected, self._done), f"{name}, {note}")
+
+        options |= {"mask": task.use, "held_out": task.held_out, "generator": self.generator, "batch_size": _BATCH}
+        result = self.run_fit(
+            self.prefix + name, noise_model, signal, task.observation, digitise=False, progress=report, **options
+        )
+        self._done = begun + options["num_steps"]
+        return result
+
+
+@torch.no_grad()
+def _tabulates(noise_model: nn.Module, task: Task, signal: Tensor) -> bool:
+    """Whether a table holds the likelihood of the observations; the fits that follow use it."""
+    observation, ends = task.observation.flatten(), [float(end) for end in torch.aminmax(signal)]
+    if task.use is not None:
+        observation = torch.where(task.use.flatten(), observation, task.observation[task.use].mean())
+    table = task.tables(noise_model).get(lambda _: ObservationTable(noise_model, observation, *ends))
+    return table.error < _TABULATED

@@ -1,0 +1,89 @@
+"""States of a run in files: nested values and tensors, written whole or not at all; opening one runs no code from it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from noiseflow.io.ownership import is_own, require_own
+from noiseflow.io.partials import clear_all_leftovers
+from noiseflow.io.tensor_files import save_tensors
+
+FORMAT = "noiseflow checkpoint 1"
+
+
+def write_state(path: Path, state: dict[str, Any]) -> None:
+    """Write nested dicts and lists of tensors, numbers and strings, all at once or not at all.
+
+    Raises:
+        OSError: the disk is full, the folder is gone, or the like; an earlier state stays. A file of others is not replaced.
+    """
+    require_own(path, overwrite=False)
+    tensors: dict[str, Tensor] = {}
+    description = json.dumps(_packed(state, tensors))
+    save_tensors(path, tensors, {"format": FORMAT, "state": description})
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """Read what `write_state` wrote.
+
+    Raises:
+        ValueError: another file, or a damaged one.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            packed = json.loads((file.metadata() or {})["state"])
+            state: dict[str, Any] = _unpacked(packed, file)
+    except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"checkpoint {path} is damaged ({type(error).__name__}); leave out --resume to start over"
+        ) from error
+    return state
+
+
+def discard_states(folder: Path, *descriptions: str) -> None:
+    """Remove the states in a folder, and the folder where nothing else is in it; files of others stay.
+
+    Args:
+        folder: of the states; it need not exist.
+        descriptions: names of further files of the run.
+    """
+    if not folder.is_dir():
+        return
+    clear_all_leftovers(folder)
+    for file in (*(file for file in folder.glob("*.safetensors") if is_own(file)), *map(folder.joinpath, descriptions)):
+        file.unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        name = str(len(tensors))
+        kept = value.detach().cpu().contiguous()
+        whole = kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
+        shared = any(kept.data_ptr() == other.data_ptr() for other in tensors.values())
+        tensors[name] = kept if whole and not shared else kept.clone()
+        return {"tensor": name}
+    if isinstance(value, dict):
+        return {"dict": [[key, _packed(item, tensors)] for key, item in value.items()]}
+    if isinstance(value, (list, tuple)):
+        return {"list": [_packed(item, tensors) for item in value]}
+    if isinstance(value, (str, int, float, bool, type(None))):
+        return value
+    raise TypeError(f"a checkpoint cannot hold {type(value).__name__}")
+
+
+def _unpacked(value: Any, file: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    if "tensor" in value:
+        return file.get_tensor(value["tensor"])
+    if "dict" in value:
+        return {key: _unpacked(item, file) for key, item in value["dict"]}
+    return [_unpacked(item, file) for item in value["list"]]

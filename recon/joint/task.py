@@ -1,0 +1,92 @@
+"""A signal model with the pixels that it is fitted to and those that judge it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from noiseflow.fitting.observation_table import TableKeeper
+from recon.joint.half_resolution import HalfResolution
+from recon.joint.signal_model import TomographySignal
+
+
+@dataclass
+class Task:
+    """A signal model and its pixels.
+
+    Attributes:
+        signal_model: what is fitted.
+        observation: (tilt, u, y) pixel values, detector units.
+        use: (tilt, u, y) False at pixels that are left out; None uses all.
+        held_out: (tilt, u, y) True at pixels that judge and never train.
+    """
+
+    signal_model: TomographySignal
+    observation: Tensor
+    use: Tensor | None
+    held_out: Tensor
+    _tables: dict[nn.Module, TableKeeper] = field(default_factory=dict)
+
+    def tables(self, noise_model: nn.Module) -> TableKeeper:
+        """The table of the pixels under a noise model, kept until the model changes."""
+        return self._tables.setdefault(noise_model, TableKeeper())
+
+    def forget(self, noise_model: nn.Module) -> None:
+        """Let go of the table of a noise model that has changed."""
+        self._tables.pop(noise_model, None)
+
+    @torch.no_grad()
+    def signal(self) -> Tensor:
+        """The signal of all pixels as it is, (tilt, u, y)."""
+        return self.signal_model.signal().view_as(self.observation)
+
+    @contextmanager
+    def halved(self) -> Iterator[Task]:
+        """The same task at half the resolution; what it learns, this one has learnt."""
+        half = HalfResolution(self.signal_model)
+        use = None if self.use is None else half.pixels(self.use)
+        yield Task(half.signal_model, half.pixels(self.observation), use, half.pixels(self.held_out))
+        half.hand_over()
+
+
+def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
+    """Pixels (tilt, u, y) to hold out, shaped like a mask: all of two contiguous gaps of tilts, a third of the range apart, each
+    a tenth of the range and three tilts wide at least. Tilts between neighbours would be given away by them."""
+    order = np.argsort(tilt_angles, kind="stable")
+    span = tilt_angles[order[-1]] - tilt_angles[order[0]]
+    held_out = torch.zeros_like(like)
+    for middle in (tilt_angles[order[0]] + span / 3, tilt_angles[order[0]] + 2 * span / 3):
+        distance = np.abs(tilt_angles - middle)
+        near = distance <= max(span / 20, float(np.sort(distance)[min(2, len(order) - 1)]))
+        held_out[torch.from_numpy(near).to(like.device)] = True
+    return held_out
+
+
+def noise_share(images: NDArray[Any]) -> float:
+    """Noise of single pixels relative to the contrast: the mean size of a second difference along both axes, which smooth
+    structure hardly has, over the standard deviation of the images (Immerkær 1996, doi:10.1006/cviu.1996.0060).
+
+    Args:
+        images: (tilt, y, u) pixel values; about sixteen of them are looked at.
+    """
+    some = np.asarray(images[:: max(1, len(images) // 16)], dtype=np.float32)
+    if min(some.shape[1:]) < 3 or not some.std() > 0:
+        return math.inf
+    second = some[:, 2:] - 2 * some[:, 1:-1] + some[:, :-2]
+    second = second[:, :, 2:] - 2 * second[:, :, 1:-1] + second[:, :, :-2]
+    return math.sqrt(math.pi / 2) / 6 * float(np.abs(second).mean() / some.std())
+
+
+def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
+    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away."""
+    tilts, *sides = shape
+    coarse = torch.rand((tilts, *(-(-side // block) for side in sides)), generator=generator) < share
+    return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]

@@ -1,0 +1,202 @@
+"""What a method of reconstruction is, and where methods are found: every module of this folder without an underscore is one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from noiseflow.described import described
+from noiseflow.kept_memory import kept_memory
+from noiseflow.plugins import load_plugin, plugins
+from recon.joint.plan import FitStage
+from recon.joint.run import Progress, RunFit, run_fit
+from recon.joint.stages import RunStage, run_stage
+from recon.projection.wbp import WINDOWS
+from recon.reconstruction import Reconstruction
+from recon.scale.blocks import Images, Solve, solve_in_blocks
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+
+_GROUP = "noiseflow.methods"
+
+
+@described()
+@dataclass(frozen=True)
+class Settings:
+    """What a user may settle; whatever is None the method chooses by itself.
+
+    Attributes:
+        weight: of the total variation, see `recon.joint.signal_model.TomographySignal`.
+        num_steps: steps or iterations.
+        noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
+        window: of the back-projection, one of `recon.projection.wbp.WINDOWS`.
+        denoiser: see `recon.denoise.denoisers.find_denoiser`.
+        defocus: blur that fitted methods model, pixels per voxel out of the plane of focus.
+        seed: of every random choice.
+        device: where to compute.
+        progress: called with the steps done, those expected, and a note.
+        prefix: of the names of fits, where one run makes several volumes.
+        run_fit, run_stage: run every fit and every other long piece of work; a `recon.joint.checkpoint.Journal` keeps what each
+            has reached.
+
+    Raises:
+        ValueError: a negative weight, no steps, a defocus outside 0 to 1, or an unknown window.
+    """
+
+    weight: float | None = None
+    num_steps: int | None = None
+    noise_model: nn.Module | None = None
+    window: str | None = None
+    denoiser: str = "nlm"
+    defocus: float = 0.0
+    seed: int = 0
+    device: torch.device | str = "cpu"
+    progress: Progress | None = None
+    prefix: str = ""
+    run_fit: RunFit = run_fit
+    run_stage: RunStage = run_stage
+
+    def __post_init__(self) -> None:
+        if self.weight is not None and not 0 <= self.weight < np.inf:
+            raise ValueError(f"--weight {self.weight} must be zero or more")
+        if self.num_steps is not None and self.num_steps < 1:
+            raise ValueError(f"--steps {self.num_steps} must be 1 or more")
+        if not 0 <= self.defocus <= 1:
+            raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
+        if self.window is not None and self.window not in WINDOWS:
+            raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
+
+
+Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
+MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], int]]
+Finish = Callable[[Volume, Images], Reconstruction]
+Blockwise = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, Finish]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of reconstruction.
+
+    Attributes:
+        name: as users give it.
+        description: one sentence.
+        run: reconstructs a series on a grid.
+        fitted: whether it fits a volume, and so knows ``weight``, ``defocus`` and what a fit takes of memory.
+        keeps_noise_model: whether it takes a calibrated noise model; another refuses one.
+        learns_noise: whether its result has a noise model.
+        plan: the stages of its fit, and the slices of the slab that choices are made on; None where nothing is planned.
+        blockwise: settles what all slices share, and returns what reconstructs some of them and what makes the result of all
+            their volumes and projections; None where slices cannot be reconstructed apart.
+    """
+
+    name: str
+    description: str
+    run: Run
+    fitted: bool = False
+    keeps_noise_model: bool = False
+    learns_noise: bool = False
+    plan: MakePlan | None = None
+    blockwise: Blockwise | None = None
+
+
+def method_names() -> list[str]:
+    """All methods, without importing any: those of this package, then those of others (entry points ``noiseflow.methods``)."""
+    own = [module.name for module in iter_modules([str(Path(__file__).parent)]) if not module.name.startswith("_")]
+    names = sorted(name.replace("_", "-") for name in own)
+    return ["auto", *(name for name in names if name != "auto"), *sorted(plugins(_GROUP))]
+
+
+@cache
+def find_method(name: str) -> Method:
+    """The method of a name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in method_names():
+        raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
+    other = plugins(_GROUP).get(name)
+    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
+    if not isinstance(found, Method):
+        raise TypeError(f"method {name} is a {type(found).__name__}; a method is a recon.methods.Method")
+    return found
+
+
+def settings_of(method: str, **settings: Any) -> Settings:
+    """The settings of a method, checked before there are data.
+
+    Args:
+        method: one of `method_names`.
+        **settings: the attributes of `Settings`.
+
+    Raises:
+        ValueError: an unknown method, or settings that make no sense.
+    """
+    chosen, found = Settings(**settings), find_method(method)
+    if chosen.noise_model is not None and not found.keeps_noise_model:
+        able = [name for name in method_names() if find_method(name).keeps_noise_model]
+        raise ValueError(f"--noise-model: method {method} has no use for one; use --method {', '.join(able)}")
+    if chosen.defocus and not found.fitted:
+        able = [name for name in method_names() if find_method(name).fitted]
+        raise ValueError(f"--defocus: method {method} models none; use --method {', '.join(able)}")
+    return chosen
+
+
+@kept_memory()
+def reconstruct(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid | None = None,
+    *,
+    method: str = "auto",
+    slices_at_once: int | None = None,
+    scratch: str | Path | None = None,
+    **settings: Any,
+) -> Reconstruction:
+    """Reconstruct a volume from a tilt series.
+
+    Args:
+        tilt_series: the images; `recon.prepare` aligns, screens and checks raw ones.
+        grid: voxels and their size; by default one voxel per pixel and as deep as wide.
+        method: one of `method_names`.
+        slices_at_once: reconstruct in blocks of so many slices, where memory is short.
+        scratch: with `slices_at_once`, a new ``.npy`` file that holds the volume; the result maps it to memory.
+        **settings: the attributes of `Settings`.
+
+    Returns:
+        The volume, projections in the order of the tilts, and the response by rising angle.
+
+    Raises:
+        ValueError: an unknown method, settings that make no sense, or a grid that does not match the images.
+    """
+    grid = VolumeGrid.of(tilt_series) if grid is None else grid
+    order = np.argsort(tilt_series.tilt_angles, kind="stable")
+    if (np.diff(order) != 1).any():  # the order of the tilts must not change the volume by a bit
+        result = reconstruct(
+            tilt_series.select(order),
+            grid,
+            method=method,
+            slices_at_once=slices_at_once,
+            scratch=scratch,
+            **settings,
+        )
+        return replace(result, projections=result.projections[np.argsort(order)])
+    chosen, found = settings_of(method, **settings), find_method(method)
+    if slices_at_once is None:
+        return found.run(tilt_series, grid, chosen)
+    if slices_at_once < 1:
+        raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
+    if found.blockwise is None:
+        able = [name for name in method_names() if find_method(name).blockwise is not None]
+        raise ValueError(f"--slices-at-once does not know --method {method}: choose {', '.join(able)}")
+    if scratch is None:
+        raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
+    solve, finish = found.blockwise(tilt_series, grid, chosen)
+    return finish(*solve_in_blocks(solve, tilt_series, grid, Path(scratch), slices_at_once))

@@ -1,0 +1,11 @@
+"""Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best."""
+
+from noiseflow import Gaussian
+from recon.fields.fields import VoxelField
+from recon.methods._fitted import fitted
+
+METHOD = fitted(
+    "explicit",
+    "Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best.",
+    lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "weight": 0.0},
+)

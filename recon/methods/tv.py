@@ -1,0 +1,11 @@
+"""Least squares with total variation on plain voxels."""
+
+from noiseflow import Gaussian
+from recon.fields.fields import VoxelField
+from recon.methods._fitted import fitted
+
+METHOD = fitted(
+    "tv",
+    "Least squares with total variation on plain voxels.",
+    lambda settings: {"noise_model": Gaussian, "make_field": VoxelField},
+)

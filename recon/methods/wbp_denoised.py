@@ -1,0 +1,6 @@
+"""Images denoised one by one, then back-projection."""
+
+from recon.methods import wbp
+from recon.methods._denoised import after_denoising
+
+METHOD = after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", wbp.METHOD)

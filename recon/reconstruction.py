@@ -1,0 +1,61 @@
+"""What every method of reconstruction gives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.described import described
+from recon.series.tilt_series import Volume
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from noiseflow import FitResult
+    from recon.joint.signal_model import TomographySignal
+    from recon.joint.weight import WeightChoice
+
+
+@described(projections="detector units")
+@dataclass(frozen=True)
+class Reconstruction:
+    """A volume, and what was learnt with it.
+
+    Attributes:
+        volume: the clean volume.
+        projections: (tilt, y, u) the clean images that the volume predicts, detector units.
+        method: the method that made it.
+        noise_model: the noise model it was fitted with; None where the method has none.
+        fit_result: held-out likelihood and its history; None where nothing was fitted.
+        signal_model: field, projector and image formation, as fitted; None where the method has none.
+        weight_choice: the weights tried and their held-out likelihoods, where the weight was chosen.
+        choices: what was chosen or estimated, by name, for a table.
+    """
+
+    volume: Volume
+    projections: NDArray[np.float32]
+    method: str
+    noise_model: nn.Module | None = None
+    fit_result: FitResult | None = None
+    signal_model: TomographySignal | None = None
+    weight_choice: WeightChoice | None = None
+    choices: dict[str, float | str] = field(default_factory=dict)
+
+    @property
+    def weight(self) -> float:
+        """Weight of the regulariser; NaN where there is none."""
+        return math.nan if self.signal_model is None else float(self.signal_model.weight)
+
+    @property
+    def weights_tried(self) -> dict[float, float]:
+        """Weight of the regulariser → held-out negative log-likelihood, nats per pixel; empty where it was not chosen."""
+        return {} if self.weight_choice is None else self.weight_choice.tried
+
+    @property
+    def response(self) -> dict[str, list[float]]:
+        """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty where nothing was fitted."""
+        return {} if self.signal_model is None else self.signal_model.response()

@@ -1,0 +1,54 @@
+"""How long a planned reconstruction will take on this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+
+from recon.joint.plan import FitStage
+from recon.projection.projector import SliceProjector
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+_SLICES = 4  # that are projected to see how fast this machine is
+_REST = 2.3  # a step takes so many times as long as its projections: likelihood, regulariser, interpolation, optimiser (profiled)
+_NOISE_STEP = 0.012  # s, of a batch of 4096 pixels; it hardly depends on the series
+_START = 2.0  # s, of the coarse reconstruction before the first stage
+
+
+def expected_seconds(stages: Sequence[FitStage], tilt_series: TiltSeries, grid: VolumeGrid, slab_height: int) -> float:
+    """Seconds that stages will take, within a factor of two or so.
+
+    Args:
+        stages: of a plan.
+        tilt_series: the images.
+        grid: of the volume.
+        slab_height: slices of the slab that choices are made on.
+    """
+    slice_step = _REST * _seconds_of_a_slice(tilt_series, grid)
+    total = _START
+    for stage in stages:
+        if stage.kind in ("noise", "candidates"):
+            total += stage.num_steps * stage.fits * _NOISE_STEP
+        else:
+            slices = slab_height if stage.where == "slab" else grid.height
+            total += stage.num_steps * stage.fits * slices * slice_step / (8 if stage.half else 1)
+    return total
+
+
+def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
+    """Projecting one slice to all tilts, and back."""
+    projector = SliceProjector(
+        tilt_angles=tilt_series.tilt_angles,
+        depth=grid.depth,
+        width=grid.width,
+        detector_width=tilt_series.images.shape[2],
+    )
+    columns = torch.rand(grid.depth * grid.width, _SLICES)
+    with torch.no_grad():
+        rays = projector.project(columns)  # the first call makes room
+        started = time.perf_counter()
+        rays = projector.project(columns)
+        projector.backproject(rays)
+    return (time.perf_counter() - started) / _SLICES

@@ -1,0 +1,187 @@
+"""Images of a raw tilt series matched with a coarse volume of them: the shift of every image, and the tilt axis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from recon.projection.projector import SliceProjector
+
+ITERATIONS = 10
+_FARTHEST = 3.0  # pixels in one step: beyond, the slopes of an image that is blurred by a pixel no longer hold
+_MOST_TURN = math.radians(3)  # moves the edge of 64 pixels by about as much
+
+
+@dataclass(frozen=True)
+class Match:
+    """A tilt axis and shifts, and the volume that the images make with them.
+
+    Attributes:
+        axis: radians from y towards −x.
+        shifts: (tilt, (y, x)) raw pixels: where the aligned middle lies from the raw one.
+        volume: (z, y, x) of the size it was matched at.
+    """
+
+    axis: float
+    shifts: Tensor
+    volume: Tensor
+
+    @property
+    def degrees(self) -> float:
+        """The axis in degrees."""
+        return math.degrees(self.axis)
+
+    @property
+    def occupied(self) -> float:
+        """Share of the voxels that the volume fills: its sum squared over its sum of squares; small where it is compact."""
+        squares = self.volume.square().sum() * self.volume.numel()
+        return float(self.volume.sum() ** 2 / squares) if squares > 0 else 1.0
+
+
+class Matcher:
+    """Images averaged over squares of `binning` pixels, and the projector of a cube as wide as they are.
+
+    Args:
+        images: (tilt, y, x) line integrals.
+        tilt_angles: (tilt,) degrees.
+        binning: raw pixels along the edge of a coarse one.
+        used: (tilt, y, x) 1 for the pixels to use, 0 for the others; None for all.
+    """
+
+    def __init__(
+        self, images: Tensor, tilt_angles: NDArray[np.float64], binning: int, used: Tensor | None = None
+    ) -> None:
+        self.images = _blurred(functional.avg_pool2d(images[:, None], binning))[:, 0]
+        self.used = None if used is None else functional.avg_pool2d(used[:, None], binning)[:, 0]
+        self.binning, self.size = binning, max(self.images.shape[1:])
+        cut = torch.tensor([images.shape[1] % binning, images.shape[2] % binning], dtype=torch.float32)
+        self._middle = (cut / 2).to(images.device)
+        self.projector = SliceProjector(
+            tilt_angles=tilt_angles, depth=self.size, width=self.size, device=str(images.device)
+        )
+        self._sine = torch.from_numpy(np.sin(np.deg2rad(tilt_angles))).float().to(images.device)
+
+    def match(self, axis: float, shifts: Tensor, *, rounds: int, free_axis: bool = False) -> Match:
+        """Iterations of SIRT take turns with a Gauss-Newton step of all shifts, and of the axis, towards its projections."""
+        shifts, volume = self.in_own_pixels(shifts), None
+        for _ in range(rounds):
+            images, seen = self.aligned(axis, shifts)
+            volume = self.sirt(images, seen, volume, ITERATIONS)
+            move, turn = _gauss_newton(images, self.projector(volume), seen, free_axis=free_axis)
+            shifts = shifts + move.clamp(-_FARTHEST, _FARTHEST) @ frame(axis, shifts)
+            axis += min(max(turn, -_MOST_TURN), _MOST_TURN)
+        assert volume is not None
+        return Match(axis, shifts * self.binning - self._middle, volume)
+
+    def in_own_pixels(self, shifts: Tensor) -> Tensor:
+        """Shifts of raw images, in pixels of these."""
+        return (shifts + self._middle) / self.binning
+
+    def aligned(self, axis: float, shifts: Tensor) -> tuple[Tensor, Tensor]:
+        """Images (tilt, y, u) of the aligned frame, and 1 where a used pixel of the raw ones is; shifts in own pixels."""
+        raw = places(torch.Size([self.size, self.size]), shifts) @ frame(axis, shifts) + shifts[:, None, None, :]
+        values, inside = sampled(self.images, raw)
+        if self.used is not None:
+            inside = inside * (sampled(self.used, raw)[0] > 0.99)
+        return values, inside
+
+    def centred(self, found: Match) -> Match:
+        """The same with the volume's mass in the middle of its depth, for the whole object shall fit a slab."""
+        height = _middle(found.volume.sum((1, 2))) * self.binning
+        across = torch.stack([torch.zeros_like(self._sine), height * self._sine], -1)
+        return replace(found, shifts=found.shifts + across @ frame(found.axis, across))
+
+    def about_mass(self, found: Match, turn: float) -> tuple[float, Tensor]:
+        """Axis and shifts after a turn about the place on the axis where most of the mass is: the least disturbance."""
+        mass = found.volume.sum((0, 2))  # perhaps of a coarser size
+        height = _middle(mass) * self.size * self.binning / len(mass)
+        place = torch.tensor([height, 0.0], device=mass.device)
+        moved = place @ (frame(found.axis, place) - frame(found.axis + turn, place))
+        return found.axis + turn, found.shifts + moved
+
+    def neighbours_correlated(self, order: list[int]) -> Tensor:
+        """Shifts, in raw pixels, that fit every image to its neighbour in angle, from the first of `order` outwards."""
+        window = torch.outer(*(torch.hann_window(size, periodic=False) for size in self.images.shape[1:]))
+        flat = (self.images - self.images.mean((1, 2), keepdim=True)) * window.to(self.images.device)
+        spectra = torch.fft.fft2(flat)
+        shifts = torch.zeros(len(flat), 2, device=flat.device)
+        extent = torch.tensor(flat.shape[1:], device=flat.device)
+        for before, after in pairwise(order):
+            product = torch.fft.ifft2(spectra[after] * spectra[before].conj()).real
+            peak = int(product.argmax())
+            place = torch.tensor([peak // flat.shape[2], peak % flat.shape[2]], device=flat.device)
+            shifts[after] = shifts[before] + torch.where(place > extent // 2, place - extent, place)
+        return shifts * self.binning
+
+    def sirt(self, images: Tensor, seen: Tensor, volume: Tensor | None, num_iterations: int) -> Tensor:
+        """Iterations of SIRT in which pixels outside the raw images do not count; nothing is negative."""
+        A = self.projector
+        if volume is None:
+            volume = torch.zeros(A.depth, images.shape[1], A.width, device=images.device)
+        lengths, weights = A(torch.ones_like(volume[:, :1])), A.T(seen)
+        inverse = torch.where(weights > 1e-3, 1 / weights, 0.0)
+        rows = torch.where(lengths > 0, 1 / lengths, 0.0) * seen
+        for _ in range(num_iterations):
+            volume = (volume + inverse * A.T(rows * (images - A(volume)))).clamp_min(0)
+        return volume
+
+
+def frame(axis: float, like: Tensor) -> Tensor:
+    """Rows: the aligned frame's y and u directions in raw (y, x)."""
+    cosine, sine = math.cos(axis), math.sin(axis)
+    return torch.tensor([[cosine, -sine], [sine, cosine]], dtype=like.dtype, device=like.device)
+
+
+def places(shape: torch.Size, like: Tensor) -> Tensor:
+    """Places (y, x) of all pixels, from the middle, (height, width, 2)."""
+    sides = (torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2 for size in shape)
+    return torch.stack(torch.meshgrid(*sides, indexing="ij"), -1)
+
+
+def sampled(images: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+    """Images (tilt, y, x) at places (tilt, ..., 2) from their middle, and 1 where these are inside."""
+    extent = torch.tensor(images.shape[1:], device=images.device)
+    grid = (2 * where / extent).flip(-1)
+    values = functional.grid_sample(images[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return values[:, 0], (where.abs() <= (extent - 1) / 2).all(-1).float()
+
+
+def _gauss_newton(images: Tensor, predicted: Tensor, seen: Tensor, *, free_axis: bool) -> tuple[Tensor, float]:
+    """Moves (tilt, (y, u)) and turn (radians) of the sampling points that bring the images nearest to the predicted ones."""
+    down, across = torch.zeros_like(predicted), torch.zeros_like(predicted)
+    down[:, 1:-1] = (predicted[:, 2:] - predicted[:, :-2]) / 2
+    across[:, :, 1:-1] = (predicted[:, :, 2:] - predicted[:, :, :-2]) / 2
+    position = torch.arange(predicted.shape[1], device=predicted.device) - (predicted.shape[1] - 1) / 2
+    slopes = torch.stack([down, across, down * position - across * position[:, None]], 1)
+    weighted = (slopes * seen[:, None]).flatten(2).double()
+    normal = weighted @ slopes.flatten(2).double().mT
+    right = (weighted @ (predicted - images).flatten(1).double()[:, :, None])[..., 0]
+    ridge = 1e-6 * normal[:, :2, :2].diagonal(dim1=1, dim2=2).mean() * torch.eye(2, device=normal.device) + 1e-30
+    own, both = normal[:, :2, :2] + ridge, normal[:, :2, 2]
+    moves = torch.linalg.solve(own, right[:, :2])
+    if not free_axis:
+        return moves.float(), 0.0
+    coupled = torch.linalg.solve(own, both)
+    free = normal[:, 2, 2].sum() - (both * coupled).sum()
+    turn = float((right[:, 2].sum() - (both * moves).sum()) / free.clamp_min(1e-30))
+    return (moves - turn * coupled).float(), turn
+
+
+def _middle(mass: Tensor) -> float:
+    """Where the middle of a mass is from the middle of its extent, in its own pixels."""
+    position = torch.arange(len(mass), device=mass.device) - (len(mass) - 1) / 2
+    return float((mass * position).sum() / mass.sum().clamp_min(1e-30))
+
+
+def _blurred(images: Tensor) -> Tensor:
+    """A little, so that interpolation changes the noise hardly any more."""
+    kernel = torch.tensor([0.25, 0.5, 0.25], device=images.device)
+    padded = functional.pad(images, (1, 1, 1, 1), mode="replicate")
+    return functional.conv2d(padded, torch.outer(kernel, kernel)[None, None])

@@ -1,0 +1,145 @@
+"""From a tilt series as it was read to one that can be fitted: aligned, in order of angle, screened and checked."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon.series.alignment import Alignment
+from recon.series.alignment_search import find_alignment
+from recon.series.contrast import check_contrast
+from recon.series.screening import Screening, screen
+from recon.series.tilt_series import TiltSeries
+from recon.series.views import in_order
+
+Progress = Callable[[str, int, int, str], None]
+"""``progress(title, done, total, note)``."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A tilt series ready to reconstruct, and what was found on the way.
+
+    Attributes:
+        tilt_series: aligned, by rising angle, without the tilts that do not belong.
+        screening: how well every tilt fits the others, in the order of the series as given.
+        alignment: of the raw images, in the order of the series as given; None where they were not moved.
+    """
+
+    tilt_series: TiltSeries
+    screening: Screening
+    alignment: Alignment | None
+
+    @property
+    def choices(self) -> dict[str, float | str]:
+        """What a table of results shows."""
+        return ({} if self.alignment is None else self.alignment.choices()) | self.screening.choices()
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, tilt by tilt, for programs."""
+        return {
+            "screening": self.screening.as_dict(),
+            "alignment": None if self.alignment is None else self.alignment.as_dict(),
+        }
+
+
+def prepare(
+    tilt_series: TiltSeries,
+    *,
+    tilt_axis: float | None = None,
+    refine_alignment: bool = False,
+    keep_tilts: bool = False,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+) -> Prepared:
+    """Do all that comes between reading a tilt series and fitting it: checks, alignment, screening, drift of the beam.
+
+    What is doubtful is reported as a `UserWarning`; what was found is in the result.
+
+    Args:
+        tilt_series: as read.
+        tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to have it found.
+        refine_alignment: find the axis and the shift of every image.
+        keep_tilts: keep tilts that do not fit the others, with a warning.
+        device: where to compute.
+        progress: called with each step of the alignment.
+
+    Raises:
+        ValueError: a tilt axis that is no number, too few tilts to align, or images moved out of view entirely.
+    """
+    if tilt_axis is not None and not np.isfinite(tilt_axis):
+        raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")
+    _warn_of_outliers(tilt_series)
+    _warn_of_order(tilt_series.tilt_angles)
+    alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    if alignment is not None:
+        tilt_series = alignment.apply(tilt_series)
+    check_contrast(tilt_series)
+    found = screen(tilt_series)
+    _warn_of_misfits(tilt_series, found, keep=keep_tilts)
+    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
+
+
+def _alignment(
+    series: TiltSeries,
+    tilt_axis: float | None,
+    *,
+    refine: bool,
+    device: torch.device | str,
+    progress: Progress | None,
+) -> Alignment | None:
+    if refine:
+        return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)
+    if tilt_axis is None:
+        return None
+    return Alignment(tilt_axis, np.zeros((series.num_tilts, 2)), series.tilt_angles)
+
+
+def _warn_of_order(angles: NDArray[np.float64]) -> None:
+    steps = np.diff(angles)
+    if (steps > 0).any() and (steps < 0).any():
+        warnings.warn(
+            "the tilt angles are not in order; each image keeps its own angle, which is all that counts", stacklevel=3
+        )
+
+
+def _warn_of_outliers(series: TiltSeries) -> None:
+    step = max(1, series.images.size // 100_000)
+    low, high = np.quantile(np.concatenate([part[::step].copy() for part in _used(series)]), (0.02, 0.98))
+    far = [part[np.abs(part - (low + high) / 2) > 100 * (high - low)] for part in _used(series)]
+    found = np.abs(np.concatenate(far))
+    if high > low and found.size:
+        warnings.warn(
+            f"{found.size} pixels are a hundred times farther out than the others (up to {found.max():.3g}) and would "
+            "spoil the volume; leave them out with --mask FILE, or replace them",
+            stacklevel=3,
+        )
+
+
+def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
+    """The pixel values to use, image by image."""
+    for number, image in enumerate(series.images):
+        yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
+
+
+def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> None:
+    if found.suspect.any():
+        warnings.warn(
+            f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others, too many for exceptions: "
+            "the alignment, the tilt axis or the tilt angles are probably wrong; give --refine-alignment, --tilt-axis or the "
+            "right --angles",
+            stacklevel=3,
+        )
+    if not found.bad.any():
+        return
+    angles = series.tilt_angles[found.bad]
+    named = ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
+    what = f"{len(angles)} of {series.num_tilts} tilts do not fit the volume of the others: {named}"
+    advice = "kept (--keep-tilts)" if keep else "left out (--keep-tilts keeps them)"
+    warnings.warn(f"{what}; {advice}", stacklevel=3)

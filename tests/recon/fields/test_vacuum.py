@@ -1,0 +1,50 @@
+"""What the occupancy takes for vacuum by default, and what the total variation of a volume is."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from recon.fields.occupancy import Occupancy
+from recon.fields.regularisers import total_variation
+from recon.projection.projector import SliceProjector
+
+
+def test_two_voxels_around_the_rough_volume_count_as_occupied():
+    rough = torch.zeros(11, 11, 11)
+    rough[5, 5, 5] = 1.0
+    assert int(Occupancy(rough, (11, 11, 11)).mask.sum()) == 5**3
+
+
+@pytest.mark.parametrize(("gain", "taken"), [(0.9, False), (1.1, True)])
+def test_a_block_is_taken_where_the_data_gain_more_than_its_faces_cost(gain, taken):
+    """A cube of b voxels has 6 b² faces; the gain of raising it is the gradient summed over its b³ voxels."""
+    block, cost, size = 4, 0.3, 16
+    occupancy = Occupancy(torch.zeros(size, size, size), (size, size, size), block=block)
+    projector = SliceProjector(tilt_angles=[0.0], depth=size, width=size)
+    pull = -gain * 6 * block**2 * cost / block**3
+    gradient = torch.zeros(size, size)
+    gradient[4:8, 8:12] = pull
+    for _ in range(40):
+        occupancy.retest(gradient, projector, cost)
+    mask = occupancy.mask  # (z, x, y)
+    assert bool(mask[:, 4:8, 8:12].all()) is taken
+    assert int(mask.sum()) == (size * block * block if taken else 0)
+
+
+@pytest.mark.parametrize("smoothing", [1e-3, 0.5])
+def test_total_variation_is_the_sum_of_its_formula(smoothing):
+    volume = np.random.default_rng(0).normal(size=(4, 3, 5))
+    total = 0.0
+    for z in range(4):
+        for y in range(3):
+            for x in range(5):
+                here, squares = volume[z, y, x], smoothing**2
+                squares += (volume[z + 1, y, x] - here) ** 2 if z < 3 else 0.0
+                squares += (volume[z, y + 1, x] - here) ** 2 if y < 2 else 0.0
+                squares += (volume[z, y, x + 1] - here) ** 2 if x < 4 else 0.0
+                total += math.sqrt(squares) - smoothing
+    assert float(total_variation(volume, smoothing=smoothing)) == pytest.approx(total, rel=1e-12)
+    tensor = torch.from_numpy(volume).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: total_variation(v, smoothing=smoothing), tensor)

@@ -1,0 +1,164 @@
+"""The plan as data: what will be done for six kinds of series, and that what is done is what was planned."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import noiseflow
+from recon.joint.joint import JointReconstructor
+from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
+from recon.series.tilt_series import TiltSeries
+from recon.simulate.noises import SkewedNoise
+from recon.simulate.phantoms import shells
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PLANS = {
+    "everything chosen, large": (
+        Facts(can_halve=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1
+        slab   choose noise                 candidates  60 x 2  chosen
+        slab   adapt                        signal      30  chosen, rate 0.5
+        slab   refine noise                 noise       60  chosen
+        slab   choose weight                weights     30 x 5  chosen, rate 0.5
+        slab   refine noise at the weight   noise       60  chosen
+        whole  begin                        signal      25  simple, rate 1, half resolution
+        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
+        whole  fit                          signal      34  chosen, rate 0.5
+        whole  refine noise on the volume   noise       60  chosen
+        whole  finish                       signal      16  chosen, rate 0.25
+        """,
+    ),
+    "everything chosen, small": (
+        Facts(whole_slab=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1
+        slab   choose noise                 candidates  60 x 2  chosen
+        slab   adapt                        signal      30  chosen, rate 0.5
+        slab   refine noise                 noise       60  chosen
+        slab   choose weight                weights     30 x 5  chosen, rate 0.5
+        slab   refine noise at the weight   noise       60  chosen
+        whole  fit                          signal      27  chosen, rate 0.5
+        whole  refine noise on the volume   noise       60  chosen
+        whole  finish                       signal      13  chosen, rate 0.25
+        """,
+    ),
+    "least squares, weight given, offset hidden": (
+        Facts(choose_noise=False, simple_is_final=True, choose_weight=False, hidden_offset=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1, offset x 4
+        slab   learn noise                  noise       60  simple
+        slab   adapt                        signal      30  simple, rate 0.5
+        slab   refine noise                 noise       60  simple
+        whole  begin                        signal      25  simple, rate 1, offset x 4
+        whole  fit                          signal      50  simple, rate 0.5
+        whole  refine noise on the volume   noise       60  simple
+        whole  finish                       signal      25  simple, rate 0.25
+        """,
+    ),
+    "noise known, weight given": (
+        Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
+        """
+        whole  start noise                  noise       10  simple
+        whole  begin                        signal      25  simple, rate 1, half resolution
+        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
+        whole  fit                          signal      50  chosen, rate 0.5
+        """,
+    ),
+    "a block of a settled series": (
+        Facts(settled=True),
+        """
+        whole  begin                        signal      25  simple, rate 1
+        whole  fit                          signal      75  chosen, rate 0.5
+        """,
+    ),
+    "quiet": (
+        Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, can_halve=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   learn noise                  noise       60  simple
+        slab   adapt                        signal      30  simple, rate 0.5, offset held
+        slab   refine noise                 noise       60  simple
+        slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held
+        slab   refine noise at the weight   noise       60  simple
+        whole  begin                        signal      60  simple, rate 1, offset held, half resolution
+        whole  coarse                       signal      60  simple, rate 0.5, offset held, half resolution
+        whole  fit                          signal      80  simple, rate 0.5, offset held
+        whole  refine noise on the volume   noise       60  simple
+        whole  finish                       signal      40  simple, rate 0.25, offset held
+        whole  describe noise               noise       60  chosen
+        """,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_plan_is_the_stored_one(name):
+    facts, stored = PLANS[name]
+    expected = [line.strip() for line in stored.strip().splitlines()]
+    assert [line.strip() for line in describe(plan(facts)).splitlines()] == expected
+
+
+@pytest.mark.parametrize("name", PLANS)
+@pytest.mark.parametrize("num_steps", [1, 2, 3, 7, 100, 333])
+def test_the_volume_takes_as_many_steps_as_were_asked_for(name, num_steps):
+    facts, _ = PLANS[name]
+    stages = plan(facts, num_steps=num_steps)
+    assert sum(s.num_steps for s in stages if s.kind == "signal" and s.where == "whole") == num_steps
+    assert len({s.name for s in stages}) == len(stages)
+    assert all(s.num_steps > 0 for s in stages)
+
+
+def test_a_schedule_changes_what_it_names():
+    facts = PLANS["everything chosen, small"][0]
+    changed = plan(facts, schedule=replace(Schedule(), adapt=7))
+    assert [s.num_steps for s in changed if s.name == "adapt"] == [7]
+    assert [s for s in changed if s.name != "adapt"] == [s for s in plan(facts) if s.name != "adapt"]
+
+
+@pytest.fixture(scope="module")
+def clipped():
+    clean, _ = clean_tilt_series(shells(20, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0))
+    return add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"num_steps": 9}, {"num_steps": 9, "slab": 4, "weight": 0.3}, {"num_steps": 5, "noise_model": SkewedNoise}],
+    ids=["small", "slab, weight given", "noise known"],
+)
+def test_what_is_done_is_what_was_planned(clipped, options):
+    done = []
+
+    def run_fit(name, noise_model, signal, observation, **given):
+        result = noiseflow.fit(noise_model, signal, observation, **given)
+        if not isinstance(signal, type(observation)):
+            done.append((name, result.num_steps))
+        return result
+
+    fit = JointReconstructor(run_fit=run_fit, **options)
+    planned, _ = fit.plan(clipped)
+    fit(clipped)
+    signal = [(s.name, s.num_steps) for s in planned if s.kind == "signal"]
+    assert [step for step in done if "choose weight" not in step[0]] == signal
+    assert any("choose weight" in name for name, _ in done) == any(s.kind == "weights" for s in planned)
+
+
+def test_little_noise_is_seen_before_any_fit(clipped):
+    ramp = np.linspace(0, 1, 20, dtype=np.float32)
+    smooth = TiltSeries(ramp + ramp[:, None] * np.ones((9, 1, 1), np.float32), np.arange(9) * 10.0, mode="linear")
+    fit = JointReconstructor()
+    assert "describe noise" in [s.name for s in fit.plan(smooth)[0]]
+    assert "choose noise" in [s.name for s in fit.plan(clipped)[0]]
+
+
+def test_stages_are_values():
+    assert FitStage("a", "signal", "whole", "simple", 3) == FitStage("a", "signal", "whole", "simple", 3)
+    assert total_steps([FitStage("a", "weights", "slab", "simple", 3, fits=5)]) == 15

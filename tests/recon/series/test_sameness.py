@@ -1,0 +1,141 @@
+"""What must not change a volume: order, doubled tilts, constants, scales, full turns, mirrors and transposed files."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.methods import reconstruct
+from recon.projection.wbp import angular_shares
+from recon.series.prepare import prepare
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.views import every_nth_view, in_order, view_numbers, without_level
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+ANGLES = np.arange(-60, 61, 3.0)
+Array = np.ndarray
+
+
+@pytest.fixture(scope="module")
+def series() -> TiltSeries:
+    density = make_phantom("particles", 32, generator=np.random.default_rng(0))
+    acquisition = ACQUISITIONS["low-dose"]
+    clean, _ = clean_tilt_series(density, ANGLES, acquisition=acquisition)
+    return add_noise(clean, acquisition.noise(), seed=1)
+
+
+def volume(series: TiltSeries, method: str, **options: float) -> Array:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        prepared = prepare(series, **options).tilt_series
+    return reconstruct(prepared, VolumeGrid.of(prepared), method=method).volume.attenuation
+
+
+def shuffled(series: TiltSeries) -> TiltSeries:
+    return series.select(np.random.default_rng(3).permutation(series.num_tilts))
+
+
+def doubled(series: TiltSeries) -> TiltSeries:
+    return series.select(np.arange(2 * series.num_tilts) % series.num_tilts)
+
+
+def full_turns(series: TiltSeries) -> TiltSeries:
+    return replace(series, tilt_angles=series.tilt_angles + 360)
+
+
+def mirrored(series: TiltSeries) -> TiltSeries:
+    return replace(series, images=series.images[:, :, ::-1], tilt_angles=-series.tilt_angles)
+
+
+def upside_down(series: TiltSeries) -> TiltSeries:
+    return replace(series, images=series.images[:, ::-1])
+
+
+def raised(series: TiltSeries) -> TiltSeries:
+    return replace(series, images=series.images.astype(np.float64) + 1e5)
+
+
+def scaled(series: TiltSeries) -> TiltSeries:
+    return replace(series, images=series.images.astype(np.float64) * 1e-4)
+
+
+CHANGES: dict[str, tuple[Callable[[TiltSeries], TiltSeries], Callable[[Array], Array], float]] = {
+    "any order": (shuffled, lambda found: found, 1e-5),
+    "doubled tilts": (doubled, lambda found: found, 0.01),
+    "full turns": (full_turns, lambda found: found, 1e-4),
+    "mirrored": (mirrored, lambda found: found[:, :, ::-1], 1e-4),
+    "upside down": (upside_down, lambda found: found[:, ::-1], 1e-4),
+    "constant added": (raised, lambda found: found, 1e-4),
+    "scaled": (scaled, lambda found: found * 1e4, 1e-4),
+}
+
+
+@pytest.mark.parametrize("method", ["wbp", "sirt"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_same_series_in_other_words_gives_the_same_volume(series: TiltSeries, method: str, change: str) -> None:
+    how, back, tolerance = CHANGES[change]
+    wanted, found = volume(series, method), back(volume(how(series), method))
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < tolerance * np.sqrt(np.mean(wanted**2))
+
+
+@pytest.mark.parametrize("method", ["wbp", "sirt"])
+def test_a_transposed_file_with_the_axis_turned_gives_the_mirrored_volume(series: TiltSeries, method: str) -> None:
+    transposed = replace(series, images=np.ascontiguousarray(series.images.transpose(0, 2, 1)))
+    wanted, found = volume(series, method), volume(transposed, method, tilt_axis=90.0)
+    np.testing.assert_allclose(found[:, ::-1], wanted, atol=1e-4 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("method", ["wbp", "sirt"])
+def test_methods_alone_do_not_depend_on_order_or_twins(series: TiltSeries, method: str) -> None:
+    wanted = reconstruct(series, VolumeGrid.of(series), method=method).volume.attenuation
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for changed, tolerance in ((shuffled(series), 1e-5), (doubled(series), 0.01)):
+            found = reconstruct(changed, VolumeGrid.of(series), method=method).volume.attenuation
+            assert np.sqrt(np.mean((found - wanted) ** 2)) < tolerance * np.sqrt(np.mean(wanted**2))
+
+
+def test_twins_and_opposite_views_share_a_number() -> None:
+    numbers = view_numbers(np.array([0.0, 10, 10.001, 20, 190, -20, 380, -10]))
+    assert numbers.tolist() == [2, 3, 3, 4, 3, 0, 4, 1]
+    whole = view_numbers(np.arange(-90, 91, 2.0))
+    assert whole[0] == whole[-1]
+    assert whole.max() == 89
+
+
+@pytest.mark.parametrize("angles", [ANGLES, np.arange(-90, 90, 2.0), np.arange(0, 178, 3.0), ANGLES[:-1]])
+def test_views_left_out_do_not_depend_on_order_twins_or_sign(angles: Array) -> None:
+    out = every_nth_view(angles, 5)
+    assert 0.15 < out.mean() < 0.25
+    order = np.random.default_rng(0).permutation(len(angles))
+    np.testing.assert_array_equal(every_nth_view(angles[order], 5), out[order])
+    np.testing.assert_array_equal(every_nth_view(np.r_[angles, angles + 360], 5), np.r_[out, out])
+    if not np.ptp(angles) > 170:  # a full circle has no end to count from that a mirror keeps
+        np.testing.assert_array_equal(every_nth_view(-angles, 5), out)
+
+
+def test_shares_of_angles_count_half_turns_once() -> None:
+    shares = angular_shares(ANGLES)
+    np.testing.assert_allclose(shares, np.deg2rad(3.0))
+    np.testing.assert_allclose(angular_shares(ANGLES + 360), shares)
+    whole = angular_shares(np.arange(-90, 91, 2.0))
+    assert whole.sum() == pytest.approx(np.pi)
+    assert whole[0] == pytest.approx(whole[1] / 2)
+    np.testing.assert_allclose(angular_shares(np.arange(-180, 180, 2.0)).sum(), np.pi)
+
+
+def test_order_is_restored_and_a_level_taken_off_exactly() -> None:
+    images = np.random.default_rng(0).normal(size=(4, 5, 6))
+    given = TiltSeries(images, np.array([370.0, -20, 0, 350]), mode="linear")
+    found = in_order(given)
+    assert found.tilt_angles.tolist() == [-20, -10, 0, 10]
+    np.testing.assert_array_equal(found.images, images[[1, 3, 2, 0]])
+    low, level = without_level(replace(given, images=images + 2.0**20))
+    assert low.images.dtype == np.float32
+    np.testing.assert_allclose(low.images.astype(np.float64) + level - 2.0**20, images, atol=1e-6)
+    assert without_level(replace(given, mode="transmission"))[1] == 0

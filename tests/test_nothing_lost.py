@@ -1,0 +1,228 @@
+"""Users' files, and what a run has reached: lost to no other command, no second run, no full disk and no kill."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shlex
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+import noiseflow
+import recon.commands.results
+import recon.scale.blocks  # noqa: F401
+from noiseflow import io
+from noiseflow.commands.cli import main
+from noiseflow.io.partials import _prefix
+from recon.joint.state_files import discard_states, write_state
+from tests.processes import finish, start, wait_for
+
+WRITERS = {
+    "sample {files}/model.safetensors {files}/clean.npy -o {out}/noisy.mrc": ["noisy.mrc"],
+    "sample {files}/model.safetensors {files}/clean.npy -o {out}/noisy.npy": ["noisy.npy"],
+    "simulate {out}/new --size 8 --tilts=-60:60:30": [
+        "new/tilts.mrc",
+        "new/truth.mrc",
+        "new/clean.mrc",
+        "new/tilts.rawtlt",
+    ],
+    "compare {files}/new/truth.mrc {files}/new/clean8.mrc --report {out}/page": ["page/index.html"],
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    noiseflow.save(noiseflow.Gaussian(0.1), folder / "model.safetensors")
+    io.write(folder / "clean.npy", np.ones((9, 8), np.float32))
+    finish(["simulate", folder / "new", "--size", 16, "--tilts=-60:60:10"], folder / "log")
+    truth = io.read(folder / "new" / "truth.mrc").data
+    io.write(
+        folder / "new" / "clean8.mrc",
+        truth + np.float32(0.01) * np.random.default_rng(0).random(truth.shape, np.float32),
+    )
+    return folder
+
+
+@pytest.mark.parametrize(("line", "name"), [(line, name) for line, names in WRITERS.items() for name in names])
+def test_files_of_others_stay_unless_overwrite_is_given(
+    line: str, name: str, files: Path, tmp_path: Path, run, refused
+) -> None:
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("years of work")
+    words = shlex.split(line.format(files=files, out=tmp_path))
+    assert "--overwrite" in refused(*words)
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == [mine]
+    assert mine.read_text() == "years of work"
+    run(*words, "--overwrite")
+    assert mine.read_bytes() != b"years of work"
+    run(*words)  # now it is ours
+
+
+@pytest.mark.parametrize("line", [line for line in WRITERS if "sample" in line])
+def test_a_linked_output_stays_a_link(line: str, files: Path, tmp_path: Path, run) -> None:
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / WRITERS[line][0]
+    link.symlink_to(tmp_path / "disk" / link.name)
+    run(*shlex.split(line.format(files=files, out=tmp_path)))
+    assert link.is_symlink()
+    assert io.read(tmp_path / "disk" / link.name).data.shape == (9, 8)
+
+
+def test_simulate_writes_through_links(tmp_path: Path, run) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "truth.mrc").symlink_to(tmp_path / "disk" / "truth.mrc")
+    run("simulate", tmp_path / "new", "--size", "8", "--tilts=-60:60:30")
+    assert (tmp_path / "new" / "truth.mrc").is_symlink()
+    assert io.read(tmp_path / "disk" / "truth.mrc").data.shape == (8, 8, 8)
+
+
+def test_foreign_files_among_the_states_stay(tmp_path: Path) -> None:
+    write_state(tmp_path / "fit-001.safetensors", {"a": 1})
+    (tmp_path / f"{_prefix('fit-002')}abcdefgh.safetensors.part").mkdir()
+    dead = tmp_path / f".fit-003-{_prefix('x').split('-')[1]}-999999999-abcdefgh.safetensors.part"
+    dead.mkdir()
+    (dead / ".tmpAbCdEf").touch()
+    save_file({"weights": np.ones(3)}, tmp_path / "mine.safetensors")
+    save_file({"weights": np.ones(3)}, tmp_path / "current.safetensors")
+    with pytest.raises(FileExistsError, match="not written by noiseflow"):
+        write_state(tmp_path / "current.safetensors", {"a": 1})
+    discard_states(tmp_path)
+    left = {file.name for file in tmp_path.iterdir()}
+    assert left >= {"mine.safetensors", "current.safetensors"}
+    assert not left & {"fit-001.safetensors", dead.name}
+
+
+def reconstruct(files: Path, out: Path, *more: object) -> list[object]:
+    options = ["--method", "l2", "--weight", 0.4, "--steps", 60, "--checkpoint-interval", 0]
+    return ["reconstruct", files / "new" / "tilts.mrc", "-o", out, *options, *more]
+
+
+def kill(process) -> None:
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+
+
+def test_the_second_run_with_one_output_is_refused_and_the_first_ends_well(
+    files: Path, tmp_path: Path, refused
+) -> None:
+    out = tmp_path / "volume.npy"
+    process = start(reconstruct(files, out), tmp_path / "log")
+    checkpoint = tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors"
+    wait_for(checkpoint.exists, process)
+    os.kill(process.pid, signal.SIGSTOP)
+    try:
+        message = refused(*reconstruct(files, out, "--steps", 3))
+        assert f"process {process.pid} on " in message
+        assert checkpoint.exists()
+    finally:
+        os.kill(process.pid, signal.SIGCONT)
+    process.join(120)
+    assert process.exitcode == 0, (tmp_path / "log").read_text()
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "log"}
+
+
+def test_the_lock_of_a_killed_run_holds_nobody_up(files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "volume.npy"
+    process = start(reconstruct(files, out), tmp_path / "log")
+    wait_for((tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists, process)
+    kill(process)
+    finish(reconstruct(files, out, "--resume"), tmp_path / "log")
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "log"}
+
+
+def test_what_a_killed_run_in_blocks_left_is_cleared(files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "volume.npy"
+    words = [
+        "reconstruct",
+        files / "new" / "tilts.mrc",
+        "-o",
+        out,
+        "--method",
+        "sirt",
+        "--steps",
+        400,
+        "--slices-at-once",
+        4,
+    ]
+    process = start(words, tmp_path / "log")
+    wait_for(lambda: bool(list(tmp_path.glob(".volume-*/blocks.npy"))), process)
+    kill(process)
+    assert list(tmp_path.glob(".volume-*"))
+    finish(["sample", files / "model.safetensors", files / "clean.npy", "-o", tmp_path / "other.npy"], tmp_path / "log")
+    assert list(tmp_path.glob(".volume-*"))
+    finish([*words[:-3], 5, "--slices-at-once", 4], tmp_path / "log")
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "other.npy", "log"}
+
+
+@contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def test_a_full_disk_stops_with_one_line_and_the_run_goes_on_when_there_is_room(files: Path, tmp_path: Path) -> None:
+    expected = tmp_path / "whole.npy"
+    finish(reconstruct(files, expected), tmp_path / "log")
+    out = tmp_path / "volume.npy"
+    with no_file_larger_than(20_000):
+        process = start(reconstruct(files, out), tmp_path / "log")
+    process.join(120)
+    told = (tmp_path / "log").read_text().strip().splitlines()[-1]
+    assert process.exitcode == 1, told
+    assert "fault of noiseflow" not in told
+    assert "raise it (ulimit -f)" in told
+    assert told.endswith("--resume")
+    assert (tmp_path / "volume.npy.checkpoint" / "fit-001.safetensors").exists()
+    finish(shlex.split(told.partition("go on with: noiseflow ")[2]), tmp_path / "log")
+    np.testing.assert_allclose(np.load(out), np.load(expected), rtol=0, atol=1e-5 * np.abs(np.load(expected)).max())
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "whole.npy", "log"}
+
+
+def test_an_output_folder_that_is_deleted_is_told(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    folder.mkdir()
+    process = start(reconstruct(files, folder / "volume.npy"), tmp_path / "log")
+    wait_for((folder / "volume.npy.checkpoint" / "fit-001.safetensors").exists, process)
+    os.kill(process.pid, signal.SIGSTOP)
+    shutil.rmtree(folder)
+    os.kill(process.pid, signal.SIGCONT)
+    process.join(120)
+    told = (tmp_path / "log").read_text()
+    assert process.exitcode == 1, told
+    last = told.strip().splitlines()[-1]
+    assert last.startswith("noiseflow: ")
+    assert "does not exist any more" in last
+    assert "--resume" not in last
+    assert "Traceback" not in told
+
+
+def test_a_noise_model_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None:
+    path = noiseflow.save(noiseflow.Gaussian(0.1), tmp_path / "model.safetensors")
+    before = path.read_bytes()
+    with no_file_larger_than(10_000), pytest.raises(OSError, match="[Ff]ile too large"):
+        noiseflow.save(noiseflow.SplineFlow(), path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+@pytest.mark.parametrize("name", ["sample", "simulate", "compare", "demo"])
+def test_commands_that_write_say_how_to_overwrite(name: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main([name, "-h"])
+    assert "--overwrite" in capsys.readouterr().out
