@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
@@ -21,7 +21,7 @@ _LEAST = 1e-14  # density, per standard deviation, under which the transform's r
 _FITTED, _ITERATIONS = 16384, 60
 
 
-class ExcessNoise(ArrayModel):
+class ExcessNoise(NoiseModelBase):
     """Shot noise whose electrons are multiplied at random, plus read noise.
 
     observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with
@@ -42,7 +42,6 @@ class ExcessNoise(ArrayModel):
         ValueError: gain or read noise not positive, or F² not above 1.
     """
 
-    starts_most_likely = True  # `standardise` leaves little to climb
     origin: Tensor
 
     def __init__(
@@ -88,6 +87,11 @@ class ExcessNoise(ArrayModel):
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
         return ExcessNoiseDistribution(signal, *self._now())
 
+    @property
+    def starts_most_likely(self) -> bool:
+        """Whether `standardise` leaves little to learn: it climbs to the maximum."""
+        return True
+
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Start at the detector whose second and third moments, level by level, are those of (N,) signals and observations."""
         s, residual = signal.double(), observation.double() - signal.double()
@@ -108,7 +112,7 @@ class ExcessNoise(ArrayModel):
         self.settle(signal, observation)
 
     def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[nn.Module], nn.Module] = lambda detector: detector
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
         """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
 
@@ -118,7 +122,7 @@ class ExcessNoise(ArrayModel):
         """
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
-        model = behind(self)
+        model = self if behind is None else behind(self)
         climber = torch.optim.LBFGS(
             [self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9
         )
