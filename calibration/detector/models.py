@@ -47,8 +47,8 @@ NUM_STEPS = 200
 MOST_PIXELS = 32_768
 """Pixels that models are fitted to, as many as the selector screens them by."""
 
-WORTH_FITTING = 1e-3
-"""Nats per pixel that a simple model must leave before flexible ones are fitted: a fifth of what the choice may lose."""
+WORTH_FITTING = 2.5e-3
+"""Nats per pixel that a simple model must leave before flexible ones are fitted: half of what the choice may lose, 0.005."""
 
 GROUPS = 16
 """Signal levels, and cells of the probability integral transform in each, that the test for flexible models compares."""

