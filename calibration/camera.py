@@ -75,22 +75,42 @@ def judge_camera(figures: CameraFigures) -> Verdict:
     correlation = figures.correlation
     if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
         text = "neighbouring pixels' noise correlates: the frames were filtered, resampled or binned"
-        if correlation.local and 0.5 < correlation.factor:
-            add("correlated pixels", "doubtful", f"{text}; the gain reported is the one before, {correlation.factor:.3g} times as large.")
+        if correlation.local and correlation.factor > 0.5:
+            add(
+                "correlated pixels",
+                "doubtful",
+                f"{text}; the gain reported is the one before, {correlation.factor:.3g} times as large.",
+            )
         else:
             add("correlated pixels", "bad", f"{text}, or carry row noise or interference. Give raw frames.")
     if correlation.period:
-        add("periodic noise", "bad", f"the noise repeats itself every {correlation.period:.3g} pixels: resampled or compressed. Give raw frames.")
+        add(
+            "periodic noise",
+            "bad",
+            f"the noise repeats itself every {correlation.period:.3g} pixels: resampled or compressed. Give raw frames.",
+        )
     if figures.chi_squared > LARGEST_CHI_SQUARED:
         text = f"variance against signal is no straight line (χ² per degree of freedom {figures.chi_squared:.1f})"
         add("bent line", "doubtful", text + ": light that flickers, or a converter that is not linear.")
     flicker = max(level.flicker for level in figures.levels)
     if flicker > STEADY:
-        add("unsteady light", "doubtful", f"the light changed by {flicker:.1%} between equal frames; its mean was taken out. Use a steadier source.")
+        add(
+            "unsteady light",
+            "doubtful",
+            f"the light changed by {flicker:.1%} between equal frames; its mean was taken out. Use a steadier source.",
+        )
     if figures.dark is None:
-        add("no dark frames", "doubtful", "without dark frames offset, dark noise, dynamic range, DSNU and PRNU are not determined.")
+        add(
+            "no dark frames",
+            "doubtful",
+            "without dark frames offset, dark noise, dynamic range, DSNU and PRNU are not determined.",
+        )
     if len(figures.levels) < 3:
-        add("few levels", "doubtful", f"{len(figures.levels)} level(s) of light cannot show a bent line; give three or more.")
+        add(
+            "few levels",
+            "doubtful",
+            f"{len(figures.levels)} level(s) of light cannot show a bent line; give three or more.",
+        )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level reaches saturation: capacity and dynamic range are lower bounds.")
     return verdict_of([one for one in found if one.name != "not saturated"])
@@ -124,9 +144,11 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     else:
         inner = noiseflow.PoissonGaussian(figures.gain.median, offset, max(read, 1e-3))
     ends = [float(level.image.max()) for level in figures.levels if level.clipped]
-    digitised = noiseflow.Digitised(inner, step=step, high=max(ends)) if step or ends else inner
+    digitised = noiseflow.Digitised(inner, step=step, high=max(ends, default=np.inf)) if step or ends else inner
     response = np.clip(maps["response"], 0.01, None)
-    return noiseflow.WithMaps(digitised, gain=response, offset=maps.get("offset", np.full(response.shape, offset)) - response * offset)
+    return noiseflow.WithMaps(
+        digitised, gain=response, offset=maps.get("offset", np.full(response.shape, offset)) - response * offset
+    )
 
 
 def write_maps(camera: Camera, model: Path) -> list[Path]:
@@ -146,17 +168,33 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
     figures = camera.figures
     gain, per_count = figures.gain, 1 / figures.gain.median
     rows = [
-        ("system gain K", f"{gain.median:.5g} counts/e⁻ (90 %: {gain.q05:.5g} … {gain.q95:.5g}); 1/K = {per_count:.5g} e⁻/count"),
+        (
+            "system gain K",
+            f"{gain.median:.5g} counts/e⁻ (90 %: {gain.q05:.5g} … {gain.q95:.5g}); 1/K = {per_count:.5g} e⁻/count",
+        ),
         ("dark noise", _text(figures.dark_noise, "e⁻ rms")),
         ("offset", _value(figures.offset, "counts")),
         ("saturation capacity", ("" if figures.saturated else "≥ ") + f"{figures.saturation:.5g} e⁻"),
-        ("dynamic range", "not determined" if figures.dynamic_range is None else ("" if figures.saturated else "≥ ")
-         + f"{figures.dynamic_range:.4g} ({20 * np.log10(figures.dynamic_range):.1f} dB)"),
+        (
+            "dynamic range",
+            "not determined"
+            if figures.dynamic_range is None
+            else ("" if figures.saturated else "≥ ")
+            + f"{figures.dynamic_range:.4g} ({20 * np.log10(figures.dynamic_range):.1f} dB)",
+        ),
         ("largest SNR", f"{figures.snr_maximum:.4g} ({20 * np.log10(figures.snr_maximum):.1f} dB)"),
-        ("linearity error", "not determined (give --flat-time)" if figures.linearity_error is None else f"{100 * figures.linearity_error:.3g} %"),
+        (
+            "linearity error",
+            "not determined (give --flat-time)"
+            if figures.linearity_error is None
+            else f"{100 * figures.linearity_error:.3g} %",
+        ),
         ("DSNU", _value(figures.dsnu, "e⁻ rms")),
         ("PRNU", "not determined" if figures.prnu is None else f"{100 * figures.prnu:.3g} %, illumination included"),
-        ("dark current", _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)")),
+        (
+            "dark current",
+            _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)"),
+        ),
         ("excess-noise factor F²", _text(figures.excess_factor, "")),
         ("defective pixels", f"{int(camera.maps['defects'].sum())}"),
     ]
@@ -166,7 +204,17 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
 def summary_of(camera: Camera) -> dict[str, Any]:
     """The figures as plain values."""
     figures = camera.figures
-    names = ("offset", "saturation", "saturated", "dynamic_range", "snr_maximum", "linearity_error", "dsnu", "prnu", "dark_current")
+    names = (
+        "offset",
+        "saturation",
+        "saturated",
+        "dynamic_range",
+        "snr_maximum",
+        "linearity_error",
+        "dsnu",
+        "prnu",
+        "dark_current",
+    )
     found: dict[str, Any] = {name: getattr(figures, name) for name in names}
     for name in ("gain", "dark_noise", "excess_factor"):
         value = getattr(figures, name)
@@ -175,7 +223,10 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     found["correlation_factor"] = figures.correlation.factor
     zero = figures.offset or 0.0
     found["snr_curve"] = [
-        {"electrons": (level.mean - zero) / figures.gain.median, "snr": (level.mean - zero) / float(np.sqrt(level.variance))}
+        {
+            "electrons": (level.mean - zero) / figures.gain.median,
+            "snr": (level.mean - zero) / float(np.sqrt(level.variance)),
+        }
         for level in figures.levels
         if level.variance > 0
     ]
@@ -194,7 +245,7 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
         return None if value is None else Interval(value.median * by, value.q05 * by, value.q95 * by)
 
     gain, noise = times(figures.gain, factor), times(figures.dark_noise, 1 / np.sqrt(factor))
-    assert gain is not None  # noqa: S101
+    assert gain is not None
     dsnu = None if figures.dsnu is None else figures.dsnu / factor
     current = None if figures.dark_current is None else figures.dark_current / factor
     return replace(

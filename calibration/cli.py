@@ -28,12 +28,17 @@ def calibrate(
     ] = None,
     flat: Annotated[
         list[Path] | None,
-        typer.Option(help="Equal frames of even illumination; without --short a stack for each level of light (EMVA 1288)."),
+        typer.Option(
+            help="Equal frames of even illumination; without --short a stack for each level of light (EMVA 1288)."
+        ),
     ] = None,
     flat_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each level of --flat, s.")] = None,
     dark_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each stack of --dark, s.")] = None,
     kind: Annotated[
-        str, typer.Option(help="auto, or gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow.")
+        str,
+        typer.Option(
+            help="auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow."
+        ),
     ] = "auto",
     exposure_ratio: Annotated[
         float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
@@ -104,18 +109,28 @@ def _calibrate_camera(
     from calibration.report.camera_page import describe_camera_verdict, write_camera_report
 
     if not flat:
-        raise ValueError("neither --short nor --flat was given; give exposures of a scene, or flat frames at several levels of light")
+        raise ValueError(
+            "neither --short nor --flat was given; give exposures of a scene, or flat frames at several levels of light"
+        )
     darks = []
     if dark:
-        darks = read_levels(dark, name="the dark frames") if dark_time else [read_burst(dark, name="the dark frames", calibration=True)]
+        darks = (
+            read_levels(dark, name="the dark frames")
+            if dark_time
+            else [read_burst(dark, name="the dark frames", calibration=True)]
+        )
     camera = calibrate_camera(read_levels(flat), darks, flat_times=flat_time or None, dark_times=dark_time or None)
     page = None if report is None else write_camera_report(report, camera, inputs=[*flat, *dark], seed=seed)
     found = summary_of(camera)
-    noiseflow.save(camera.model, output, units="counts", provenance={"flat": flat, "dark": dark, "camera": found["camera"]})
+    noiseflow.save(
+        camera.model, output, units="counts", provenance={"flat": flat, "dark": dark, "camera": found["camera"]}
+    )
     maps = write_maps(camera, output)
     out.table(("figure", "value"), rows_of(camera))
     out.line("\n" + "\n".join(describe_camera_verdict(camera)))
-    out.line(f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else ""))
+    out.line(
+        f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else "")
+    )
     out.result({"model": output, "maps": maps, "report": page} | found)
 
 

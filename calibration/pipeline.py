@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,9 +57,9 @@ class Findings:
     no_detector: str = ""
     burst: BurstReport | None = None
     figures: Figures | None = None
-    verdict: Verdict = Verdict("bad", ())
+    verdict: Verdict = field(default_factory=lambda: Verdict("bad", ()))
     correlation: Correlation | None = None
-    repairs: Repairs = Repairs()
+    repairs: Repairs = field(default_factory=Repairs)
     pattern: Image | None = None
 
 
@@ -128,9 +128,7 @@ def measure_exposures(
     except NotMeasurable as error:
         reason = str(error)
         verdict = verdict_of([Reason("not measurable", "bad", f"the detector was not measured: {reason}.")])
-    return Findings(
-        pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern
-    )
+    return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 
 
 def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:

@@ -31,7 +31,8 @@ LEAST_MISFIT = 0.8
 a usual calibration it scatters by 0.05. Bursts share their frames, which takes some scatter away."""
 
 WIDEST_GAIN = 0.04
-"""Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded: twice the goal."""
+"""Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded:
+twice the goal."""
 
 BIAS = 0.02
 """Relative error of the gain that may go without a warning: the goal of the calibration."""
@@ -105,8 +106,12 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
     found = []
     if repairs.changed > MOST_CHANGED:
         grade: Grade = "bad" if repairs.changed > 0.2 else "doubtful"
-        text = f"{repairs.changed:.1%} of the pixels lie in places that changed between the exposures; they were left out"
-        found.append(Reason("scene changed", grade, text + ". Check the residual map, or expose a scene that stands still."))
+        text = (
+            f"{repairs.changed:.1%} of the pixels lie in places that changed between the exposures; they were left out"
+        )
+        found.append(
+            Reason("scene changed", grade, text + ". Check the residual map, or expose a scene that stands still.")
+        )
     causes = {
         "blur": "blur, drift or another focus of one exposure",
         "illumination": "light or dose that changed across the field",
@@ -120,7 +125,9 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
     text = f"{share:.1%} of the residual's variance follows the scene: {causes[name]}"
     left = after.clear and after.largest[1] > LEAST_SHARE
     if not repairs.refitted:
-        found.append(Reason("scene misfit", "bad" if share > 5 * LEAST_SHARE else "doubtful", text + " (not modelled)."))
+        found.append(
+            Reason("scene misfit", "bad" if share > 5 * LEAST_SHARE else "doubtful", text + " (not modelled).")
+        )
     elif left or correlation.found:
         text += ". A kernel fitted between the exposures does not explain it all: take the exposures anew"
         found.append(Reason("scene misfit", "bad", text + "."))
@@ -145,11 +152,13 @@ def _correlation(
         text += "carry afterglow or interference"
         if correctable(correlation, repairs):
             text += (
-                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain reported is"
-                " the one before; per pixel of the recorded frame it is "
+                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain "
+                "reported is the one before; per pixel of the recorded frame it is "
                 f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Give raw frames to be sure"
             )
-            grade: Grade = "bad" if correlation.factor < 0.5 else "doubtful"  # a sharpened frame: its factor is hardly known
+            grade: Grade = (
+                "bad" if correlation.factor < 0.5 else "doubtful"
+            )  # a sharpened frame: its factor is hardly known
         else:
             grade, text = "bad", text + ", which no short filter explains. Give raw frames, or remove the interference"
         found.append(Reason("correlated pixels", grade, text + "."))
@@ -157,7 +166,9 @@ def _correlation(
         text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
         found.append(Reason("compressed", "bad", text + ". Give raw frames."))
     if correlation.period:
-        text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed in blocks"
+        text = (
+            f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed"
+        )
         found.append(Reason("periodic noise", "bad", text + ", so that the gain is not the camera's. Give raw frames."))
     return found
 
@@ -197,7 +208,9 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures) -
         found.append(Reason("gain uncertain", "doubtful", text + "."))
     shares = [full_share(pair) for pair in pairs]
     if max(shares) > 0.001:
-        text = f"{max(shares):.1%} of the pixels pile up at the brightest values, below the converter's end: a full well"
+        text = (
+            f"{max(shares):.1%} of the pixels pile up at the brightest values, below the converter's end: a full well"
+        )
         found.append(Reason("saturation", "doubtful", text + ". Expose for a shorter time."))
     return found
 

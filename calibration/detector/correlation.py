@@ -26,6 +26,9 @@ which leaves exp(−17), once in 10⁴ frames of 1000 lines."""
 LONGEST_PERIOD = 10.0
 """Pixels: blocks of image compression have 8, resampling by factors near 1 has more but then hardly changes the noise."""
 
+LEAST_PROFILE = 64
+"""Pixels along an axis from which on a period can be told from chance."""
+
 LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if dy > 0 or dx > 0]
 
 
@@ -107,8 +110,10 @@ def _near_clear(value: Image, error: Image) -> Mask:
     """The lags that count towards the density at frequency 0: those that stand out, and their inner neighbours."""
     lags = np.abs(np.array(LAGS))
     clear = lags[np.abs(value) > CLEAR * error]
-    return np.asarray([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags]) if clear.size else np.zeros(
-        len(lags), bool
+    return (
+        np.asarray([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
+        if clear.size
+        else np.zeros(len(lags), bool)
     )
 
 
@@ -138,6 +143,8 @@ def _period(residual: Residual) -> float:
     found = [0.0]
     for z in (residual.z, residual.z.T):
         for profile in ((z**2).mean(0), (z[:, 1:] * z[:, :-1]).mean(0)):
+            if len(profile) < LEAST_PROFILE:
+                continue
             power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2
             usual = median_filter(power, min(31, len(power) // 2)) / np.log(2)
             first = int(np.ceil(len(profile) / LONGEST_PERIOD))

@@ -145,7 +145,9 @@ def measure_camera(
     used = _linear(levels, offset or 0.0)
     points = [*([dark] if dark else []), *used]
     if len(points) < LEAST_LEVELS:
-        raise NotMeasurable("flats at one level tell no gain; give dark frames with them, or flats at several levels of light")
+        raise NotMeasurable(
+            "flats at one level tell no gain; give dark frames with them, or flats at several levels of light"
+        )
     slope, error, intercept, chi_squared = _line(points, dark)
     if not slope > 3 * error:
         raise NotMeasurable(
@@ -202,7 +204,17 @@ def level_of(burst: Burst) -> Level:
     clipped = float(np.mean(frames == end)) if np.mean(frames == end) > 1e-3 else 0.0
     flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
     return Level(
-        float(image.mean()), variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker, clipped
+        float(image.mean()),
+        variance - rounding,
+        float(error),
+        third,
+        third_error,
+        spatial,
+        image,
+        noise,
+        number,
+        flicker,
+        clipped,
     )
 
 
@@ -235,7 +247,9 @@ def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
 
 def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
     """Slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
-    mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error"))
+    mean, variance, error = (
+        np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
+    )
     spread = np.hypot(error, LEVEL_ERROR * np.abs(variance))
     weight = 1 / spread**2
     middle = float(np.average(mean, weights=weight))
@@ -263,7 +277,9 @@ def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> I
     spread = 1 / np.sqrt(information) / slope**2
     if spread > 0.1:  # tells 1 from 1.5 at three standard errors no more
         return None
-    low, middle, high = (1 / (2 - np.clip(value, 1.0, 1.9)) for value in (ratio - NINETY * spread, ratio, ratio + NINETY * spread))
+    low, middle, high = (
+        1 / (2 - np.clip(value, 1.0, 1.9)) for value in (ratio - NINETY * spread, ratio, ratio + NINETY * spread)
+    )
     return Interval(float(middle), float(low), float(high))
 
 
@@ -286,7 +302,14 @@ def _residuals(burst: Burst) -> list[Residual]:
         difference = first - second
         difference = difference - difference.mean()
         spread = float(difference.std())
-        found.append(Residual(np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT), mask, 0.0, mask * spread))
+        found.append(
+            Residual(
+                np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT),
+                mask,
+                0.0,
+                np.full(mask.shape, spread),
+            )
+        )
     return found
 
 
@@ -295,15 +318,22 @@ def _normal(middle: float, error: float) -> Interval:
 
 
 def _require_equal(
-    flats: Sequence[Burst], darks: Sequence[Burst], flat_times: Sequence[float] | None, dark_times: Sequence[float] | None
+    flats: Sequence[Burst],
+    darks: Sequence[Burst],
+    flat_times: Sequence[float] | None,
+    dark_times: Sequence[float] | None,
 ) -> None:
     if not flats:
         raise ValueError("no flat frames were given; give two or more equal frames for each level of light")
     shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
     if len(shapes) > 1:
-        raise ValueError(f"flat and dark frames have the sizes {sorted(shapes)}; take all with the same binning and region")
+        raise ValueError(
+            f"flat and dark frames have the sizes {sorted(shapes)}; take all with the same binning and region"
+        )
     for name, times, bursts in (("flat", flat_times, flats), ("dark", dark_times, darks)):
         if times is not None and len(times) != len(bursts):
-            raise ValueError(f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each")
+            raise ValueError(
+                f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each"
+            )
     if darks and min(float(flat.frames.mean()) for flat in flats) <= float(darks[0].frames.mean()):
         raise ValueError("the dark frames are as bright as a flat level; give frames without light as dark ones")

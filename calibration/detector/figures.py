@@ -102,7 +102,9 @@ def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
     whole = middle * float(np.hypot(width, error / factor))
     read = figures.read_noise
-    noise = None if read is None else Interval(*(value / np.sqrt(factor) for value in (read.median, read.q05, read.q95)))
+    noise = (
+        None if read is None else Interval(*(value / np.sqrt(factor) for value in (read.median, read.q05, read.q95)))
+    )
     return Figures(_normal(middle, whole), figures.offset, noise, figures.source, factor)
 
 

@@ -12,7 +12,6 @@ from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
 
-
 MODEL_ERROR = 0.005
 """Relative error of a level's variance that is granted to the straight line itself, so that one level of a million dark pixels
 does not rule all others."""
@@ -23,7 +22,12 @@ class NotMeasurable(ValueError):
 
 
 @described(
-    signal="counts", variance="counts²", variance_error="counts²", gain="counts per electron", intercept="counts²", gain_error="counts per electron"
+    signal="counts",
+    variance="counts²",
+    variance_error="counts²",
+    gain="counts per electron",
+    intercept="counts²",
+    gain_error="counts per electron",
 )
 @dataclass(frozen=True)
 class PhotonTransfer:

@@ -10,6 +10,7 @@ import numpy as np
 from calibration.detector.residual import residual_of
 from calibration.detector.scene_fit import SceneFit, changed_places, fit_scene, refitted, without_places
 from calibration.exposures.frames import Image
+from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
@@ -56,7 +57,9 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
     single = [pair.frames == 1 for pair in pairs]
     offsets = [_without_offsets(pair) for pair in pairs]
     found = [pair for pair, _, _ in offsets]
-    changed = [changed_places(pair) if one else np.zeros_like(pair.mask) for pair, one in zip(found, single, strict=True)]
+    changed = [
+        changed_places(pair) if one else np.zeros_like(pair.mask) for pair, one in zip(found, single, strict=True)
+    ]
     share = float(np.mean([mask.sum() / pair.mask.sum() for mask, pair in zip(changed, found, strict=True)]))
     scene = tuple(fit_scene(pair) for pair in found)
     misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in scene]
@@ -89,7 +92,7 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
     return pair, deviations[0], deviations[1]
 
 
-def _shared(z: Image, mask: Image, axis: int) -> tuple[float, float]:
+def _shared(z: Image, mask: Mask, axis: int) -> tuple[float, float]:
     """Deviation that all pixels of a row share, and the standard error of its square.
 
     The covariance of the means of even and odd runs of 16 pixels along the row, which correlated neighbours hardly touch.
@@ -103,7 +106,9 @@ def _shared(z: Image, mask: Image, axis: int) -> tuple[float, float]:
     if number < 16:
         return 0.0, 1.0
     first, second = (one[:number] - one[:number].mean() for one in means)
-    smooth = np.convolve(np.mean(means, axis=0), np.ones(9) / 9, mode="same")  # a slow change is of the scene, not of rows
+    smooth = np.convolve(
+        np.mean(means, axis=0), np.ones(9) / 9, mode="same"
+    )  # a slow change is of the scene, not of rows
     first, second = first - (smooth - smooth.mean()), second - (smooth - smooth.mean())
     covariance = float(np.mean(first * second)) / (1 - 1 / 9)
     error = float(np.sqrt(np.mean(first**2) * np.mean(second**2) / number))

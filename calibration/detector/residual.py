@@ -70,7 +70,9 @@ def residual_of(pair: AlignedPair) -> Residual:
     z = np.zeros(pair.mask.shape)
     z[pair.mask] = np.clip((difference - np.median(difference)) / spread[pair.mask], -CUT, CUT)
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
-    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, float(pair.share[pair.mask].mean()), spread * scale)
+    return Residual(
+        z / max(scale, np.finfo(float).tiny), pair.mask, float(pair.share[pair.mask].mean()), spread * scale
+    )
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = 1.5) -> Image:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.detector.residual import residual_of, smooth_signal
@@ -35,7 +36,9 @@ PATCH_DEVIATIONS = 6.0
 ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "xy": (1, 1), "yy": (2, 0)}
 
 
-@described(blur="of the residual's variance", illumination="of the residual's variance", response="of the residual's variance")
+@described(
+    blur="of the residual's variance", illumination="of the residual's variance", response="of the residual's variance"
+)
 @dataclass(frozen=True)
 class SceneFit:
     """Shares of the residual's variance that follow the scene, zero within `error` where the signal fits.
@@ -98,7 +101,9 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
         shares[name] = (whole - without - len(columns)) / mask.sum()
     most = max(len(columns) for columns in groups.values())
-    return SceneFit(**{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / mask.sum()))
+    return SceneFit(
+        **{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / mask.sum())
+    )
 
 
 def changed_places(pair: AlignedPair) -> Mask:
@@ -147,7 +152,7 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     return replace(pair, signal=signal, total_variance=fit_line(signal[pair.mask], squares), signal_variance=own)
 
 
-def _normal_equations(pair: AlignedPair, chosen: Image, weight: Image) -> tuple[Image, Image, list[Image]]:
+def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Image) -> tuple[Image, Image, list[Image]]:
     """Gram matrix and moments of the kernel's shifts and of the smooth terms; and the images these stand for."""
     middle = float(pair.signal[pair.mask].mean())
     filled = np.where(pair.mask, pair.signal, smooth_signal(pair))

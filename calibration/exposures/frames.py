@@ -83,7 +83,11 @@ class Burst:
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
                 f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give "
-                + ("at least two" if self.calibration else "a long exposure with it, or a burst of at least two equal exposures")
+                + (
+                    "at least two"
+                    if self.calibration
+                    else "a long exposure with it, or a burst of at least two equal exposures"
+                )
             )
         least = 1 if self.calibration else MINIMUM_SIDE
         checked = [checked_frame(frame, f"{self.name}, frame {i}", least_side=least) for i, frame in enumerate(frames)]

@@ -42,14 +42,20 @@ def write_camera_report(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     page = Report("Camera calibration (EMVA 1288)")
-    page.facts([("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])])
+    page.facts(
+        [("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])]
+    )
     page.heading("Verdict")
     for sentence in describe_camera_verdict(camera):
         page.text(sentence)
     page.heading("Figures")
     page.table(("figure", "value"), rows_of(camera), prose=True)
-    page.figure(transfer_figure(camera), caption="Photon transfer with its residual, and the signal-to-noise ratio of a pixel.")
-    page.figure(correlation_figure(camera.figures.correlation), caption="Correlation of neighbouring pixels' temporal noise.")
+    page.figure(
+        transfer_figure(camera), caption="Photon transfer with its residual, and the signal-to-noise ratio of a pixel."
+    )
+    page.figure(
+        correlation_figure(camera.figures.correlation), caption="Correlation of neighbouring pixels' temporal noise."
+    )
     page.heading("Pixels")
     page.figure(map_figure(camera), caption="Maps of the pixels, between their 0.5th and 99.5th percentiles.")
     defects = np.argwhere(camera.maps["defects"] > 0)
@@ -69,7 +75,9 @@ def transfer_figure(camera: Camera) -> Figure:
     """Variance against mean with the line, its residual, and signal-to-noise ratio against electrons."""
     figures = camera.figures
     points = [*([figures.dark] if figures.dark else []), *figures.levels]
-    mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error"))
+    mean, variance, error = (
+        np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
+    )
     slope = figures.gain.median / max(figures.correlation.factor, 1e-9)
     base = figures.dark or figures.levels[0]
     expected = base.variance + slope * (mean - base.mean)
@@ -85,7 +93,9 @@ def transfer_figure(camera: Camera) -> Figure:
         axis.set_xlabel("mean, counts")
     electrons = np.maximum(mean - (figures.offset or 0.0), 1e-9) / slope
     used = (electrons > 1e-6) & (variance > 0)
-    axes[0, 2].loglog(electrons[used], (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used], "o-", markersize=3)
+    axes[0, 2].loglog(
+        electrons[used], (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used], "o-", markersize=3
+    )
     axes[0, 2].set_xlabel("electrons per pixel")
     axes[0, 2].set_ylabel("signal-to-noise ratio")
     return figure

@@ -103,7 +103,9 @@ def photon_transfer_figure(detector: Detector) -> Figure:
     axis.set_ylabel("variance, counts²")
     axis.legend(fontsize=8)
     expected = line.gain * line.signal + line.intercept
-    axes[0, 1].errorbar(line.signal, 100 * (line.variance / expected - 1), 100 * line.variance_error / expected, **style)
+    axes[0, 1].errorbar(
+        line.signal, 100 * (line.variance / expected - 1), 100 * line.variance_error / expected, **style
+    )
     axes[0, 1].axhline(0, color="0.5", linewidth=0.8)
     axes[0, 1].set_ylabel("departure from the line, %")
     for one in axes[0]:

@@ -193,7 +193,7 @@ def write_report(
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
-    facts = [("Verdict", findings.verdict.grade)]
+    facts: list[tuple[str, str]] = [("Verdict", findings.verdict.grade)]
     if findings.figures is not None:
         for name, unit, value in _named(findings.figures):
             shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
@@ -207,7 +207,9 @@ def describe_verdict(findings: Findings) -> list[str]:
     """The grade and its reasons, a sentence each."""
     grade = findings.verdict.grade
     if grade == "good":
-        return ["Verdict: good. Gain, offset and read noise can be believed within their intervals; no assumption fails its test."]
+        return [
+            "Verdict: good. Gain, offset and read noise can be believed within their intervals; no assumption fails its test."
+        ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
     return [f"Verdict: {head}", *(f"{one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
 

@@ -23,9 +23,11 @@ _FITTED, _ITERATIONS = 16384, 60
 class ExcessNoise(NoiseModelBase):
     """Shot noise whose electrons are multiplied at random, plus read noise.
 
-    observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with mean 1
-    and variance F² − 1. F² = 2 is the exponential law of a long multiplication register (EMCCD, doi:10.1109/TED.2003.813462); F²
-    near 1 is a Poisson-Gaussian detector; between lie photomultipliers (Polya law) and direct detectors (straggling).
+    observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with
+    mean 1 and variance F² − 1. F² = 2 is the exponential law of a long multiplication register (EMCCD,
+    doi:10.1109/TED.2003.813462); F² near 1 is a Poisson-Gaussian detector; between lie photomultipliers (Polya law) and direct
+    detectors (straggling).
+
     The variance, F²·gain·(signal − offset) + (gain·read_noise)², identifies F²·gain; the shape of the noise tells them apart.
     Clock-induced charge counts as signal.
 
@@ -39,7 +41,6 @@ class ExcessNoise(NoiseModelBase):
         ValueError: gain or read noise not positive, or F² not above 1.
     """
 
-    starts_most_likely = True  # `standardise` leaves little to climb
     origin: Tensor
 
     def __init__(
@@ -48,8 +49,8 @@ class ExcessNoise(NoiseModelBase):
         super().__init__()
         if not (gain > 0 and read_noise > 0 and excess_factor > 1):
             raise ValueError(
-                f"gain is {gain}, read_noise {read_noise} and excess_factor {excess_factor}; the first two must be positive and the "
-                "last above 1"
+                f"gain is {gain}, read_noise {read_noise} and excess_factor {excess_factor}; the first two must be positive and "
+                "the last above 1"
             )
         start = [math.log(gain), math.log(read_noise), math.log(excess_factor - 1)]
         self.change = nn.Parameter(torch.zeros(4))
@@ -84,6 +85,11 @@ class ExcessNoise(NoiseModelBase):
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
         return ExcessNoiseDistribution(signal, *self._now())
+
+    @property
+    def starts_most_likely(self) -> bool:
+        """Whether `standardise` leaves little to learn: it climbs to the maximum."""
+        return True
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Start at the detector whose second and third moments, level by level, are those of (N,) signals and observations."""
@@ -221,7 +227,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         return self._as(value, self._at(value, False))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        """Log-probability of (low, high]: the difference of the distribution function, or density times width in the far tails."""
+        """Log-probability of (low, high]: the distribution function's difference; in the far tails density times width."""
         ends = []
         for value, empty in ((low, 0.0), (high, 1.0)):
             finite = torch.isfinite(value)

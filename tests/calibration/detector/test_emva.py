@@ -1,0 +1,111 @@
+"""EMVA 1288 figures of simulated cameras are those of the simulation."""
+
+import numpy as np
+import pytest
+
+import noiseflow
+from calibration.camera import calibrate_camera, write_maps
+from calibration.detector.emva import measure_camera
+from calibration.detector.photon_transfer import NotMeasurable
+from calibration.exposures.frames import Burst, read_levels
+from noiseflow.io import read, write
+
+from .. import simulators as sim
+
+SHAPE = (96, 96)
+LEVELS = (200.0, 1000.0, 2500.0, 4500.0, 6500.0, 8200.0, 9500.0)
+
+
+def camera(seed: int, *, number: int = 4, change=lambda image: image):
+    """Flats and darks of gain 2, read noise 3 e⁻, offset 100 ± 2, response 1 ± 1 %, full well 9000 e⁻, dark current 5 e⁻/s."""
+    generator = np.random.default_rng(seed)
+    response = 1 + 0.01 * generator.standard_normal(SHAPE)
+    offset = 100 + 4 * generator.standard_normal(SHAPE)
+
+    def frames(electrons: float) -> Burst:
+        made = []
+        for _ in range(number):
+            charge = np.minimum(generator.poisson(electrons * response), 9000)
+            made.append(np.round(change(offset + 2 * (charge + 3 * generator.standard_normal(SHAPE)))))
+        return Burst(np.stack(made), calibration=True)
+
+    return [frames(level) for level in LEVELS], [frames(0.0), frames(20.0)], response, offset
+
+
+def test_figures_are_those_of_the_camera():
+    flats, darks, response, offset = camera(0)
+    found = measure_camera(flats, darks, flat_times=LEVELS, dark_times=(1.0, 5.0))
+    assert found.gain.median == pytest.approx(2.0, rel=0.01)
+    assert found.gain.q05 < 2.0 < found.gain.q95
+    assert found.dark_noise.median == pytest.approx(3.0, rel=0.02)
+    assert found.saturation == pytest.approx(9000, rel=0.1)  # the level nearest below the full well
+    assert found.saturated
+    assert found.snr_maximum == pytest.approx(np.sqrt(found.saturation), rel=0.03)
+    assert found.dynamic_range == pytest.approx(found.saturation / 3.54, rel=0.03)
+    assert found.linearity_error < 2e-3
+    assert found.dsnu == pytest.approx(2.0, rel=0.05)
+    assert found.prnu == pytest.approx(0.01, rel=0.05)
+    assert found.dark_current == pytest.approx(5.0, rel=0.05)
+    assert np.corrcoef(found.response.ravel(), response.ravel())[0, 1] > 0.7
+    assert np.corrcoef(found.dark.image.ravel(), offset.ravel())[0, 1] > 0.7
+
+
+def test_gain_and_excess_factor_of_an_emccd_are_told_apart():
+    generator = np.random.default_rng(1)
+    flats = [
+        Burst(
+            np.stack(
+                [
+                    sim.multiplied(generator, np.full((128, 128), level), gain=75.0, offset=500.0, read=30.0)
+                    for _ in range(6)
+                ]
+            )
+        )
+        for level in (0.0, 3.0, 8.0, 20.0)
+    ]
+    found = measure_camera(flats[1:], flats[:1])
+    assert found.gain.median == pytest.approx(150, rel=0.02)
+    assert found.excess_factor.q05 < 2.0 < found.excess_factor.q95
+    assert found.excess_factor.median == pytest.approx(2.0, rel=0.15)
+    model = calibrate_camera(flats[1:], flats[:1]).model
+    assert any(isinstance(module, noiseflow.ExcessNoise) for module in model.modules())
+
+
+def test_binned_flats_are_flagged_or_clean_and_filtered_ones_corrected():
+    flats, darks, *_ = camera(2, change=lambda image: 0.75 * image + 0.25 * np.roll(image, 1, axis=1))
+    found = calibrate_camera(flats[:4], darks[:1])
+    assert found.verdict.grade == "doubtful"
+    assert "correlated pixels" in [one.name for one in found.verdict.reasons]
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.03)
+
+
+def test_one_level_alone_tells_no_gain():
+    flats, *_ = camera(3)
+    with pytest.raises(NotMeasurable, match="one level"):
+        measure_camera(flats[:1])
+
+
+def test_model_and_maps_of_a_camera_describe_its_raw_frames(tmp_path):
+    flats, darks, response, offset = camera(4)
+    found = calibrate_camera(flats[:4], darks[:1])
+    assert found.verdict.grade == "good"
+    path = noiseflow.save(found.model, tmp_path / "camera.safetensors")
+    model = noiseflow.load(path)
+    clean = np.full(SHAPE, 100 + 2 * 3000.0, np.float32)
+    drawn = np.stack([np.asarray(model(clean).sample()) for _ in range(16)])
+    expected = offset + 2 * 3000.0 * response
+    assert np.corrcoef(drawn.mean(0).ravel(), expected.ravel())[0, 1] > 0.6  # the frames' own noise is left in the maps
+    assert drawn.var(axis=0, ddof=1).mean() == pytest.approx(4 * (3000 + 9), rel=0.02)
+    for written in write_maps(found, path):
+        assert read(written).data.shape == SHAPE
+
+
+def test_levels_are_stacks_or_runs_of_equal_single_frames(tmp_path):
+    generator = np.random.default_rng(5)
+    paths = []
+    for number, level in enumerate((100, 100, 300, 300)):
+        paths.append(tmp_path / f"{number}.tif")
+        write(paths[-1], generator.poisson(level, SHAPE).astype(np.uint16))
+    assert [len(level.frames) for level in read_levels(paths)] == [2, 2]
+    with pytest.raises(ValueError, match="one frame only"):
+        read_levels(paths[:3])

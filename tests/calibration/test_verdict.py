@@ -1,0 +1,121 @@
+"""No figure is wrong without a flag, and clean exposures raise none."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from calibration.detector.correlation import correlation_of_residuals
+from calibration.detector.residual import Residual
+from calibration.exposures.compression import block_compressed
+from calibration.exposures.frames import Burst, ExposurePair
+from calibration.pipeline import measure_exposures
+
+from . import simulators as sim
+from .sabotage import CASES
+
+
+def measured(case):
+    options = dict(case.options)
+    dark = options.pop("dark", None)
+    exposures = Burst(case.short) if case.long is None else [ExposurePair(case.short, case.long, **options)]
+    return measure_exposures(exposures, dark=None if dark is None else Burst(dark, calibration=True))
+
+
+def test_a_clean_pair_is_good_and_right():
+    found = measured(CASES["clean, ratio known"](11))
+    assert (found.verdict.grade, found.verdict.reasons) == ("good", ())
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.04)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason", "tolerance"),
+    [
+        ("afterglow 0.35 along x", "correlated pixels", 0.06),
+        ("both Gaussian-filtered, 0.4", "correlated pixels", 0.06),
+        ("row offsets of 12", "row offsets", 0.04),
+        ("4 % of the area moved", "scene changed", 0.05),
+        ("long blurred, 0.7 pixels", "scene misfit", 0.06),
+        ("illumination changed across the field", "scene misfit", 0.09),
+        ("both resampled × 0.8", "periodic noise", None),
+        ("both compressed (DCT)", "compressed", None),
+        ("long drifted by 2 pixels", "scene misfit", 0.06),
+    ],
+)
+def test_what_is_wrong_is_flagged_and_modelled_where_it_can_be(name, reason, tolerance):
+    found = measured(CASES[name](12))
+    assert found.verdict.grade != "good"
+    assert reason in [one.name for one in found.verdict.reasons]
+    if tolerance is not None:
+        assert found.figures.gain.median == pytest.approx(2.0, rel=tolerance)
+
+
+def test_excess_noise_is_flagged_and_photon_transfer_gives_the_product():
+    found = measured(CASES["EMCCD, gain × F² 150, darks"](13))
+    assert found.verdict.grade != "good"
+    assert found.figures.source == "photon transfer"
+    assert found.figures.gain.median == pytest.approx(150, rel=0.06)
+    assert found.figures.offset.median == pytest.approx(500, abs=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("seed", [21, 22])
+def test_every_case_is_right_or_flagged(name, seed):
+    case = CASES[name](seed)
+    if name == "gamma-encoded":  # nothing in it is Poisson-Gaussian: either way of saying so will do
+        with contextlib.suppress(ValueError):
+            assert measured(case).verdict.grade == "bad"
+        return
+    found = measured(case)
+    if found.figures is None:
+        assert found.verdict.grade == "bad"
+        return
+    if found.verdict.grade == "good":
+        assert found.figures.gain.median == pytest.approx(case.gain, rel=0.04)  # 2 % and its own error
+    else:
+        serious = {one.name for one in found.verdict.reasons} - {"gain uncertain"}
+        assert not (case.clean and serious)
+
+
+def test_factor_of_a_known_filter_is_its_variance_loss():
+    generator = np.random.default_rng(0)
+    noise = generator.standard_normal((400, 400))
+    filtered = 0.7 * noise + 0.3 * np.roll(noise, 1, axis=1)
+    z = filtered / filtered.std()
+    found = correlation_of_residuals([Residual(z, np.ones(z.shape, bool), 0.0, np.ones(z.shape))])
+    assert found.found
+    assert found.local
+    assert found.factor == pytest.approx(1 / (0.7**2 + 0.3**2), rel=0.02)
+    assert found.at(0, 1) == pytest.approx(0.21 / 0.58, abs=0.01)
+
+
+def test_white_noise_has_no_correlation_and_no_period():
+    z = np.random.default_rng(1).standard_normal((300, 500))
+    found = correlation_of_residuals([Residual(z, np.ones(z.shape, bool), 0.0, np.ones(z.shape))])
+    assert not found.found
+    assert found.factor == 1
+    assert found.period == 0
+
+
+def test_only_a_compressed_frame_is_called_so():
+    assert block_compressed(CASES["both compressed (DCT)"](5).short)
+    assert not block_compressed(CASES["clean"](5).short)
+    assert not block_compressed(CASES["both Gaussian-filtered, 0.8"](5).short)
+
+
+def test_uneven_pixels_are_seen_in_a_burst():
+    generator = np.random.default_rng(3)
+    scene = sim.random_scene(generator, 128)
+    uneven = measure_exposures(Burst(sim.scmos(generator, scene, 6)))
+    assert "uneven pixels" in [one.name for one in uneven.verdict.reasons]
+    even = measure_exposures(Burst(np.stack([sim.exposed(generator, scene) for _ in range(6)])))
+    assert "uneven pixels" not in [one.name for one in even.verdict.reasons]
+
+
+def test_darks_brighter_than_the_exposures_are_refused_in_one_line():
+    generator = np.random.default_rng(4)
+    scene = sim.random_scene(generator, 64)
+    dark = Burst(np.stack([sim.exposed(generator, 0 * scene, offset=5000.0) for _ in range(3)]), calibration=True)
+    with pytest.raises(ValueError, match="brighter"):
+        measure_exposures([ExposurePair(sim.exposed(generator, scene), sim.exposed(generator, 16 * scene))], dark=dark)

@@ -1,0 +1,78 @@
+"""Random multiplication: the density is that of the compound law, and a fit finds gain and excess factor apart."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import noiseflow
+
+
+def law(value, rate, gain, offset, read_noise, pulse_variance):
+    """Density by summing over electrons and integrating the gamma law against the read noise, term by term."""
+    grid = np.linspace(0, 60 * gain, 60_001)
+    density = stats.poisson.pmf(0, rate) * stats.norm.pdf(value, offset, gain * read_noise)
+    for electrons in range(1, 60):
+        charge = stats.gamma.pdf(grid, electrons / pulse_variance, scale=gain * pulse_variance)
+        charge[0] = 0.0
+        spread = stats.norm.pdf(value, offset + grid, gain * read_noise)
+        density += stats.poisson.pmf(electrons, rate) * np.trapezoid(charge * spread, grid)
+    return density
+
+
+@pytest.mark.parametrize("squared", [1.3, 2.0])
+@pytest.mark.parametrize("rate", [0.4, 5.0])
+def test_density_is_the_compound_law(squared, rate):
+    gain, offset, read_noise = 10.0, 100.0, 0.5
+    model = noiseflow.ExcessNoise(gain, offset, read_noise, excess_factor=squared)
+    signal = torch.tensor([offset, offset + gain * rate, offset + 20 * gain], dtype=torch.float64)
+    for value in (97.0, 110.0, 140.0, 190.0):
+        found = float(model(signal).log_prob(torch.full((3,), value, dtype=torch.float64))[1].detach().exp())
+        assert found == pytest.approx(law(value, rate, gain, offset, read_noise, squared - 1), rel=0.02)
+
+
+def test_intervals_sum_to_one_and_moments_are_those_of_the_mass():
+    model = noiseflow.ExcessNoise(4.0, 50.0, 0.8, excess_factor=1.8)
+    signal = torch.tensor([50.0, 70.0, 300.0], dtype=torch.float64)
+    value = torch.arange(-100.0, 2000.0, dtype=torch.float64)[:, None].expand(-1, 3)
+    with torch.no_grad():
+        mass = noiseflow.Digitised(model, step=1.0)(signal).log_prob(value).exp()
+        variance = model(signal).variance
+    np.testing.assert_allclose(mass.sum(0), 1, atol=1e-3)
+    mean = (mass * value).sum(0)
+    np.testing.assert_allclose(mean, signal, rtol=2e-3)
+    np.testing.assert_allclose((mass * (value - mean) ** 2).sum(0), variance + 1 / 12, rtol=0.01)
+
+
+def test_samples_follow_the_distribution_function():
+    model = noiseflow.ExcessNoise(30.0, 500.0, 0.4, excess_factor=2.0)
+    distribution = model(torch.tensor([560.0, 900.0], dtype=torch.float64))
+    drawn = distribution.sample((20_000,), generator=torch.Generator().manual_seed(0))
+    transform = distribution.cdf(drawn).detach().numpy()
+    for column in transform.T:
+        assert stats.kstest(column, "uniform").statistic < 1.63 / np.sqrt(20_000) + 2e-3
+
+
+def test_a_fit_tells_gain_from_excess_factor():
+    truth = noiseflow.ExcessNoise(75.0, 500.0, 0.4, excess_factor=2.0)
+    generator = torch.Generator().manual_seed(1)
+    signal = 500 + 75 * torch.distributions.Gamma(2.0, 0.2).sample((30_000,)).double()
+    observation = truth(signal).sample(generator=generator)
+    model = noiseflow.ExcessNoise()
+    model.standardise(signal, observation)
+    assert float(model.gain * model.excess_factor) == pytest.approx(150, rel=0.04)
+    assert float(model.excess_factor) == pytest.approx(2.0, abs=0.25)
+    with torch.no_grad():
+        loss = truth(signal).log_prob(observation).mean() - model(signal).log_prob(observation).mean()
+    assert float(loss) < 0.002
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ValueError, match="above 1"):
+        noiseflow.ExcessNoise(excess_factor=1.0)
+
+
+def test_saved_and_loaded_it_is_the_same(tmp_path):
+    model = noiseflow.ExcessNoise(3.0, 10.0, 1.5, excess_factor=1.6)
+    loaded = noiseflow.load(noiseflow.save(model, tmp_path / "m.safetensors"))
+    assert repr(loaded) == repr(model)
