@@ -35,3 +35,34 @@ def test_help_answers_without_torch() -> None:
         "sys.exit(any(name in sys.modules for name in ('torch', 'scipy', 'matplotlib', 'cv2')))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def module_name(file: Path) -> str:
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_files(file: Path, known: dict[str, Path]) -> set[Path]:
+    """The project's files that a file imports anywhere in it, in functions and for types too."""
+    found: set[Path] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {known[alias.name] for alias in node.names if alias.name in known}
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            members = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules = {name for name in members if name in known} or ({node.module} & set(known))
+            found |= {known[name] for name in modules}
+    return found
+
+
+def test_no_file_imports_a_file_that_imports_it() -> None:
+    files = [file for package in FORBIDDEN for file in (ROOT / package).rglob("*.py")]
+    known = {module_name(file): file for file in files if file.name != "__init__.py"}
+    graph = {file: imported_files(file, known) - {file} for file in files}
+    assert sum(map(len, graph.values())) > len(files)
+    remaining = dict(graph)
+    while remaining:  # files without imports among those that remain are taken away, until none or a circle is left
+        leaves = [file for file, imports in remaining.items() if not imports & set(remaining)]
+        assert leaves, sorted(str(file.relative_to(ROOT)) for file in remaining)
+        for file in leaves:
+            del remaining[file]

@@ -142,7 +142,7 @@ def _draw(method: Method, name: str) -> Method:
             found = _drawn_from_table(self, whole, generator)
             if found is not None:
                 return found
-            if not (self.independent and whole.numel() > MOST) or torch.compiler.is_compiling():
+            if not (self.independent and whole.numel() > MOST) or torch.compiler.is_compiling() or not self.splits:
                 return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
             parts = self.expand(whole).flat().parts(MOST)
             return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
@@ -174,7 +174,7 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
 def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
     """The method's answer for values (..., *batch), in pieces of bounded memory where there are many."""
     shape = torch.broadcast_shapes(self.batch_shape, *(value.shape for value in values))  # type: ignore[no-untyped-call]
-    if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]):
+    if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]) or not self.splits:
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)
     split = [torch.split(value.expand(shape).reshape(-1), MOST) for value in values]

@@ -139,6 +139,17 @@ class Pixels:
                 setattr(other, name, take(value, tuple(value.shape[size:])))
         return other
 
+    @property
+    def splits(self) -> bool:
+        """Whether pixels can be told apart in all that is kept: a tensor whose leading axes are not the batch's may hold pixels
+        along others, and such a distribution is computed whole."""
+        for name, value in vars(self).items():
+            if isinstance(value, Pixels) and not value.splits:
+                return False
+            if isinstance(value, Tensor) and value.numel() > 1 and not self._is_per_pixel(name, value):
+                return self.per_pixel is not None
+        return True
+
     def _is_per_pixel(self, name: str, tensor: Tensor) -> bool:
         if self.per_pixel is not None:
             return name in self.per_pixel

@@ -44,9 +44,12 @@ class NetworkField(Field):
         z, x, y = torch.meshgrid(*axes, indexing="ij")
         self.register_buffer("points", torch.stack([x, y, z], -1).reshape(-1, 3), persistent=False)
 
-    def forward(self) -> Tensor:
-        density: Tensor = self.network(self.points) * (2 * _DENSITY_SCALE / self.width)
-        return density.view(self.depth * self.width, self.height)
+    def start_from(self, volume: Tensor) -> None:
+        """The network starts nearly empty, whatever the volume."""
+
+    def units(self) -> Tensor:
+        density: Tensor = self.network(self.points) * (2 * _DENSITY_SCALE / self.width / self.scale)
+        return density.view(self.depth, self.width, self.height)
 
 
 def fit_network(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -17,7 +18,7 @@ from recon.projection.tiles import Tiles
 _LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
 
 
-class Field(Described):
+class Field(Described, ABC):
     """A trainable volume of non-negative attenuation.
 
     Args:
@@ -41,9 +42,9 @@ class Field(Described):
         self.depth, self.height, self.width = shape
         self.register_buffer("scale", torch.tensor(float(scale)))
 
+    @abstractmethod
     def units(self) -> Tensor:
         """Attenuation in units of the scale, not negative, (depth, width, height)."""
-        raise NotImplementedError
 
     def at(self, places: Tensor) -> Tensor:
         """Attenuation, in units of the scale, at (N,) places of the flat lattice (z, x, y)."""
@@ -54,9 +55,9 @@ class Field(Described):
         values = self.at(tiles.voxels)
         return values.new_zeros(tiles.filled.numel()).index_copy(0, tiles.occupied, values)
 
+    @abstractmethod
     def start_from(self, volume: Tensor) -> None:
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
-        raise NotImplementedError
 
     @property
     def has_coarser(self) -> bool:

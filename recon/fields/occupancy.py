@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.projection.projector import SliceProjector
+from recon.projection.base import Projector
 
 _RETEST_EVERY = 10
 
@@ -64,7 +64,7 @@ class Occupancy(nn.Module):
         return part
 
     @torch.no_grad()
-    def retest(self, gradient: Tensor, projector: SliceProjector, cost: float) -> None:
+    def retest(self, gradient: Tensor, projector: Projector, cost: float) -> None:
         """Occupy the blocks that the data wants, in every tenth call.
 
         Args:

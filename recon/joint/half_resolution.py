@@ -8,7 +8,6 @@ from torch import Tensor
 
 from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
-from recon.projection.projector import SliceProjector
 
 _LEAST = 128  # voxels; half the resolution of 96 costs 0.2 dB of a volume of shells for a tenth of the time
 
@@ -33,33 +32,26 @@ class HalfResolution:
         """Whether the field has a voxel grid half as fine, the projector has one, and there are voxels enough to save."""
         full = signal_model.projector
         wide = min(full.width, full.detector_width) >= _LEAST
-        return wide and isinstance(full, SliceProjector) and signal_model.field.has_coarser
+        return wide and full.has_parts and signal_model.field.has_coarser
 
     def __init__(self, signal_model: TomographySignal) -> None:
         full, field = signal_model.projector, signal_model.field.coarser()
-        if field is None or not isinstance(full, SliceProjector):
+        if field is None:
             raise ValueError("this signal model has no half resolution; ask HalfResolution.possible first")
         tilts = np.arange(full.num_tilts)
         # of an odd number, the last pixel along u is left out at some tilts; rows are as many as coarse slices
         self._num_columns, self._first_columns = full.detector_width // 2, tilts % 2
         self._num_rows, self._first_rows = field.height, tilts // 2 % 2 * (signal_model.field.height % 2 == 0)
-        middle = self._first_columns + self._num_columns - 1 - (full.detector_width - 1) / 2
-        projector = SliceProjector(
-            tilt_angles=full.tilt_angles,
-            depth=field.depth,
-            width=field.width,
-            detector_width=self._num_columns,
-            detector_offset=(middle + full.detector_offset) / 2,
-            dtype=full.dtype,
-            device=full.device,
-        )
+        projector = full.half(field.depth, field.width, self._num_columns, self._first_columns)
+        if projector is None:
+            raise ValueError(f"{type(full).__name__} has no half resolution; ask HalfResolution.possible first")
         self._full, occupancy = signal_model, signal_model.occupancy
         self.signal_model = TomographySignal(
             field,
             projector,
             signal_model.image_formation,
             weight=signal_model.weight,
-            smoothing=signal_model.smoothing,
+            regulariser=signal_model.regulariser,
             learning_rate=signal_model.learning_rate,
             occupancy=None if occupancy is None else occupancy.coarser((field.depth, field.height, field.width)),
         )

@@ -202,7 +202,6 @@ class JointReconstructor:
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
             can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),
-            hidden_offset=whole.occupancy is None and isinstance(whole.image_formation, Linear),
         )
         return facts, rows, given
 

@@ -23,7 +23,6 @@ class Facts:
         simple_is_final: whether that model is the simple one that every fit begins with (least squares).
         choose_weight: whether the weight of the regulariser is chosen.
         can_halve: whether the field has a voxel grid half as fine that is worth using.
-        hidden_offset: whether no vacuum shows the offset of a linear response.
         settled: whether noise model, weight and response are known from other slices of the same series.
         quiet: whether the noise model is chosen, and noise is small beside the contrast: most of what a fit leaves is then
             misfit, which a width that follows the signal would excuse where it is bright. The volume is fitted by least squares,
@@ -38,7 +37,6 @@ class Facts:
     simple_is_final: bool = False
     choose_weight: bool = True
     can_halve: bool = False
-    hidden_offset: bool = False
     settled: bool = False
     quiet: bool = False
     hold_offset: bool = False
@@ -57,21 +55,19 @@ class Schedule:
         trial: signal steps that compare weights, from a state fitted at the first one.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
-        whole_rate: learning rate of the volume; twice as much can diverge on sparse objects of 96 voxels and more.
+        whole_rate: learning rate of the volume; 1.2 times as much diverges on sparse objects of 96 voxels.
         later_rate: learning rate of a slab that is not a rough start: the first steps of Adam are as large where little is left.
-        offset_rate: factor on the rate of an offset that no vacuum shows, from a rough start.
     """
 
     settle: int = 40
-    candidate: int = 60
-    adapt: int = 30
-    refine: int = 60
+    candidate: int = 30
+    adapt: int = 20
+    refine: int = 20
     trial: int = 30
     whole: int = 100
     quiet: int = 240
-    whole_rate: float = 0.5
+    whole_rate: float = 0.7
     later_rate: float = 0.5
-    offset_rate: float = 4.0
 
 
 @described(rate="of a rough start's learning rate")
@@ -88,7 +84,8 @@ class FitStage:
         num_steps: optimisation steps; of each fit, where there are several.
         rate: learning rate of the signal, relative to a rough start's.
         half: at half the resolution.
-        offset_rate: factor on the learning rate of the offset.
+        warm_up: the rate grows to its full size first: the first steps of Adam are as large where little is left.
+        hold_offset: leave the offset as it is.
         standardise: measure the noise model's scaling first.
         fits: how many fits the stage is expected to make.
     """
@@ -100,7 +97,8 @@ class FitStage:
     num_steps: int
     rate: float = 1.0
     half: bool = False
-    offset_rate: float = 1.0
+    warm_up: bool = False
+    hold_offset: bool = False
     standardise: bool = False
     fits: int = 1
 
@@ -133,26 +131,24 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
 
 def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    usual = 0.0 if facts.hold_offset else 1.0
-    hasten = usual * (schedule.offset_rate if facts.hidden_offset else 1.0)
+    hold = facts.hold_offset
     stages = [
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
-        FitStage("settle", "signal", "slab", "simple", schedule.settle, offset_rate=hasten),
+        FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold),
     ]
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
     later = schedule.later_rate
-    stages.append(FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later, offset_rate=usual))
+    stages.append(
+        FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later, warm_up=True, hold_offset=hold)
+    )
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        stages.append(
-            FitStage(
-                "choose weight", "weights", "slab", noise, schedule.trial, rate=later, offset_rate=usual, fits=_TRIALS
-            )
-        )
+        how = {"rate": later, "warm_up": True, "hold_offset": hold, "fits": _TRIALS}
+        stages.append(FitStage("choose weight", "weights", "slab", noise, schedule.trial, **how))  # type: ignore[arg-type]
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -161,16 +157,14 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
 def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitStage]:
     """From the coarse reconstruction again, under what is chosen: steps under other noise or another weight leave traces."""
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    usual = 0.0 if facts.hold_offset else 1.0
-    hasten = usual * (schedule.offset_rate if facts.hidden_offset and not facts.settled else 1.0)
     quarter, stages = num_steps // 4, list[FitStage]()
 
-    def add(name: str, model: Noise, steps: int, *, half: bool = False, offset_rate: float = usual) -> None:
-        rate = schedule.whole_rate
-        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, offset_rate=offset_rate))
+    def add(name: str, model: Noise, steps: int, *, half: bool = False) -> None:
+        rate, hold = schedule.whole_rate, facts.hold_offset
+        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, hold_offset=hold))
 
     if quarter:  # the simple noise pulls at a rough signal steadily
-        add("begin", "simple", quarter, half=facts.can_halve, offset_rate=hasten)
+        add("begin", "simple", quarter, half=facts.can_halve)
     if quarter and facts.can_halve:
         add("coarse", noise, quarter, half=True)
     add("fit", noise, num_steps - sum(stage.num_steps for stage in stages))
@@ -190,8 +184,10 @@ def describe(stages: Sequence[FitStage]) -> str:
         how: list[str] = [stage.noise]
         if stage.kind in ("signal", "weights"):
             how.append(f"rate {stage.rate:g}")
-        if stage.offset_rate != 1 and stage.kind in ("signal", "weights"):
-            how.append(f"offset x {stage.offset_rate:g}" if stage.offset_rate else "offset held")
+        if stage.hold_offset:
+            how.append("offset held")
+        if stage.warm_up:
+            how.append("warm-up")
         if stage.half:
             how.append("half resolution")
         lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")

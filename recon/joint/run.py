@@ -21,7 +21,7 @@ Progress = Callable[[int, int, str], None]
 """``progress(steps done, steps expected, note)``."""
 
 _BATCH = 4096  # pixels per noise-model step
-_WARM_UP = 0.1  # share of the steps, except from a rough start
+_WARM_UP = 0.1  # share of the steps
 _TOLERATED = (
     0.003  # nats per pixel; what a richer noise model gains below that may be a bias of the signal that it absorbed
 )
@@ -165,8 +165,8 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
-                parameter_groups=model.parameter_groups(rate=stage.rate, offset_rate=stage.offset_rate),
-                warm_up=_WARM_UP if stage.rate < 1 else 0.0,
+                parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
+                warm_up=_WARM_UP if stage.warm_up else 0.0,
                 tables=task.tables(noise_model),
             )
         finally:

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from noiseflow.models.base import Described
 from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
-from recon.fields.regularisers import total_variation
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.fields.regularisers.base import Regulariser
+from recon.fields.regularisers.total_variation import TotalVariation
+from recon.projection.base import Projector, from_columns
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.projector import SliceProjector, from_columns
 from recon.projection.tiles import Tiles
 
 _RESPONSE_RATE = 0.04  # learning rate of the detector's response, relative to the volume's
@@ -31,9 +31,9 @@ class TomographySignal(Described):
         image_formation: line integrals to signals, such as `Transmission` or `Linear`.
         weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
             voxel face.
-        smoothing: jumps below this, in units of the field's scale, count quadratically.
+        regulariser: what is expected of a volume; isotropic total variation by default.
         learning_rate: of a field of voxels.
-        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a `SliceProjector`.
+        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a projector that has parts.
 
     Raises:
         ValueError: an occupancy for another projector.
@@ -42,19 +42,20 @@ class TomographySignal(Described):
     def __init__(
         self,
         field: Field,
-        projector: SliceProjector | DefocusedProjector,
+        projector: Projector,
         image_formation: nn.Module,
         *,
         weight: float = 1.0,
-        smoothing: float = 0.02,
+        regulariser: Regulariser | None = None,
         learning_rate: float = 0.2,
         occupancy: Occupancy | None = None,
     ) -> None:
         super().__init__()
-        if occupancy is not None and not isinstance(projector, SliceProjector):
-            raise ValueError("vacuum is left out of a SliceProjector only; give no occupancy with this projector")
+        if occupancy is not None and not projector.has_parts:
+            raise ValueError("vacuum is left out only where the projector has parts; give no occupancy with this one")
         self.field, self.projector, self.image_formation = field, projector, image_formation
-        self.weight, self.smoothing, self.learning_rate = weight, smoothing, learning_rate
+        self.weight, self.learning_rate = weight, learning_rate
+        self.regulariser = TotalVariation() if regulariser is None else regulariser
         self.occupancy = occupancy
         self._values: Tensor | None = None
         self._tiles: Tiles | None = None
@@ -63,7 +64,7 @@ class TomographySignal(Described):
         self._steps_follow = False
 
     def extra_repr(self) -> str:
-        return f"{self.projector!r}, weight={self.weight:.4g}, smoothing={self.smoothing:.4g}"
+        return f"{self.projector!r}, weight={self.weight:.4g}, {self.regulariser!r}"
 
     @property
     def num_pixels(self) -> int:
@@ -92,7 +93,7 @@ class TomographySignal(Described):
     def _project(self, values: Tensor) -> Tensor:
         """Line integrals; what the data wants where the lattice counts as empty is tested as gradients pass."""
         occupancy, projector = self.occupancy, self.projector
-        if occupancy is None or not isinstance(projector, SliceProjector):
+        if occupancy is None:
             return projector.project(values)
         rays = self.tiles.project(values)
         if rays.requires_grad:
@@ -107,7 +108,7 @@ class TomographySignal(Described):
         Raises:
             ValueError: there is no occupancy.
         """
-        if self.occupancy is None or not isinstance(self.projector, SliceProjector):
+        if self.occupancy is None:
             raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
         mask = self.occupancy.mask
         known, version = self._tiles_of
@@ -148,39 +149,43 @@ class TomographySignal(Described):
         return tuple((tensor._version, tensor.requires_grad) for tensor in tensors)
 
     def penalty(self) -> Tensor:
-        """The weighted total variation per pixel; after `signal` it reuses the volume evaluated there."""
+        """The weighted regulariser per pixel; after `signal` it reuses the volume evaluated there."""
         values = self._evaluate() if self._values is None else self._values
         self._values = None
         scale = float(self.field.scale)
-        smoothing = self.smoothing * scale
         if self.occupancy is None:
-            lattice = values.view(self.field.depth, self.field.width, self.field.height)
-            variation = total_variation(lattice, smoothing=smoothing)
+            cost = self.regulariser(values.view(self.field.depth, self.field.width, self.field.height), scale)
         else:
-            variation = self.tiles.total_variation(values, smoothing=smoothing)
-        return variation * (self.weight / (scale * self.num_pixels))
+            cost = self.regulariser.of_tiles(values, self.tiles, scale)
+        return cost * (self.weight / (scale * self.num_pixels))
 
     def with_field(self, field: Field) -> TomographySignal:
         """The same detector and response, copied, in front of another field of as many voxels along z and x."""
         response = copy.deepcopy(self.image_formation)
-        options = {"weight": self.weight, "smoothing": self.smoothing, "learning_rate": self.learning_rate}
-        return TomographySignal(field, self.projector, response, occupancy=None, **options)
+        return TomographySignal(
+            field,
+            self.projector,
+            response,
+            weight=self.weight,
+            regulariser=self.regulariser,
+            learning_rate=self.learning_rate,
+        )
 
     def response(self) -> dict[str, list[float]]:
         """Intensity and offset of every tilt as they are; nothing for an image formation of another kind."""
         formation = self.image_formation
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
-    def parameter_groups(self, *, rate: float = 1.0, offset_rate: float = 1.0) -> list[dict[str, Any]]:
+    def parameter_groups(self, *, rate: float = 1.0, hold_response: bool = False) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam.
 
         Args:
             rate: factor on all of them.
-            offset_rate: further factor on that of the detector's response.
+            hold_response: leave the detector's response as it is.
         """
-        response = [parameter for parameter in self.image_formation.parameters() if parameter.requires_grad]
+        response = [p for p in self.image_formation.parameters() if p.requires_grad and not hold_response]
         usual = self.learning_rate * rate
         groups: list[dict[str, Any]] = [
             {"params": list(self.field.parameters()), "lr": usual * self.field.relative_rate, "eps": 1e-15}
         ]
-        return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE * offset_rate}] if response else [])
+        return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])

@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.projector import SliceProjector, from_columns, from_rays, to_columns, to_rays
+from recon.projection.base import Projector
+from recon.projection.projector import SliceProjector
 from recon.projection.rays import march, view_matrices, view_rays
 
 _SUBPIXEL = 0.25
@@ -24,7 +25,7 @@ def with_defocus(projector: SliceProjector, convergence: float) -> SliceProjecto
     return blurred if len(blurred.blurs) > 1 else projector
 
 
-class DefocusedProjector:
+class DefocusedProjector(Projector):
     """Line integrals through a converging beam that is in focus on the tilt axis; takes the place of a `SliceProjector`.
 
     What lies at distance w from the focal plane, along the beam, is blurred by a Gaussian of standard deviation
@@ -48,8 +49,7 @@ class DefocusedProjector:
     def __init__(self, projector: SliceProjector, convergence: float, *, most_layers: int = _MOST_LAYERS) -> None:
         if not 0 <= convergence < math.inf:
             raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
-        self.tilt_angles, self.num_tilts = projector.tilt_angles, projector.num_tilts
-        self.dtype, self.device = projector.dtype, projector.device
+        self.tilt_angles = projector.tilt_angles
         self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
         farthest = convergence * math.hypot(self.depth - 1, self.width - 1) / 2
         count = min(most_layers, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))
@@ -61,6 +61,14 @@ class DefocusedProjector:
 
     def __repr__(self) -> str:
         return f"DefocusedProjector({self._layers[0]!r}, convergence {self.convergence:g}, {len(self.blurs)} layers)"
+
+    @property
+    def device(self) -> torch.device:
+        return self._layers[0].device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self._layers[0].dtype
 
     @property
     def reach(self) -> int:
@@ -79,14 +87,6 @@ class DefocusedProjector:
         pairs = zip(self._layers[1:], self.blurs[1:], strict=False)
         first = self._layers[0].backproject(rays)
         return sum((layer.backproject(self._blurred(rays, blur)) for layer, blur in pairs), first)
-
-    def __call__(self, attenuation: Tensor) -> Tensor:
-        """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
-        return from_rays(self.project(to_columns(attenuation)), self.num_tilts)
-
-    def T(self, line_integrals: Tensor) -> Tensor:
-        """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
-        return from_columns(self.backproject(to_rays(line_integrals)), self.depth)
 
     def _blurred(self, rays: Tensor, blur: float) -> Tensor:
         images = rays.view(self.num_tilts, self.detector_width, -1)

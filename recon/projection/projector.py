@@ -11,13 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from noiseflow.arrays import Given, alike, as_tensor
+from recon.projection.base import Projector, from_columns, from_rays, to_columns, to_rays
 from recon.projection.sparse import PanelledMatrix
 
+__all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
 
 
-class SliceProjector:
+class SliceProjector(Projector):
     """Line integrals of a volume along all rays of a single-axis tilt series.
 
     A point (x, z) relative to the volume's centre lands on the detector at u = x cos θ + z sin θ; y does not change.
@@ -94,11 +95,6 @@ class SliceProjector:
         """Number type of the matrix."""
         return self.matrix.panels[0].dtype
 
-    @property
-    def num_tilts(self) -> int:
-        """How many tilts the series has."""
-        return int(self.tilt_angles.size)
-
     def project(self, columns: Tensor) -> Tensor:
         """Native layout, no copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
         result: Tensor = _Product.apply(columns, self.matrix, self.transposed)  # type: ignore[no-untyped-call]
@@ -108,18 +104,6 @@ class SliceProjector:
         """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
         result: Tensor = _Product.apply(rays, self.transposed, self.matrix)  # type: ignore[no-untyped-call]
         return result
-
-    def __call__(self, attenuation: Given) -> Given:
-        """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
-        volume = as_tensor(attenuation, like=self)
-        _require(volume, "attenuation (z, y, x)", self.depth, self.width)
-        return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
-
-    def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
-        """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
-        images = as_tensor(line_integrals, like=self)
-        _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
-        return alike(from_columns(self.backproject(to_rays(images)), self.depth), line_integrals)
 
     def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
         """Operators of layers across the beam, which add up to this one.
@@ -138,26 +122,27 @@ class SliceProjector:
             parts.append(part)
         return parts
 
+    @property
+    def has_parts(self) -> bool:
+        return True
+
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """The matrix of some columns of the lattice, (n,) indices z·width + x, and its transpose."""
+        """The matrix of some columns of a slice, (n,) indices z·width + x, and its transpose."""
         transposed, matrix = self.transposed.some_rows(columns)
         return matrix, transposed
 
-
-def to_columns(volume: Tensor) -> Tensor:
-    """(z, y, x) -> (z * x, y): each slice becomes one column."""
-    return volume.transpose(1, 2).reshape(volume.shape[0] * volume.shape[2], volume.shape[1])
-
-
-def from_columns(columns: Tensor, depth: int) -> Tensor:
-    """(z * x, y) -> (z, y, x), a view."""
-    return columns.reshape(depth, -1, columns.shape[1]).transpose(1, 2)
-
-
-to_rays = to_columns
-"""(tilt, y, u) -> (tilt * u, y)."""
-from_rays = from_columns
-"""(tilt * u, y) -> (tilt, y, u), a view."""
+    def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> SliceProjector:
+        """The projector of a voxel grid half as fine, see `Projector.half`."""
+        middle = first_columns + num_columns - 1 - (self.detector_width - 1) / 2
+        return SliceProjector(
+            tilt_angles=self.tilt_angles,
+            depth=depth,
+            width=width,
+            detector_width=num_columns,
+            detector_offset=(middle + self.detector_offset) / 2,
+            dtype=self.dtype,
+            device=self.device,
+        )
 
 
 class _Product(torch.autograd.Function):
@@ -199,8 +184,3 @@ def _joseph(
             voxels.append(row * width + across if along_z else across * width + row)
             weights.append(share[inside] * step)
     return np.concatenate(rays), np.concatenate(voxels), np.concatenate(weights)
-
-
-def _require(tensor: Tensor, what: str, first: int, last: int) -> None:
-    if tensor.ndim != 3 or tensor.shape[0] != first or tensor.shape[2] != last:
-        raise ValueError(f"{what} must have shape ({first}, any, {last}), not {tuple(tensor.shape)}")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon.fields.upsampling import upsampling_matrix
-from recon.projection.projector import SliceProjector
+from recon.projection.base import Projector
 from recon.projection.sparse import csr_tensor
 from recon.projection.tile import Tile, neighbours_of
 from recon.projection.tile_variation import TileVariation
@@ -38,7 +38,7 @@ class Tiles:
         filled: (N,) 1 where the listed voxel is occupied, else 0.
     """
 
-    def __init__(self, mask: Tensor, projector: SliceProjector, *, known: Tiles | None = None) -> None:
+    def __init__(self, mask: Tensor, projector: Projector, *, known: Tiles | None = None) -> None:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
         together = max(_TOGETHER, -(-height // _MOST_TILES))
@@ -115,6 +115,11 @@ class Tiles:
         """The whole lattice, (depth * width, height), without gradient."""
         return self.scattered(values.detach()).view(-1, self.shape[2])
 
+    def spread(self, values: Tensor) -> Tensor:
+        """The voxel grid, (z, x, y), of a list, differentiable."""
+        lattice: Tensor = _Spreading.apply(values, self)  # type: ignore[no-untyped-call]
+        return lattice
+
     def scattered(self, values: Tensor) -> Tensor:
         """The lattice, (z, x, y), of a list: the adjoint of `gathered`."""
         lattice = values.new_zeros(self.shape)
@@ -126,7 +131,7 @@ class Tiles:
         return iter(self._tiles)
 
 
-def _matrices(projector: SliceProjector, columns: Tensor, known: Tile | None) -> tuple[Tensor, Tensor]:
+def _matrices(projector: Projector, columns: Tensor, known: Tile | None) -> tuple[Tensor, Tensor]:
     if known is not None and torch.equal(columns, known.columns):
         return known.matrix, known.transposed
     return projector.part(columns)
@@ -171,6 +176,17 @@ class _Gathering(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return ctx.tiles.scattered(gradient), None
+
+
+class _Spreading(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, tiles: Tiles) -> Tensor:
+        ctx.tiles = tiles
+        return tiles.scattered(values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.tiles.gathered(gradient), None
 
 
 class _Upsampling(torch.autograd.Function):

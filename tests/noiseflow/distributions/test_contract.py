@@ -159,3 +159,13 @@ def test_flows_compile_without_graph_breaks(name: str) -> None:
     found, drawn = compiled(signal)
     assert torch.allclose(found, both(signal)[0], atol=1e-5)
     assert drawn.shape == signal.shape
+
+
+def test_pixels_along_another_axis_than_the_first_are_not_mixed_up():
+    """A mixture that keeps its components along a leading axis: many pixels at once are as the same pixels one by one."""
+    from recon.simulate.noises import OutlierNoise
+
+    signal = torch.linspace(0, 1, 64)[:, None]
+    values = torch.randn(64, 5000, generator=torch.Generator().manual_seed(0))
+    whole = OutlierNoise()(signal).log_prob(values)
+    assert torch.allclose(whole[:, :7], OutlierNoise()(signal).log_prob(values[:, :7]))

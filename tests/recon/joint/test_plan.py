@@ -21,25 +21,25 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  60 x 2  chosen
-        slab   adapt                        signal      30  chosen, rate 0.5
-        slab   refine noise                 noise       60  chosen
-        slab   choose weight                weights     30 x 5  chosen, rate 0.5
-        slab   refine noise at the weight   noise       60  chosen
-        whole  begin                        signal      25  simple, rate 0.5
-        whole  fit                          signal      75  chosen, rate 0.5
+        slab   choose noise                 candidates  30 x 2  chosen
+        slab   adapt                        signal      20  chosen, rate 0.5, warm-up
+        slab   refine noise                 noise       20  chosen
+        slab   choose weight                weights     30 x 5  chosen, rate 0.5, warm-up
+        slab   refine noise at the weight   noise       20  chosen
+        whole  begin                        signal      25  simple, rate 0.7
+        whole  fit                          signal      75  chosen, rate 0.7
         """,
     ),
-    "least squares, weight given, offset hidden": (
-        Facts(choose_noise=False, simple_is_final=True, choose_weight=False, hidden_offset=True),
+    "least squares, weight given": (
+        Facts(choose_noise=False, simple_is_final=True, choose_weight=False),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset x 4
-        slab   learn noise                  noise       60  simple
-        slab   adapt                        signal      30  simple, rate 0.5
-        slab   refine noise                 noise       60  simple
-        whole  begin                        signal      25  simple, rate 0.5, offset x 4
-        whole  fit                          signal      75  simple, rate 0.5
+        slab   settle                       signal      40  simple, rate 1
+        slab   learn noise                  noise       20  simple
+        slab   adapt                        signal      20  simple, rate 0.5, warm-up
+        slab   refine noise                 noise       20  simple
+        whole  begin                        signal      25  simple, rate 0.7
+        whole  fit                          signal      75  simple, rate 0.7
         """,
     ),
     "everything chosen, large": (
@@ -47,30 +47,30 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  60 x 2  chosen
-        slab   adapt                        signal      30  chosen, rate 0.5
-        slab   refine noise                 noise       60  chosen
-        slab   choose weight                weights     30 x 5  chosen, rate 0.5
-        slab   refine noise at the weight   noise       60  chosen
-        whole  begin                        signal      25  simple, rate 0.5, half resolution
-        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
-        whole  fit                          signal      50  chosen, rate 0.5
+        slab   choose noise                 candidates  30 x 2  chosen
+        slab   adapt                        signal      20  chosen, rate 0.5, warm-up
+        slab   refine noise                 noise       20  chosen
+        slab   choose weight                weights     30 x 5  chosen, rate 0.5, warm-up
+        slab   refine noise at the weight   noise       20  chosen
+        whole  begin                        signal      25  simple, rate 0.7, half resolution
+        whole  coarse                       signal      25  chosen, rate 0.7, half resolution
+        whole  fit                          signal      50  chosen, rate 0.7
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
         """
         whole  start noise                  noise       10  simple
-        whole  begin                        signal      25  simple, rate 0.5, half resolution
-        whole  coarse                       signal      25  chosen, rate 0.5, half resolution
-        whole  fit                          signal      50  chosen, rate 0.5
+        whole  begin                        signal      25  simple, rate 0.7, half resolution
+        whole  coarse                       signal      25  chosen, rate 0.7, half resolution
+        whole  fit                          signal      50  chosen, rate 0.7
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      25  simple, rate 0.5
-        whole  fit                          signal      75  chosen, rate 0.5
+        whole  begin                        signal      25  simple, rate 0.7
+        whole  fit                          signal      75  chosen, rate 0.7
         """,
     ),
     "quiet": (
@@ -78,15 +78,15 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, offset held
-        slab   learn noise                  noise       60  simple
-        slab   adapt                        signal      30  simple, rate 0.5, offset held
-        slab   refine noise                 noise       60  simple
-        slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held
-        slab   refine noise at the weight   noise       60  simple
-        whole  begin                        signal      60  simple, rate 0.5, offset held, half resolution
-        whole  coarse                       signal      60  simple, rate 0.5, offset held, half resolution
-        whole  fit                          signal      120  simple, rate 0.5, offset held
-        whole  describe noise               noise       60  chosen
+        slab   learn noise                  noise       20  simple
+        slab   adapt                        signal      20  simple, rate 0.5, offset held, warm-up
+        slab   refine noise                 noise       20  simple
+        slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held, warm-up
+        slab   refine noise at the weight   noise       20  simple
+        whole  begin                        signal      60  simple, rate 0.7, offset held, half resolution
+        whole  coarse                       signal      60  simple, rate 0.7, offset held, half resolution
+        whole  fit                          signal      120  simple, rate 0.7, offset held
+        whole  describe noise               noise       20  chosen
         """,
     ),
 }

@@ -1,4 +1,4 @@
-"""What a volume is expected to look like before any data is seen."""
+"""Total variation: volumes of few faces."""
 
 from __future__ import annotations
 
@@ -8,6 +8,33 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
+from recon.fields.regularisers.base import Regulariser
+from recon.projection.tiles import Tiles
+
+
+class TotalVariation(Regulariser):
+    """Isotropic total variation.
+
+    Args:
+        smoothing: jumps below this, in units of the scale, count quadratically.
+
+    Raises:
+        ValueError: a smoothing that is not positive.
+    """
+
+    def __init__(self, smoothing: float = 0.02) -> None:
+        if not smoothing > 0:
+            raise ValueError(f"smoothing {smoothing} must be positive, in units of the scale")
+        self.smoothing = smoothing
+
+    def __call__(self, volume: Tensor, scale: float) -> Tensor:
+        return total_variation(volume, smoothing=self.smoothing * scale)
+
+    def of_tiles(self, values: Tensor, tiles: Tiles, scale: float) -> Tensor:
+        return tiles.total_variation(values, smoothing=self.smoothing * scale)
+
+    def __repr__(self) -> str:
+        return f"TotalVariation(smoothing={self.smoothing:g})"
 
 
 def total_variation(volume: Given, *, smoothing: float) -> Given:

@@ -1,0 +1,5 @@
+"""What a volume is expected to look like before any data is seen, one file each."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

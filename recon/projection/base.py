@@ -1,0 +1,112 @@
+"""What a projector is: line integrals of a volume, and their adjoint. Kernels and geometries plug in here."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from noiseflow.arrays import Given, alike, as_tensor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Projector(ABC):
+    """Line integrals along the rays of a single-axis tilt series, linear in the volume.
+
+    A projector defines `project` and `backproject` in the native layout, in which slices are columns: no copies are made. The
+    rest has defaults; `has_parts` and `half` say what a projector can do beyond that.
+
+    Attributes:
+        tilt_angles: (tilts,) degrees.
+        depth, width: voxels along z and x.
+        detector_width: pixels along u.
+    """
+
+    tilt_angles: NDArray[np.float64]
+    depth: int
+    width: int
+    detector_width: int
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Where the projector computes."""
+
+    @property
+    @abstractmethod
+    def dtype(self) -> torch.dtype:
+        """Number type it computes in."""
+
+    @abstractmethod
+    def project(self, columns: Tensor) -> Tensor:
+        """(depth * width, slices) -> line integrals (tilts * detector_width, slices), differentiable."""
+
+    @abstractmethod
+    def backproject(self, rays: Tensor) -> Tensor:
+        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
+
+    @property
+    def num_tilts(self) -> int:
+        """How many tilts the series has."""
+        return int(np.size(self.tilt_angles))
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether slices are projected one by one, and `part` gives the matrix of some of their columns; False."""
+        return False
+
+    def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose.
+
+        Raises:
+            ValueError: the projector has no parts.
+        """
+        raise ValueError(f"{type(self).__name__} has no parts; ask has_parts first")
+
+    def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> Projector | None:
+        """The projector of a voxel grid half as fine, to every second pixel along u; None where there is none.
+
+        Args:
+            depth, width: voxels of that grid along z and x.
+            num_columns: pixels taken of each image.
+            first_columns: (tilts,) the first of them, 0 or 1.
+        """
+        return None
+
+    def __call__(self, attenuation: Given) -> Given:
+        """Project a volume (z, y, x), attenuation per voxel, to line integrals (tilt, y, u)."""
+        volume = as_tensor(attenuation, like=self)
+        _require(volume, "attenuation (z, y, x)", self.depth, self.width)
+        return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
+
+    def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
+        """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
+        images = as_tensor(line_integrals, like=self)
+        _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)
+        return alike(from_columns(self.backproject(to_rays(images)), self.depth), line_integrals)
+
+
+def to_columns(volume: Tensor) -> Tensor:
+    """(z, y, x) -> (z * x, y): each slice becomes one column."""
+    return volume.transpose(1, 2).reshape(volume.shape[0] * volume.shape[2], volume.shape[1])
+
+
+def from_columns(columns: Tensor, depth: int) -> Tensor:
+    """(z * x, y) -> (z, y, x), a view."""
+    return columns.reshape(depth, -1, columns.shape[1]).transpose(1, 2)
+
+
+to_rays = to_columns
+"""(tilt, y, u) -> (tilt * u, y)."""
+from_rays = from_columns
+"""(tilt * u, y) -> (tilt, y, u), a view."""
+
+
+def _require(tensor: Tensor, what: str, first: int, last: int) -> None:
+    if tensor.ndim != 3 or tensor.shape[0] != first or tensor.shape[2] != last:
+        raise ValueError(f"{what} must have shape ({first}, any, {last}), not {tuple(tensor.shape)}")
