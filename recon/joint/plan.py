@@ -52,10 +52,10 @@ class Schedule:
             tolerance of the choice.
         adapt: signal steps on the slab under the chosen noise model.
         refine: noise-model steps on a signal that has become better.
-        trial: signal steps that compare weights, from a state fitted at the first one.
+        trial: signal steps that compare weights, after the first quarter of those of the volume.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
-        whole_rate: learning rate of the volume; 1.2 times as much diverges on sparse objects of 96 voxels.
+        whole_rate: learning rate of the volume; 1.4 times as much diverges on sparse objects of 96 voxels.
         later_rate: learning rate of a slab that is not a rough start: the first steps of Adam are as large where little is left.
     """
 
@@ -63,10 +63,10 @@ class Schedule:
     candidate: int = 30
     adapt: int = 20
     refine: int = 20
-    trial: int = 30
-    whole: int = 100
+    trial: int = 50
+    whole: int = 150
     quiet: int = 240
-    whole_rate: float = 0.7
+    whole_rate: float = 0.6
     later_rate: float = 0.5
 
 
@@ -84,6 +84,7 @@ class FitStage:
         num_steps: optimisation steps; of each fit, where there are several.
         rate: learning rate of the signal, relative to a rough start's.
         half: at half the resolution.
+        afresh: start from the coarse reconstruction again.
         warm_up: the rate grows to its full size first: the first steps of Adam are as large where little is left.
         hold_offset: leave the offset as it is.
         standardise: measure the noise model's scaling first.
@@ -97,6 +98,7 @@ class FitStage:
     num_steps: int
     rate: float = 1.0
     half: bool = False
+    afresh: bool = False
     warm_up: bool = False
     hold_offset: bool = False
     standardise: bool = False
@@ -147,8 +149,13 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        how = {"rate": later, "warm_up": True, "hold_offset": hold, "fits": _TRIALS}
-        stages.append(FitStage("choose weight", "weights", "slab", noise, schedule.trial, **how))  # type: ignore[arg-type]
+        # trial and final fits share one schedule, because longer fits favour larger weights
+        rate, begin = schedule.whole_rate, schedule.whole // 4
+        again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
+        trials = FitStage(
+            "choose weight", "weights", "slab", noise, schedule.trial, rate=rate, hold_offset=hold, fits=_TRIALS
+        )
+        stages += [again, trials]
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -186,6 +193,8 @@ def describe(stages: Sequence[FitStage]) -> str:
             how.append(f"rate {stage.rate:g}")
         if stage.hold_offset:
             how.append("offset held")
+        if stage.afresh:
+            how.append("afresh")
         if stage.warm_up:
             how.append("warm-up")
         if stage.half:

@@ -98,6 +98,8 @@ class Runner:
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
+        if stage.afresh:
+            task.restart()
         if not stage.half:
             self.result = self._fit_signal(stage, task, stage.name)
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +35,15 @@ class Task:
     use: Tensor | None
     held_out: Tensor
     _tables: dict[nn.Module, TableKeeper] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._rough = copy.deepcopy(self.signal_model.state_dict())
+
+    def restart(self) -> None:
+        """Go back to the volume that the task began with; the detector's response stays as it was learnt."""
+        response = copy.deepcopy(self.signal_model.image_formation.state_dict())
+        self.signal_model.load_state_dict(self._rough)
+        self.signal_model.image_formation.load_state_dict(response)
 
     def tables(self, noise_model: nn.Module) -> TableKeeper:
         """The table of the pixels under a noise model, kept until the model changes."""

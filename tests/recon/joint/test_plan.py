@@ -24,10 +24,11 @@ PLANS = {
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   choose weight                weights     30 x 5  chosen, rate 0.5, warm-up
+        slab   begin again                  signal      37  simple, rate 0.6, afresh
+        slab   choose weight                weights     50 x 5  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
-        whole  begin                        signal      25  simple, rate 0.7
-        whole  fit                          signal      75  chosen, rate 0.7
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
@@ -38,8 +39,8 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.5, warm-up
         slab   refine noise                 noise       20  simple
-        whole  begin                        signal      25  simple, rate 0.7
-        whole  fit                          signal      75  simple, rate 0.7
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  simple, rate 0.6
         """,
     ),
     "everything chosen, large": (
@@ -50,27 +51,28 @@ PLANS = {
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   choose weight                weights     30 x 5  chosen, rate 0.5, warm-up
+        slab   begin again                  signal      37  simple, rate 0.6, afresh
+        slab   choose weight                weights     50 x 5  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
-        whole  begin                        signal      25  simple, rate 0.7, half resolution
-        whole  coarse                       signal      25  chosen, rate 0.7, half resolution
-        whole  fit                          signal      50  chosen, rate 0.7
+        whole  begin                        signal      37  simple, rate 0.6, half resolution
+        whole  coarse                       signal      37  chosen, rate 0.6, half resolution
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
         """
         whole  start noise                  noise       10  simple
-        whole  begin                        signal      25  simple, rate 0.7, half resolution
-        whole  coarse                       signal      25  chosen, rate 0.7, half resolution
-        whole  fit                          signal      50  chosen, rate 0.7
+        whole  begin                        signal      37  simple, rate 0.6, half resolution
+        whole  coarse                       signal      37  chosen, rate 0.6, half resolution
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      25  simple, rate 0.7
-        whole  fit                          signal      75  chosen, rate 0.7
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
     "quiet": (
@@ -81,11 +83,12 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.5, offset held, warm-up
         slab   refine noise                 noise       20  simple
-        slab   choose weight                weights     30 x 5  simple, rate 0.5, offset held, warm-up
+        slab   begin again                  signal      37  simple, rate 0.6, offset held, afresh
+        slab   choose weight                weights     50 x 5  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      60  simple, rate 0.7, offset held, half resolution
-        whole  coarse                       signal      60  simple, rate 0.7, offset held, half resolution
-        whole  fit                          signal      120  simple, rate 0.7, offset held
+        whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
+        whole  coarse                       signal      60  simple, rate 0.6, offset held, half resolution
+        whole  fit                          signal      120  simple, rate 0.6, offset held
         whole  describe noise               noise       20  chosen
         """,
     ),
