@@ -132,9 +132,9 @@ reconstruct {good}/tilts.mrc --angles {bad}/blank.tlt -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/words.tlt -o {out}/v.mrc | line 1
 reconstruct {good}/tilts.mrc --angles {bad}/binary.tlt -o {out}/v.mrc | binary.tlt
 reconstruct {good}/tilts.mrc --angles {bad}/short.tlt -o {out}/v.mrc | there are 2
-reconstruct {good}/tilts.mrc --angles {bad}/unknown.tlt -o {out}/v.mrc | within ±360
-reconstruct {good}/tilts.mrc --angles {bad}/huge.tlt -o {out}/v.mrc | within ±360
-reconstruct {good}/tilts.mrc --angles {bad}/far.tlt -o {out}/v.mrc | within ±360
+reconstruct {good}/tilts.mrc --angles {bad}/unknown.tlt -o {out}/v.mrc | within ±720
+reconstruct {good}/tilts.mrc --angles {bad}/huge.tlt -o {out}/v.mrc | within ±720
+reconstruct {good}/tilts.mrc --angles {bad}/far.tlt -o {out}/v.mrc | within ±720
 reconstruct {good}/tilts.mrc --angles {bad}/script.tlt -o {out}/v.mrc | is not an angle
 reconstruct {good}/one-tilt.npy -o {out}/v.mrc | images are flat
 reconstruct {good}/tilts.mrc --angles {bad}/same.tlt -o {out}/v.mrc | different angles

@@ -32,6 +32,11 @@ from recon.benchmarks.scenes import Results
 RESULTS = Path(__file__).parent / "results" / "joint.json"
 SPEED: dict[str, Callable[[], dict[str, Any]]] = {
     "joint": lambda: joint_speed.joint(96),
+    "chosen-64": lambda: joint_speed.chosen(64),
+    "chosen-96": lambda: joint_speed.chosen(96),
+    "chosen-256": lambda: joint_speed.chosen(256, repeats=1),
+    "low-dose": lambda: joint_speed.cropped("low-dose"),
+    "8-bit": lambda: joint_speed.cropped("8-bit"),
     "scaling": lambda: joint_speed.scaling([64, 96, 128, 192]),
     "scaling-quick": lambda: joint_speed.scaling([64, 96, 128]),
     "skipping-shells": lambda: joint_speed.skipping("shells", 96),

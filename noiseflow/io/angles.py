@@ -14,8 +14,8 @@ from noiseflow.io.image_file import ImageFile
 
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
-LARGEST_ANGLE = 360
-"""Degrees; series go from 0 to 180, or once around."""
+LARGEST_ANGLE = 720
+"""Degrees; two full turns are more than any stage counts, and what is beyond is no angle."""
 
 
 def read_angles(path: str | Path) -> NDArray[np.float64]:

@@ -153,10 +153,10 @@ def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
     make = partial(CoordinateNetwork, width=8, layers=2, frequencies=2, skip=0)
     grid = VolumeGrid.of(clean)
     first, second, plain = (
-        JointReconstructor(make_field=make, skip_vacuum=skip).prepare(clean, grid) for skip in (True, True, False)
+        JointReconstructor(make_field=make, skip_vacuum=skip).signal_model(clean, grid) for skip in (True, True, False)
     )
     assert plain.occupancy is None
     dense, _ = clean_tilt_series(np.ones((8, 16, 16), np.float32), np.arange(-60, 61, 20.0))
-    assert JointReconstructor().prepare(dense, VolumeGrid.of(dense, 8)).occupancy is None
+    assert JointReconstructor().signal_model(dense, VolumeGrid.of(dense, 8)).occupancy is None
     assert torch.equal(first.occupancy.mask, second.occupancy.mask)
     torch.testing.assert_close(first.field.volume(), second.field.volume(), rtol=0, atol=0)

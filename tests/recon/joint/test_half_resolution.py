@@ -12,6 +12,7 @@ from noiseflow import Gaussian
 from recon.benchmarks.scenes import make_scene
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
+from recon.fields.regularisers import TotalVariation
 from recon.joint import half_resolution
 from recon.joint.checkpoint import Journal
 from recon.joint.half_resolution import HalfResolution
@@ -77,7 +78,7 @@ def test_half_the_resolution_sees_the_same(shape, offset, occupancy):
 
 def test_total_variation_weighs_as_much():
     model = smooth_model((64, 64, 64))
-    model.smoothing = 1e-3
+    model.regulariser = TotalVariation(smoothing=1e-3)
     half = HalfResolution(model).signal_model
     assert float(half.penalty()) == pytest.approx(float(model.penalty()), rel=0.08)
 

@@ -1,0 +1,123 @@
+"""Every projector, field and regulariser keeps the contract of its kind."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from recon.fields.coordinate_network import CoordinateNetwork
+from recon.fields.fields import Field, MultiresolutionField, VoxelField
+from recon.fields.occupancy import Occupancy
+from recon.fields.regularisers import Regulariser, TotalVariation
+from recon.projection.base import Projector
+from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.projector import SliceProjector
+from recon.projection.tiles import Tiles
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+_ANGLES = np.array([-71.0, -20.0, 0.0, 33.0, 90.0])
+
+
+def in_focus():
+    return SliceProjector(tilt_angles=_ANGLES, depth=6, width=9, detector_width=11, dtype=torch.float64)
+
+
+PROJECTORS = {"slices": in_focus, "defocused": lambda: DefocusedProjector(in_focus(), 0.2)}
+
+
+class SumOfAttenuation(Regulariser):
+    """The plainest there is: the sum of attenuation, which is not negative."""
+
+    def __call__(self, volume, scale):
+        return volume.sum()
+
+
+FIELDS = {
+    "voxels": VoxelField,
+    "multiresolution": MultiresolutionField,
+    "network": lambda shape, scale: CoordinateNetwork(shape, scale=scale, width=8, layers=2, frequencies=3, skip=0),
+}
+REGULARISERS = {"total variation": TotalVariation, "sum": SumOfAttenuation}
+
+
+@pytest.mark.parametrize("name", PROJECTORS)
+def test_projector_contract(name):
+    A = PROJECTORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    volume = torch.rand(A.depth, 4, A.width, generator=generator, dtype=A.dtype)
+    images = torch.rand(A.num_tilts, 4, A.detector_width, generator=generator, dtype=A.dtype)
+    assert isinstance(A, Projector)
+    assert A(volume).shape == images.shape
+    assert float((A(volume) * images).sum()) == pytest.approx(float((volume * A.T(images)).sum()), rel=1e-10)
+    torch.testing.assert_close(A(2 * volume + 1), 2 * A(volume) + A(torch.ones_like(volume)))
+    volume.requires_grad_()
+    (slope,) = torch.autograd.grad((A(volume) * images).sum(), volume)
+    torch.testing.assert_close(slope, A.T(images))
+    with pytest.raises(ValueError, match="attenuation"):
+        A(volume[:, :, 1:])
+    if A.has_parts:
+        columns = torch.tensor([3, 17, 40])
+        some = torch.zeros(A.depth * A.width, 4, dtype=A.dtype)
+        some[columns] = torch.rand(3, 4, generator=generator, dtype=A.dtype)
+        matrix, transposed = A.part(columns)
+        torch.testing.assert_close(matrix @ some[columns], A.project(some))
+        rays = torch.rand(A.num_tilts * A.detector_width, 4, generator=generator, dtype=A.dtype)
+        torch.testing.assert_close(transposed @ rays, A.backproject(rays)[columns])
+    else:
+        with pytest.raises(ValueError, match="no parts"):
+            A.part(torch.tensor([0]))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_field_contract(name):
+    torch.manual_seed(0)
+    field = FIELDS[name]((6, 8, 10), scale=0.3)
+    assert isinstance(field, Field)
+    assert (field.depth, field.height, field.width) == (6, 8, 10)
+    rough = torch.zeros(3, 4, 5)
+    rough[1:, 1:3, 2:4] = 0.3
+    field.start_from(rough)
+    units = field.units()
+    assert units.shape == (6, 10, 8)
+    assert bool((units >= 0).all())
+    torch.testing.assert_close(field(), (units * field.scale).reshape(60, 8))
+    torch.testing.assert_close(field.volume(), (units * field.scale).transpose(1, 2).detach())
+    places = torch.tensor([0, 5, 479])
+    torch.testing.assert_close(field.at(places), units.reshape(-1)[places])
+    field().square().sum().backward()
+    assert all(p.grad is not None and math.isfinite(float(p.grad.sum())) for p in field.parameters())
+    tiles = some_tiles()
+    torch.testing.assert_close(tiles.spread(field.on(tiles)), field.units() * tiles.mask)
+    assert (field.coarser() is not None) == field.has_coarser
+
+
+def some_tiles():
+    projector = SliceProjector(tilt_angles=_ANGLES, depth=6, width=10)
+    rough = torch.zeros(6, 8, 10)
+    rough[2:4, 3:5, 4:7] = 1.0
+    return Tiles(Occupancy(rough, (6, 8, 10), margin=1).mask, projector)
+
+
+@pytest.mark.parametrize("name", REGULARISERS)
+def test_regulariser_contract(name):
+    cost = REGULARISERS[name]()
+    assert isinstance(cost, Regulariser)
+    assert "(" in repr(cost)
+    tiles = some_tiles()
+    values = torch.rand(tiles.filled.numel(), generator=torch.Generator().manual_seed(0)) * tiles.filled
+    values.requires_grad_()
+    volume = tiles.spread(values)
+    torch.testing.assert_close(cost(torch.zeros(3, 4, 5), 0.3), torch.zeros(()), atol=1e-6, rtol=0)
+    torch.testing.assert_close(cost(5 * volume, 1.5), 5 * cost(volume, 0.3))
+    torch.testing.assert_close(cost.of_tiles(values, tiles, 0.3), cost(volume, 0.3), rtol=1e-4, atol=1e-4)
+    (here,) = torch.autograd.grad(cost.of_tiles(values, tiles, 0.3), values)
+    (there,) = torch.autograd.grad(cost(tiles.spread(values), 0.3), values)
+    torch.testing.assert_close(here * tiles.filled, there * tiles.filled, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [Projector, Field, Regulariser])
+def test_contracts_are_abstract_for_real(kind):
+    with pytest.raises(TypeError, match="abstract"):
+        kind((2, 2, 2)) if kind is Field else kind()
