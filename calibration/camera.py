@@ -31,6 +31,9 @@ STEADY = 0.003
 LEAST_FRAMES = 8
 """Frames from which on a pixel's own variance is known to a factor of 1.5, so that a map of it tells something."""
 
+MAPS = ("response", "gain", "offset", "variance", "defects")
+"""Names of the maps; offset and variance need dark frames."""
+
 
 @described()
 @dataclass(frozen=True)
@@ -151,13 +154,18 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     )
 
 
+def map_path(model: Path, name: str) -> Path:
+    """Where the map of this name, one of `MAPS`, is written: beside the model file."""
+    return model.with_name(f"{model.stem}_{name}.tif")
+
+
 def write_maps(camera: Camera, model: Path) -> list[Path]:
     """Write each map as a 32-bit TIFF beside the model file; returns the paths."""
     from noiseflow.io import write
 
     paths = []
     for name, image in camera.maps.items():
-        path = model.with_name(f"{model.stem}_{name}.tif")
+        path = map_path(model, name)
         write(path, image.astype(np.float32))
         paths.append(path)
     return paths

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import DeviceOption, JsonOption, Output, SeedOption, choose_device, progress_bar
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    OverwriteOption,
+    SeedOption,
+    choose_device,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from calibration.detector.models import ModelScore
@@ -44,6 +52,7 @@ def calibrate(
         float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for report.html.")] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
@@ -51,18 +60,24 @@ def calibrate(
     """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
+    from calibration.camera import MAPS, map_path
     from calibration.detector.models import SIMPLE, require_kind
     from calibration.pipeline import saved_model
     from calibration.report.page import write_report
-    from noiseflow.io import check_folder, check_output
+    from noiseflow.io import check_folder, check_output, require_other
     from noiseflow.io.model_files import MODEL_SUFFIXES
 
-    check_output(output, suffixes=MODEL_SUFFIXES)
+    inputs = [*(short or []), *(long or []), *(dark or []), *(flat or [])]
+    check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
+    require_other(output, *inputs)
     if report is not None:
-        check_folder(report)
+        check_folder(report, holds=["report.html"], overwrite=overwrite)
     require_kind(kind)
     chosen_device = _device(device)
     if not short:
+        for path in (map_path(output, name) for name in MAPS):
+            check_output(path, overwrite=overwrite)
+            require_other(path, *inputs)
         _calibrate_camera(flat or [], dark or [], flat_time, dark_time, output, report, seed, Output(json))
         return
     if flat_time or dark_time:
@@ -82,7 +97,6 @@ def calibrate(
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
     model = saved_model(best.model, findings)
-    inputs = [*short, *(long or []), *(dark or []), *(flat or [])]
     page = None if report is None else write_report(report, findings, inputs=inputs, seed=seed)
     provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
     noiseflow.save(model, output, units="counts", provenance=provenance)

@@ -24,6 +24,10 @@ from noiseflow.io.partials import _prefix
 from recon.joint.state_files import discard_states, write_state
 from tests.processes import finish, start, wait_for
 
+CALIBRATE = (
+    "calibrate --flat {files}/flat200.npy --flat {files}/flat1000.npy --flat {files}/flat4000.npy --dark {files}/flat0.npy "
+    "-o {out}/camera.safetensors --report {out}/page"
+)
 WRITERS = {
     "sample {files}/model.safetensors {files}/clean.npy -o {out}/noisy.mrc": ["noisy.mrc"],
     "sample {files}/model.safetensors {files}/clean.npy -o {out}/noisy.npy": ["noisy.npy"],
@@ -34,6 +38,11 @@ WRITERS = {
         "new/tilts.rawtlt",
     ],
     "compare {files}/new/truth.mrc {files}/new/clean8.mrc --report {out}/page": ["page/index.html"],
+    "reconstruct {files}/new/tilts.mrc -o {out}/volume.mrc --method wbp": ["volume.mrc"],
+    "reconstruct {files}/new/tilts.mrc -o {out}/volume.npy --method wbp --report {out}/page": ["page/index.html"],
+    "reconstruct {files}/new/tilts.mrc -o {out}/volume.tif --method l2 --weight 0.4 --steps 3 "
+    "--save-noise-model {out}/noise.safetensors": ["noise.safetensors"],
+    CALIBRATE: ["camera.safetensors", "page/report.html", "camera_offset.tif"],
 }
 
 
@@ -42,6 +51,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
     noiseflow.save(noiseflow.Gaussian(0.1), folder / "model.safetensors")
     io.write(folder / "clean.npy", np.ones((9, 8), np.float32))
+    generator = np.random.default_rng(2)
+    for level in (0, 200, 1000, 4000):
+        frames = 100 + 2 * (generator.poisson(level, (4, 32, 32)) + 3 * generator.standard_normal((4, 32, 32)))
+        io.write(folder / f"flat{level}.npy", np.round(frames).astype(np.uint16))
     finish(["simulate", folder / "new", "--size", 16, "--tilts=-60:60:10"], folder / "log")
     truth = io.read(folder / "new" / "truth.mrc").data
     io.write(
@@ -225,7 +238,7 @@ def test_a_noise_model_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None
     assert [file.name for file in tmp_path.iterdir()] == ["model.safetensors"]
 
 
-@pytest.mark.parametrize("name", ["sample", "simulate", "compare", "demo"])
+@pytest.mark.parametrize("name", ["calibrate", "compare", "demo", "reconstruct", "sample", "simulate"])
 def test_commands_that_write_say_how_to_overwrite(name: str, capsys) -> None:
     with pytest.raises(SystemExit):
         main([name, "-h"])

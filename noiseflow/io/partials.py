@@ -40,11 +40,19 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     try:
         folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=_prefix(path.stem), suffix=path.suffix + _ENDING))
     except FileNotFoundError as error:
-        raise FileNotFoundError(errno.ENOENT, "the output folder does not exist any more", str(path.parent)) from error
+        raise _gone(path.parent) from error
     try:
         yield folder
+    except FileNotFoundError as error:
+        if path.parent.is_dir():
+            raise
+        raise _gone(path.parent) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _gone(folder: Path) -> FileNotFoundError:
+    return FileNotFoundError(errno.ENOENT, "the output folder does not exist any more", str(folder))
 
 
 def clear_leftovers(path: Path) -> None:

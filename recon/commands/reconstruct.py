@@ -13,12 +13,14 @@ from noiseflow.commands.console import (
     DeviceOption,
     JsonOption,
     Output,
+    OverwriteOption,
     SeedOption,
     choose_device,
     step_report,
 )
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import memory_line, open_journal, scratch_beside, stoppable, warnings_as_lines
+from recon.methods._names import method_names
 
 if TYPE_CHECKING:
     from recon.joint.checkpoint import Journal
@@ -42,9 +44,7 @@ def reconstruct(
     transforms: Annotated[Path | None, typer.Option(help="IMOD's .xf alignment to apply to the stack.")] = None,
     method: Annotated[
         str,
-        typer.Option(
-            help="auto, joint, joint-supervised, l2, l1, tv, explicit, l2-denoised, wbp-denoised, sirt or wbp."
-        ),
+        typer.Option(help=f"One of {', '.join(method_names())}."),
     ] = "auto",
     preset: Annotated[
         str | None,
@@ -61,7 +61,11 @@ def reconstruct(
         typer.Option(help="Of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen by itself if not given."),
     ] = None,
     denoiser: Annotated[
-        str, typer.Option(help="Of the denoised methods: nlm, tv, wavelet, wiener, bm3d, or package.module:function.")
+        str,
+        typer.Option(
+            help="Of the denoised methods: nlm, tv, wavelet, wiener, bm3d, or one of your own, package.module:function "
+            "(module:function runs that code)."
+        ),
     ] = "nlm",
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
     save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
@@ -107,6 +111,10 @@ def reconstruct(
         bool,
         typer.Option("--dry-run", help="Print the plan with its memory and expected time, and stop before fitting."),
     ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit with an error if the verdict is bad; the volume is still written.")
+    ] = False,
+    overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
@@ -115,15 +123,18 @@ def reconstruct(
 
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
-    from noiseflow.io import require_other
+    from noiseflow.io import locked, require_other
     from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.methods import find_method, settings_of
     from recon.report.page import read_reference
     from recon.series.tilt_series import VolumeGrid
 
-    output, targets = Output(json), Targets(out, report=report, noise_model=save_noise_model)
-    require_other(out, tilts, angles, transforms, mask, reference)
+    output = Output(json)
+    targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite)
+    require_other(out, tilts, angles, transforms, mask, reference, noise_model)
+    if save_noise_model is not None:
+        require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
@@ -134,7 +145,7 @@ def reconstruct(
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
         raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
-    with warnings_as_lines(output) as warned:
+    with locked(out), warnings_as_lines(output) as warned:
         fixed = load_noise_model(noise_model)
         tilt_series = load_tilt_series(
             tilts,
@@ -174,7 +185,7 @@ def reconstruct(
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch}
             with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
-            targets.write(
+            verdict = targets.write(
                 output,
                 tilt_series,
                 outcome,
@@ -186,7 +197,9 @@ def reconstruct(
                 reference=truth,
                 warned=warned,
             )
-    journal.discard()
+        journal.discard()
+    if strict and verdict.grade == "bad":
+        raise ValueError(f"--strict: the verdict is bad, though {out} is written. {verdict.reasons[0]}")
 
 
 def _solve(

@@ -30,21 +30,23 @@ class Targets:
         volume: the volume's file.
         report: folder of the HTML report, or None.
         noise_model: file for the learnt noise model, or None.
+        overwrite: replace existing files even if this program did not write them.
 
     Raises:
-        ValueError, OSError: as `noiseflow.io.check_output`.
+        ValueError, OSError: as `noiseflow.io.check_output` and `noiseflow.io.check_folder`.
     """
 
     volume: Path
     report: Path | None = None
     noise_model: Path | None = None
+    overwrite: bool = False
 
     def __post_init__(self) -> None:
-        io.check_output(self.volume)
+        io.check_output(self.volume, overwrite=self.overwrite)
         if self.noise_model is not None:
-            io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES)
+            io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
         if self.report is not None:
-            io.check_folder(self.report)
+            io.check_folder(self.report, holds=["index.html"], overwrite=self.overwrite)
 
     def write(
         self,

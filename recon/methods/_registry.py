@@ -1,4 +1,4 @@
-"""What a method of reconstruction is, and where methods are found: every module of this folder without an underscore is one."""
+"""What a method of reconstruction is, and how one is found by its name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,11 @@ from noiseflow.plugins import load_plugin, plugins
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
+from recon.methods._names import GROUP, method_names
 from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Images, Solve, solve_in_blocks
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-
-_GROUP = "noiseflow.methods"
 
 
 @described()
@@ -107,13 +105,6 @@ class Method:
     blockwise: Blockwise | None = None
 
 
-def method_names() -> list[str]:
-    """All methods, without importing any: those of this package, then those of others (entry points ``noiseflow.methods``)."""
-    own = [module.name for module in iter_modules([str(Path(__file__).parent)]) if not module.name.startswith("_")]
-    names = sorted(name.replace("_", "-") for name in own)
-    return ["auto", *(name for name in names if name != "auto"), *sorted(plugins(_GROUP))]
-
-
 @cache
 def find_method(name: str) -> Method:
     """The method of a name.
@@ -123,7 +114,7 @@ def find_method(name: str) -> Method:
     """
     if name not in method_names():
         raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
-    other = plugins(_GROUP).get(name)
+    other = plugins(GROUP).get(name)
     found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; a method is a recon.methods.Method")

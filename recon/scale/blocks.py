@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.files import reserve
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 Images = NDArray[np.float32]
@@ -37,8 +38,12 @@ def solve_in_blocks(
 
     Returns:
         The volume, mapped to memory, and the projections (tilt, y, u), in a file that is gone when they are let go of.
+
+    Raises:
+        OSError: the disk has no room for the volume.
     """
     volume = np.lib.format.open_memmap(scratch, "w+", np.float32, grid.shape)
+    reserve(scratch, scratch.stat().st_size)
     with tempfile.TemporaryFile(dir=scratch.parent) as file:
         projections = np.memmap(file, np.float32, "w+", shape=tilt_series.images.shape)
     for rows in blocks(grid.height, slices_at_once):
