@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
 from torch import nn
 
-from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation, fit
+from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
 from recon.benchmarks.defocus import STRENGTH, defocused_scene
 from recon.benchmarks.external import missing
 from recon.benchmarks.network import WIDTHS, fit_network
@@ -19,6 +19,8 @@ from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, 
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace
+from recon.joint.plan import Schedule
+from recon.joint.run import RunFit, run_fit
 from recon.metrics.metrics import compare
 
 WEIGHT = 0.4
@@ -134,7 +136,7 @@ def _flow(scene: Scene, layers: int = 8, *, mean_preserving: bool = True, digiti
     return Digitised(flow, *digitisation) if digitised and digitisation.found else flow
 
 
-def _with_flow(scene: Scene, run_fit: Callable[..., Any] = fit, **options: Any) -> Best:
+def _with_flow(scene: Scene, run_fit: RunFit = run_fit, **options: Any) -> Best:
     return _once(scene, noise_model=partial(_flow, scene, **options), weight=WEIGHT, run_fit=run_fit)
 
 
@@ -146,12 +148,11 @@ def _layers(scene: Scene) -> list[Variant]:
 
 
 def _parts(scene: Scene) -> list[Variant]:
-    untabulated = partial(fit, tabulate=False)
     variants: dict[str, Callable[[], Best]] = {
         "as it is": partial(_with_flow, scene),
         "mean not preserved": partial(_with_flow, scene, mean_preserving=False),
         "clipping ignored": partial(_with_flow, scene, digitised=False),
-        "likelihood not tabulated": partial(_with_flow, scene, run_fit=untabulated),
+        "likelihood not tabulated": partial(_with_flow, scene, run_fit=partial(run_fit, tabulate=False)),
     }
     return [Variant("parts", name, make, scene) for name, make in variants.items()]
 
@@ -177,7 +178,20 @@ def _skipping(scene: Scene) -> list[Variant]:
     ]
 
 
-GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
+def _schedule(scene: Scene) -> list[Variant]:
+    """Half and twice of every number of steps and every learning rate of the plan."""
+    usual, found = Schedule(), [Variant("schedule", "as it is", partial(_once, scene), scene)]
+    for each in fields(usual):
+        value = getattr(usual, each.name)
+        for changed in (value // 2, value * 2) if isinstance(value, int) else (value / 2, value * 1.5):
+            schedule = replace(usual, **{each.name: changed})
+            found.append(
+                Variant("schedule", f"{each.name} {changed:g}", partial(_once, scene, schedule=schedule), scene)
+            )
+    return found
+
+
+GROUPS = (_likelihoods, _schedule, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
 """What changes, on one scene."""
 
 
