@@ -178,7 +178,7 @@ class Perfect:
 
     def __call__(self, tilt_series, grid=None):
         volume = Volume(self.scene.truth * np.float32(0.9), None)
-        return SimpleNamespace(volume=volume, signal_model=SimpleNamespace(weight=0.2))
+        return SimpleNamespace(volume=volume, weight=0.2)
 
 
 def test_paper_table_has_every_method(tmp_path, monkeypatch):
