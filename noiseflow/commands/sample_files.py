@@ -54,13 +54,20 @@ def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress
     return torch.cat(drawn)
 
 
-def read_any(path: Path) -> tuple[NDArray[Any], Any]:
-    """The numbers of a file and its voxel size; a NumPy file may have any number of axes."""
+def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
+    """The numbers of a file and its voxel size; from one ``.npy`` file to another there may be any number of axes.
+
+    Raises:
+        ValueError: as `noiseflow.io.read`.
+    """
     from noiseflow import io
 
-    if path.suffix.lower() == ".npy" and path.is_file():
-        data = np.load(path, mmap_mode="r", allow_pickle=False)
-        if data.ndim > 3 and data.dtype.kind in "buif":
+    if path.suffix.lower() == output.suffix.lower() == ".npy" and path.is_file():
+        try:
+            data = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, OSError, EOFError):  # a damaged file, of which io.read says what is wrong
+            data = None
+        if data is not None and data.ndim > 3 and data.dtype.kind in "buif":
             return data, None
     image = io.read(path)
     return image.data, image.voxel_size

@@ -51,7 +51,7 @@ def sample(
     io.require_other(output, clean)
     io.check_output(output, overwrite=overwrite)
     sample_files.check_dtype(dtype)
-    data, voxel_size = sample_files.read_any(clean)
+    data, voxel_size = sample_files.read_any(clean, output)
     io.require_finite(data, clean)
     noise_model = as_noise_model(noiseflow.load(model).to(choose_device(device)))
     pieces = sample_files.pieces(noise_model, _tensor(data))
