@@ -97,3 +97,18 @@ def test_bad_options_give_one_clear_line(series, tmp_path, arguments, words):
 def test_output_that_cannot_be_written_is_refused_before_the_work(series, tmp_path):
     with pytest.raises(FileNotFoundError, match="create the folder"):
         run_command("reconstruct", series / "tilts.mrc", "-o", tmp_path / "none" / "out.mrc")
+
+
+def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_path):
+    run_command("simulate", tmp_path / "new", "--size", 24)
+    angles = np.random.default_rng(0).permutation(io.read_angles(tmp_path / "new" / "tilts.rawtlt"))
+    np.savetxt(tmp_path / "wrong.tlt", angles, fmt="%.2f")
+    out = tmp_path / "volume.mrc"
+    words = ["reconstruct", tmp_path / "new" / "tilts.mrc", "-o", out, "--method", "sirt", "--strict", "--angles"]
+    assert run_command(*words, tmp_path / "new" / "tilts.rawtlt")["verdict"]["grade"] == "good"
+    out.unlink()
+    with pytest.raises(
+        ValueError, match=r"--strict: the verdict is bad, though .* is written\. Check axis, shifts and angles"
+    ):
+        run_command(*words, tmp_path / "wrong.tlt")
+    assert io.read(out).data.shape == (24, 24, 24)
