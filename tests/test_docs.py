@@ -86,6 +86,10 @@ def public_names(module: ModuleType) -> set[str]:
     """What a package exports, or what a module (or a folder of modules) defines."""
     if module.__name__ in PACKAGES:
         return {name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)}
+    stub = Path(str(module.__file__)).with_suffix(".pyi")
+    if stub.is_file():  # it names what is public, whichever file defines it
+        names = set(re.findall(r" as (\w+)$", stub.read_text(encoding="utf-8"), flags=re.MULTILINE))
+        return {name for name in names if callable(getattr(module, name))}
     homes = {name: f"{getattr(getattr(module, name), '__module__', '')}." for name in dir(module)}
     return {name for name, home in homes.items() if home.startswith(f"{module.__name__}.") and name[0] != "_"}
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow.commands import console
-from noiseflow.commands import sampling as commands
+from noiseflow.commands import console, sample_files
 from noiseflow.commands.cli import main
 from tests.bad_files import ANGLES, make_good_files
 
@@ -46,7 +45,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images are sampled in several pieces, as large ones are."""
-    monkeypatch.setattr(commands, "_PIECE", 1000)
+    monkeypatch.setattr(sample_files, "_PIECE", 1000)
 
 
 def words(name: str, good: Path, out: Path) -> list[str]:

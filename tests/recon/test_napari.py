@@ -66,11 +66,12 @@ def test_layer_is_reconstructed_with_progress(needle):
         method="tv",
         thickness=16,
         num_steps=8,
-        progress=lambda done, note: steps.append(done),
+        progress=lambda done, total, note: steps.append((done, total)),
     )
     assert volume.shape == (16, 6, 64)
     assert result["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][-1]] * 3)
-    assert steps[-1] == 8
+    assert steps[-1][0] == steps[-1][1]
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
 
 
 def test_layer_without_angles_is_refused_with_the_fix():
