@@ -192,12 +192,14 @@ class JointReconstructor:
     def _facts(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[Facts, slice, nn.Module | None]:
         """What is known before any fit, the slices that choices are made on, and the noise model that was given."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        quiet = given is None and noise_share(tilt_series.images) < _QUIET
+        learning = given is None or (learns(given) and not isinstance(given, Gaussian))
+        quiet = learning and noise_share(tilt_series.images) < _QUIET
+        described = quiet and given is None  # by a noise model that no fit of the volume sees
         rows = contrast_slab(tilt_series, self._num_slices(whole.field))
         facts = Facts(
-            choose_noise=given is None and not quiet,
+            choose_noise=given is None and not described,
             learn_noise=given is None or learns(given),
-            simple_is_final=quiet or isinstance(given, Gaussian),
+            simple_is_final=described or isinstance(given, Gaussian),
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
@@ -212,7 +214,7 @@ class JointReconstructor:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             candidates = noise_candidates(tilt_series.images, quiet=facts.quiet) if given is None else []
-        if facts.quiet:
+        if facts.quiet and given is None:
             simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)

@@ -24,10 +24,10 @@ class Facts:
         choose_weight: whether the weight of the regulariser is chosen.
         can_halve: whether the field has a voxel grid half as fine that is worth using.
         settled: whether noise model, weight and response are known from other slices of the same series.
-        quiet: whether the noise model is chosen, and noise is small beside the contrast: most of what a fit leaves is then
-            misfit, which a width that follows the signal would excuse where it is bright. The volume is fitted by least squares,
-            weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and the noise model describes
-            what is left.
+        quiet: whether noise is small beside the contrast, and the noise model learns: most of what a fit leaves is then misfit,
+            which a width that follows the signal would excuse where it is bright. Where the noise model is not given, the volume
+            is fitted by least squares, weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and
+            the noise model describes what is left; one that is given takes over at three quarters of the steps.
         hold_offset: whether the offset of a linear response stays as the coarse reconstruction found it: without noise, a haze
             over a lower offset looks as good as vacuum to least squares, and absorbs misfit.
     """
@@ -126,7 +126,7 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
         stages.append(FitStage("start noise", "noise", "whole", "simple", _START, standardise=True))
     usual = schedule.quiet if facts.quiet else schedule.whole
     stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps)
-    if facts.quiet and not facts.settled:
+    if facts.quiet and facts.simple_is_final and not facts.settled:
         stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.refine, standardise=True))
     return stages
 
@@ -165,6 +165,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     """From the coarse reconstruction again, under what is chosen: steps under other noise or another weight leave traces."""
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
     quarter, stages = num_steps // 4, list[FitStage]()
+    taken_over = facts.quiet and not facts.simple_is_final
 
     def add(name: str, model: Noise, steps: int, *, half: bool = False) -> None:
         rate, hold = schedule.whole_rate, facts.hold_offset
@@ -173,8 +174,11 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     if quarter:  # the simple noise pulls at a rough signal steadily
         add("begin", "simple", quarter, half=facts.can_halve)
     if quarter and facts.can_halve:
-        add("coarse", noise, quarter, half=True)
-    add("fit", noise, num_steps - sum(stage.num_steps for stage in stages))
+        add("coarse", "simple" if taken_over else noise, quarter, half=True)
+    if quarter and taken_over:
+        add("go on", "simple", 3 * quarter - sum(stage.num_steps for stage in stages))
+        stages.append(FitStage("learn noise on the volume", "noise", "whole", noise, schedule.refine, standardise=True))
+    add("fit", noise, num_steps - sum(stage.num_steps for stage in stages if stage.kind == "signal"))
     return stages
 
 

@@ -75,6 +75,20 @@ PLANS = {
         whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
+    "quiet, noise model given": (
+        Facts(choose_noise=False, choose_weight=False, quiet=True, hold_offset=True),
+        """
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   learn noise                  noise       20  chosen
+        slab   adapt                        signal      20  chosen, rate 0.5, offset held, warm-up
+        slab   refine noise                 noise       20  chosen
+        whole  begin                        signal      60  simple, rate 0.6, offset held
+        whole  go on                        signal      120  simple, rate 0.6, offset held
+        whole  learn noise on the volume    noise       20  chosen
+        whole  fit                          signal      60  chosen, rate 0.6, offset held
+        """,
+    ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, can_halve=True),
         """
