@@ -107,8 +107,9 @@ def _sums(
     inside = positive & (mode > 0)
     safe_mode = torch.where(inside, mode, torch.ones_like(mode))
     log_rate, growth = torch.log(safe), (2 * gap - 1) / (2 * variance)
-    up = torch.exp(log_rate + growth - torch.log(mode + 1)) * positive
-    down = torch.exp(torch.log(safe_mode) - log_rate - 1 / variance - growth) * inside
+    # filled, not multiplied by 0: far from the mode an unused ratio is infinite
+    up = torch.exp(log_rate + growth - torch.log(mode + 1)).masked_fill(~positive, 0)
+    down = torch.exp(torch.log(safe_mode) - log_rate - 1 / variance - growth).masked_fill(~inside, 0)
     stretch = torch.exp(offset / variance)
     above = up * stretch
     below = torch.div(down, stretch, out=stretch)

@@ -19,6 +19,7 @@ from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixels import FitPixels, thinned
 from noiseflow.fitting.steps import adam, take_step
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation
 
 Progress = Callable[[int, str], None]
@@ -78,7 +79,7 @@ class FitLoop:
 
     def __init__(
         self,
-        noise_model: nn.Module,
+        noise_model: NoiseModelBase,
         signal_model: nn.Module,
         pixels: FitPixels,
         result: FitResult,
@@ -108,10 +109,10 @@ class FitLoop:
             train_noise: whether the noise model learns.
             parameter_groups: of the signal model, in place of its own.
         """
-        if standardise and hasattr(self.noise_model, "standardise"):
+        if standardise:
             with torch.no_grad():
                 pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
-                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])  # type: ignore[operator]
+                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])
         noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]
         self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
         self.signal_optimiser = None
@@ -246,11 +247,11 @@ class FitLoop:
     def _compute_fixed_part(self) -> Tensor | None:
         """What of every pixel's likelihood no step can change, where the noise model knows such a thing."""
         pixels = torch.cat([self.pixels.train, self.pixels.judge])
-        if not hasattr(self.noise_model, "fixed_part") or pixels.numel() > _FIXED_COUNT:
+        if pixels.numel() > _FIXED_COUNT:
             return None
         fixed: Tensor | None = None
         for part in torch.split(pixels, 32768):
-            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[operator]
+            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[arg-type]
             if found is None:
                 return None
             if fixed is None:
@@ -279,12 +280,12 @@ class FitLoop:
         """Log-likelihood of each pixel, or of each line, (P,)."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
-        found: Tensor
         if self.fixed_part is not None:
-            found = self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[operator]
-            return found
+            return self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[arg-type]
         distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
-        found = distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
+        found: Tensor = (
+            distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
+        )
         return found
 
     def _count(self, pixels: Tensor) -> int:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
 from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.numerical import as_noise_distribution
 
 
 class Described(nn.Module):
@@ -62,7 +63,7 @@ class NoiseModelBase(Described, ABC):
         """As `forward`; numbers and arrays of any library are taken too, and the distribution then takes and gives arrays."""
         if is_array(signal):
             return distribution_of_array(self, signal, needs_image=self.needs_image)
-        return super().__call__(signal)
+        return as_noise_distribution(super().__call__(signal))
 
     # What the model looks at
 

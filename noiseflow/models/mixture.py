@@ -135,7 +135,7 @@ class MixtureDistribution(NoiseDistribution):
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
         """The model and the signal, where the model allows tables."""
-        return (self._model, self.signal) if getattr(self._model, "tabulate", False) else None
+        return (self._model, self.signal) if self._model.tabulate else None
 
     @property
     def _components(self) -> tuple[Tensor, Tensor, Tensor]:

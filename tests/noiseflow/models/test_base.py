@@ -104,7 +104,7 @@ def test_no_trait_is_looked_up_by_name() -> None:
     """A trait that is looked up by ``getattr`` or ``hasattr`` is one that the base does not declare."""
     traits = {name for name in vars(noiseflow.NoiseModelBase) if not name.startswith("_")}
     for folder in ("models", "fitting", "interop", "commands", "io"):
-        for file in set((ROOT / folder).glob("*.py")) - {ROOT / "fitting" / "loop.py"}:
+        for file in (ROOT / folder).glob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 named = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1
                 if named and node.func.id in ("getattr", "hasattr") and isinstance(node.args[1], ast.Constant):
