@@ -112,13 +112,13 @@ class NoiseDistribution(Pixels, Distribution):
         return self.cast(-self.expectation(self.log_prob))
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
-        """E[function(observation)] by quadrature, shape of the batch; the function takes observations (Q, *batch)."""
+        """E[function(observation)] by quadrature, shape of the batch; the function takes observations ``(Q, *batch)``."""
         nodes, weights = self.quadrature()
         values = function(nodes)  # infinite at impossible ones
         return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        """Nodes and weights (Q, *batch) of expectations: Gauss–Legendre's rule on panels between far quantiles."""
+        """Nodes and weights ``(Q, *batch)`` of expectations: Gauss–Legendre's rule on panels between far quantiles."""
         ends = (
             self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())),
             self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)),
@@ -126,7 +126,7 @@ class NoiseDistribution(Pixels, Distribution):
         return self.panels(ends[0].double(), ends[1].double(), _PANELS)
 
     def panels(self, low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Nodes and weights (4·count, *batch) of the integral over the density between two bounds."""
+        """Nodes and weights ``(4·count, *batch)`` of the integral over the density between two bounds."""
         nodes, lengths = panels(low.detach(), high.detach(), count)
         weights = lengths * torch.exp(self.log_prob(nodes))
         return nodes, weights / weights.detach().sum(0)

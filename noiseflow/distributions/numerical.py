@@ -208,7 +208,7 @@ class NumericalDistribution(NoiseDistribution):
     @property
     @torch.no_grad()
     def error(self) -> Tensor:
-        """How far CDF and masses of intervals may be wrong: |∫ p − 1| over all observations, shape of the batch."""
+        """How far CDF and masses of intervals may be wrong: ``|∫ p − 1|`` over all observations, shape of the batch."""
         if self.discrete:
             return (torch.exp(self.log_masses(self._numbers())).sum(0) - 1).abs()
         infinity = torch.full(self.batch_shape, math.inf).to(self._known_mean)

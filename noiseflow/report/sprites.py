@@ -26,7 +26,8 @@ class Sprites:
         shape: (section, y, x) as stored.
         original: (section, y, x) before it was made smaller.
         columns, per_sheet: layout.
-        low, high: detector or volume units of the grey values 0 and 255.
+        low: detector or volume units of the grey value 0.
+        high: of the grey value 255.
         lossless: whether the sheets hold the 8-bit values exactly.
     """
 

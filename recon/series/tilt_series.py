@@ -92,7 +92,11 @@ class TiltSeries:
         return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
-        """The series of some of its tilts, by index, boolean mask or slice."""
+        """The series of some of its tilts, by index, boolean mask or slice.
+
+        Evenly spaced tilts are views of the images, so mapped ones stay on the disk.
+        """
+        tilts = evenly(tilts, self.num_tilts)
         mask = None if self.mask is None else self.mask[tilts]
         beam = None if self.beam is None else self.beam[tilts]
         return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
@@ -264,6 +268,17 @@ def write_angles(path: Path, tilt_angles: NDArray[np.floating[Any]]) -> Path:
     with io.atomic_path(path) as partial:
         partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_angles), encoding="utf-8")
     return path
+
+
+def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
+    """The same tilts, as a slice where they are evenly spaced and ascending."""
+    if isinstance(tilts, slice):
+        return tilts
+    numbers = np.arange(count)[tilts]
+    steps = np.unique(np.diff(numbers))
+    if len(numbers) < 2 or len(steps) != 1 or steps[0] < 1:
+        return tilts
+    return slice(int(numbers[0]), int(numbers[-1]) + 1, int(steps[0]))
 
 
 def _require_several_views(images: NDArray[Any]) -> None:

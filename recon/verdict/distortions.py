@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +48,8 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
     The errors are White's (doi:10.2307/1912934): noise need be neither Gaussian nor of one width. Fitted volumes take part of a
     distortion into themselves, so what is found is a lower bound.
     """
-    estimates, errors = zip(*(_of_tilt(*pair) for pair in _fields(residuals)), strict=True)
+    found = [_of_tilt(*pair) for pair in _fields(residuals)]
+    estimates, errors = zip(*found, strict=True)
     units = _units(residuals)
     return {
         name: _over_tilts(np.array(estimates)[:, number] * unit, np.array(errors)[:, number] * unit, residuals)
@@ -61,11 +63,10 @@ def _units(residuals: Residuals) -> tuple[float, ...]:
     return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30)
 
 
-def _fields(residuals: Residuals) -> list[tuple[Array, Array]]:
-    """For each tilt, the columns of the regression and what they shall explain."""
+def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
+    """For each tilt in turn, the columns of the regression and what they shall explain."""
     width = residuals.images.shape[2]
     across, along = np.arange(width, dtype=np.float64) - (width - 1) / 2, residuals.height[:, None].astype(np.float64)
-    found = []
     by_angle = _slope_over_tilts(residuals)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
@@ -73,8 +74,7 @@ def _fields(residuals: Residuals) -> list[tuple[Array, Array]]:
         columns = (down, right, along * down + across * right, along * right - across * down)
         brightness = image - image.mean()
         parts = [*columns, by_angle[tilt], brightness, np.ones_like(image)]
-        found.append((np.stack([part.ravel() for part in parts], 1), residual.ravel().astype(np.float64)))
-    return found
+        yield np.stack([part.ravel() for part in parts], 1), residual.ravel().astype(np.float64)
 
 
 def _slope_over_tilts(residuals: Residuals) -> Array:

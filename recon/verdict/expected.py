@@ -14,10 +14,10 @@ from recon.verdict.verdict import Result
 _LEVELS = 256  # signals at which the mean is computed; between them it is interpolated
 
 
-def expected_images(result: Result) -> NDArray[np.float32]:
-    """Means of the noise model at the projections (tilt, y, u), detector units; the projections where there is none."""
+def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.float32]:
+    """Means of the noise model at the projections (tilt, y, u) of some rows, detector units; without a noise model, the projections."""
     model: nn.Module | None = getattr(result, "noise_model", None)
-    projections = np.asarray(result.projections, dtype=np.float32)
+    projections = np.asarray(result.projections, dtype=np.float32)[:, rows]
     if model is None:
         return projections
     low, high = float(projections.min()), float(projections.max())

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from recon.projection.projector import _joseph
 
@@ -52,9 +52,10 @@ class GapFit:
         self.detector_width, self.gaps = detector_width, contiguous_gaps(angles, gap)
         normal = matrix.T @ matrix
         prior = _roughness(depth, width)
-        scale = smoothness * float(np.trace(normal[:-1, :-1])) / float(np.trace(prior))
-        normal[:-1, :-1] += np.float32(scale) * prior
-        factor = linalg.cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
+        scale = smoothness * float(np.trace(normal[:-1, :-1])) / float(prior.data[prior.row == prior.col].sum())
+        normal[prior.row, prior.col] += np.float32(scale) * prior.data
+        # symmetric: the transpose is in the order of LAPACK, which then copies nothing
+        factor = linalg.cholesky(normal.T, lower=True, overwrite_a=True, check_finite=False)
         self.half = linalg.solve_triangular(factor, matrix.T, lower=True, overwrite_b=True, check_finite=False)
         self.inverse = [self._inverse(tilts) for tilts in self.gaps]
 
@@ -117,15 +118,15 @@ def unexplained(images: Array, errors: Array) -> Unexplained:
     return Unexplained(shared(errors) / whole, float(np.mean(errors**2)) / np.sqrt(errors.size) / whole)
 
 
-def _roughness(depth: int, width: int) -> Array:
-    """Squared gradient of a (depth, width) slice as a matrix, and a little of its square."""
+def _roughness(depth: int, width: int) -> sparse.coo_array:
+    """Squared gradient of a (depth, width) slice as a sparse matrix of distinct entries, and a little of its square."""
 
     def line(size: int) -> Array:
         steps = np.diff(np.eye(size), axis=0)
         return steps.T @ steps
 
-    matrix = np.kron(line(depth), np.eye(width)) + np.kron(np.eye(depth), line(width))
-    return np.asarray(matrix + _RIDGE * np.eye(depth * width), dtype=np.float32)
+    matrix = sparse.kron(line(depth), sparse.eye_array(width)) + sparse.kron(sparse.eye_array(depth), line(width))
+    return sparse.coo_array((matrix + _RIDGE * sparse.eye_array(depth * width)).tocsr().astype(np.float32))
 
 
 def _to_rays(images: Array) -> Array:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
+from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means
+from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import distortions
 from recon.verdict.expected import expected_images
@@ -26,6 +27,7 @@ from recon.verdict.tilts import tilt_findings
 from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
+_TALL = 4  # widths: of a taller series so many slices are judged, because the rest may not fit into memory
 _CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
 
 
@@ -53,8 +55,9 @@ def judge(
             "with the tilt series that it was made from"
         )
     shape = np.shape(result.volume.attenuation)
-    grid = VolumeGrid(shape[0], shape[1], shape[2])
-    expected = expected_images(result)
+    rows = contrast_slab(tilt_series, _TALL * tilt_series.images.shape[2])
+    grid = VolumeGrid(shape[0], rows.stop - rows.start, shape[2])
+    tilt_series, expected = tilt_series.rows(rows), expected_images(result, rows)
     residuals = Residuals.of(tilt_series, expected)
     coarse = coarse_series(tilt_series, grid)
     geometry = Geometry(coarse)
@@ -81,7 +84,7 @@ def _gaps(
 ) -> tuple[Unexplained, Unexplained]:
     """What left-out gaps leave of the images, and what they leave of the volume's own projections, which are consistent."""
     some = tilt_series.select(coarse.tilts)
-    own = line_integrals(some, expected[coarse.tilts], coarse.binning)
+    own = line_integrals(some, expected[evenly(coarse.tilts, len(expected))], coarse.binning)
     return unexplained(coarse.images, geometry.errors), unexplained(own, geometry.fit.errors(own))
 
 

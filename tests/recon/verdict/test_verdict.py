@@ -99,7 +99,7 @@ def _dense(angles: Any, depth: int, width: int) -> Any:
 def _prior(angles: Any, depth: int, width: int, smoothness: float) -> Any:
     from recon.verdict.gap_fit import _roughness
 
-    matrix, rough = _dense(angles, depth, width)[:, :-1], _roughness(depth, width).astype(np.float64)
+    matrix, rough = _dense(angles, depth, width)[:, :-1], _roughness(depth, width).toarray().astype(np.float64)
     prior = np.zeros((depth * width + 1,) * 2)
     prior[:-1, :-1] = smoothness * np.trace(matrix.T @ matrix) / np.trace(rough) * rough
     return prior
