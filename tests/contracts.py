@@ -80,9 +80,10 @@ def check_quantiles(distribution, draws: Tensor) -> None:
     """The CDF reaches u at the quantile of u, and not before it."""
     for u in (0.01, 0.3, 0.7, 0.99):
         level = torch.full(distribution.batch_shape, u, dtype=draws.dtype)
-        quantile = distribution.icdf(level)
-        assert bool((distribution.cdf(quantile) >= u - 1e-6).all())
-        assert bool((distribution.cdf_below(quantile) <= u + 1e-6).all())
+        with torch.no_grad():  # while it learns, a mean-preserving model solves for the mean at fewer signals
+            quantile = distribution.icdf(level)
+            assert bool((distribution.cdf(quantile) >= u - 1e-6).all())
+            assert bool((distribution.cdf_below(quantile) <= u + 1e-6).all())
 
 
 def check_moments(distribution, draws: Tensor) -> None:

@@ -151,7 +151,7 @@ def public_classes() -> set[type]:
     found = set()
     for package in (noiseflow, recon, calibration):
         found |= {value for value in map(package.__getattr__, package.__all__) if inspect.isclass(value)}
-    return found - {noiseflow.NoiseModel, noiseflow.NoiseModelBase, noiseflow.SignalModel}
+    return found - {noiseflow.NoiseModel, noiseflow.NoiseModelBase, noiseflow.SignalModel, recon.Field}
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def instances() -> list[Any]:
         noiseflow.StaticScene(NOISY),
         *(pair, aligned, aligned.registration, calibration.Burst(FRAMES)),
         *(series, grid, reconstructor, result, result.volume, result.fit_result, result.signal_model, projector()),
-        *(kind((6, 5, 8)) for kind in (recon.Field, recon.VoxelField, recon.MultiresolutionField)),
+        *(kind((6, 5, 8)) for kind in (recon.VoxelField, recon.MultiresolutionField)),
         *(recon.Linear(), recon.Transmission(torch.ones(7))),
     ]
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from noiseflow.arrays import as_tensor
 from noiseflow.models.base import Described
 
-_RATE = 0.1  # of the frames' deviation: some hundred steps, their rates falling, reach the estimate of any pixel
+_RATE = 0.15  # of the frames' deviation: some hundred steps, their rates falling, reach the estimate of any pixel
 
 
 class KnownSignal(Described):

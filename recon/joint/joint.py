@@ -108,7 +108,7 @@ class JointReconstructor:
     schedule: Schedule = field(default_factory=Schedule)
     seed: int = 0
     device: torch.device | str = "cpu"
-    run_fit: RunFit = run_fit
+    run_fit: RunFit = field(default=run_fit, repr=False)
     prefix: str = ""
 
     @kept_memory()

@@ -15,7 +15,7 @@ _LEVELS = 256  # signals at which the mean is computed; between them it is inter
 
 
 def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.float32]:
-    """Means of the noise model at the projections (tilt, y, u) of some rows, detector units; without a noise model, the projections."""
+    """Means of the noise model at the projections (tilt, y, u) of some rows, detector units; else the projections."""
     model: nn.Module | None = getattr(result, "noise_model", None)
     projections = np.asarray(result.projections, dtype=np.float32)[:, rows]
     if model is None:

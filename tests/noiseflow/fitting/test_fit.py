@@ -276,7 +276,8 @@ def test_a_joint_fit_begins_with_small_steps_where_it_is_told_to(warm_up, first)
     def progress(step, note):
         moved.append(float((signal_model.scene - before).abs().max()))
 
-    options = {"num_steps": 100, "learning_rate": 0.05, "warm_up": warm_up, "progress": progress}
+    groups = [{"params": [signal_model.scene], "lr": 0.05}]
+    options = {"num_steps": 100, "parameter_groups": groups, "warm_up": warm_up, "progress": progress}
     noiseflow.fit(noiseflow.Gaussian(), signal_model, observation, **options)
     assert moved[0] == pytest.approx(0.05 * first, rel=0.02)
 
