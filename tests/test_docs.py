@@ -45,6 +45,11 @@ def folder(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     needle = io.read(data / "tilt_needle" / "needle_aligned.mrc")
     io.write("tilts.mrc", needle.data[:, 24:32], voxel_size=needle.voxel_size)
     shutil.copy(data / "tilt_needle" / "needle_aligned.rawtlt", "tilts.rawtlt")
+    moved = [
+        np.roll(image, shift, axis=1) for image, shift in zip(needle.data, [0, 1] * len(needle.data), strict=False)
+    ]
+    io.write("raw.mrc", np.stack(moved), voxel_size=needle.voxel_size)
+    shutil.copy("tilts.rawtlt", "raw.rawtlt")
     noiseflow.save(noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0), "detector.safetensors")
     return tmp_path
 
