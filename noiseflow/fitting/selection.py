@@ -97,22 +97,24 @@ def default_candidates() -> dict[str, nn.Module]:
     }
 
 
-def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
+def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, negligible: float = NEGLIGIBLE) -> _Item:
     """The simplest model whose held-out likelihood lies within one standard error of the best: the one rule of the library.
 
-    One standard error counts as at least `NEGLIGIBLE` and at most `MOST_FOR_SIMPLICITY` nats per pixel, or `LEAST_PIXEL_COST`
+    One standard error counts as at least `negligible` and at most `MOST_FOR_SIMPLICITY` nats per pixel, or `LEAST_PIXEL_COST`
     nats over all judging pixels where that is more.
 
     Args:
         candidates: simplest first, with their excess over the best and its standard error, nats per pixel.
         num_judging: number of judging pixels.
+        negligible: nats per pixel that never speak against a simpler model; more where the signal is an estimate, whose
+            errors a richer model may describe.
 
     Raises:
         ValueError: every candidate calls some judging pixel impossible.
     """
     most = max(MOST_FOR_SIMPLICITY, LEAST_PIXEL_COST / num_judging)
     for item in candidates:
-        if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
+        if item.excess <= max(min(item.excess_error, most), negligible):
             return item
     raise ValueError(
         "every candidate calls some of the judging pixels impossible; add a candidate such as SplineFlow()"

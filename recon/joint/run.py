@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.selection import simplest_sufficient
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
@@ -26,6 +28,15 @@ _TOLERATED = (
     0.003  # nats per pixel; what a richer noise model gains below that may be a bias of the signal that it absorbed
 )
 _TABULATED = 0.05  # nats per pixel
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A candidate and its held-out negative log-likelihood above the best one's, nats per pixel."""
+
+    model: nn.Module
+    excess: float
+    excess_error: float = 0.0  # chance errs by less than the signal does
 
 
 class RunFit(Protocol):
@@ -116,22 +127,23 @@ class Runner:
         """The simplest that predicts held-out pixels nearly as well as the richest. One of which no table can be made is left
         out: it has a peak for every electron, far narrower than their distance, to which noise without such peaks was bent."""
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates)
-        signal, found = task.signal(), dict[nn.Module, float]()
+        signal, tried = task.signal(), list[_Tried]()
 
         def nll(model: nn.Module) -> float:
-            name = f"{stage.name} {len(found) + 1}"
+            name = f"{stage.name} {len(tried) + 1}"
             result = self._fit_noise(name, model, task, signal, stage.num_steps, standardise=True)
             return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
 
-        found[richest] = lowest = nll(richest)
-        for model in simpler:
-            found[model] = nll(model)
-            if found[model] <= lowest + _TOLERATED:
+        lowest = nll(richest)
+        tried.append(_Tried(richest, 0.0))
+        for place, model in enumerate(simpler):
+            excess = nll(model) - lowest
+            tried.insert(place, _Tried(model, excess))
+            if excess <= _TOLERATED:
                 break
-        good_enough = min(found.values()) + _TOLERATED
-        self.models["chosen"] = next(
-            model for model in [*simpler, richest] if found.get(model, math.inf) <= good_enough
-        )
+        best = min(each.excess for each in tried)
+        judged = [_Tried(each.model, each.excess - best) for each in tried]
+        self.models["chosen"] = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED).model
 
     def _weights(self, stage: FitStage, task: Task) -> None:
         """Compare weights by fits that all begin in the same state: steps that another weight has taken count for none. The task
