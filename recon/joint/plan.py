@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from noiseflow.described import described
@@ -51,7 +51,8 @@ class Schedule:
         candidate: steps of each candidate noise model; its likelihood then differs from where it would end by less than the
             tolerance of the choice.
         adapt: signal steps on the slab under the chosen noise model.
-        refine: noise-model steps on a signal that has become better.
+        refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
+        learn: noise-model steps on the volume, which has more pixels and a better signal, half of its steps done.
         trial: signal steps that compare weights, after the first quarter of those of the volume.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
@@ -60,9 +61,10 @@ class Schedule:
     """
 
     settle: int = 40
-    candidate: int = 30
+    candidate: int = 60
     adapt: int = 20
     refine: int = 20
+    learn: int = 60
     trial: int = 50
     whole: int = 150
     quiet: int = 240
@@ -127,7 +129,7 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     usual = schedule.quiet if facts.quiet else schedule.whole
     stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps)
     if facts.quiet and facts.simple_is_final and not facts.settled:
-        stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.refine, standardise=True))
+        stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.learn, standardise=True))
     return stages
 
 
@@ -171,13 +173,16 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         rate, hold = schedule.whole_rate, facts.hold_offset
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, hold_offset=hold))
 
+    learning = facts.learn_noise and not facts.settled and noise == "chosen"
     if quarter:  # the simple noise pulls at a rough signal steadily
         add("begin", "simple", quarter, half=facts.can_halve)
-    if quarter and facts.can_halve:
-        add("coarse", "simple" if taken_over else noise, quarter, half=True)
-    if quarter and taken_over:
-        add("go on", "simple", 3 * quarter - sum(stage.num_steps for stage in stages))
-        stages.append(FitStage("learn noise on the volume", "noise", "whole", noise, schedule.refine, standardise=True))
+        if facts.can_halve or learning:
+            add("go on", "simple" if taken_over else noise, quarter, half=facts.can_halve)
+        if taken_over:
+            add("settle further", "simple", quarter)
+        if learning:
+            learn = FitStage("learn noise on the volume", "noise", "whole", noise, schedule.learn)
+            stages.append(replace(learn, standardise=taken_over))
     add("fit", noise, num_steps - sum(stage.num_steps for stage in stages if stage.kind == "signal"))
     return stages
 

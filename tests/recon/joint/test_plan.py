@@ -21,14 +21,16 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  30 x 2  chosen
+        slab   choose noise                 candidates  60 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 5  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  go on                        signal      37  chosen, rate 0.6
+        whole  learn noise on the volume    noise       60  chosen
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
@@ -48,14 +50,15 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  30 x 2  chosen
+        slab   choose noise                 candidates  60 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 5  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6, half resolution
-        whole  coarse                       signal      37  chosen, rate 0.6, half resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half resolution
+        whole  learn noise on the volume    noise       60  chosen
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -64,7 +67,7 @@ PLANS = {
         """
         whole  start noise                  noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6, half resolution
-        whole  coarse                       signal      37  chosen, rate 0.6, half resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -84,8 +87,9 @@ PLANS = {
         slab   adapt                        signal      20  chosen, rate 0.5, offset held, warm-up
         slab   refine noise                 noise       20  chosen
         whole  begin                        signal      60  simple, rate 0.6, offset held
-        whole  go on                        signal      120  simple, rate 0.6, offset held
-        whole  learn noise on the volume    noise       20  chosen
+        whole  go on                        signal      60  simple, rate 0.6, offset held
+        whole  settle further               signal      60  simple, rate 0.6, offset held
+        whole  learn noise on the volume    noise       60  chosen
         whole  fit                          signal      60  chosen, rate 0.6, offset held
         """,
     ),
@@ -101,9 +105,9 @@ PLANS = {
         slab   choose weight                weights     50 x 5  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
-        whole  coarse                       signal      60  simple, rate 0.6, offset held, half resolution
+        whole  go on                        signal      60  simple, rate 0.6, offset held, half resolution
         whole  fit                          signal      120  simple, rate 0.6, offset held
-        whole  describe noise               noise       20  chosen
+        whole  describe noise               noise       60  chosen
         """,
     ),
 }
