@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.commands import run_command
 
 import recon
 from noiseflow import io
 from recon.napari import get_reader
 from recon.napari.widget import reconstruct_layer
+from tests.commands import run_command
 
 
 @pytest.fixture
