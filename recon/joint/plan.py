@@ -176,10 +176,11 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     learning = facts.learn_noise and not facts.settled and noise == "chosen"
     if quarter:  # the simple noise pulls at a rough signal steadily
         add("begin", "simple", quarter, half=facts.can_halve)
-        if facts.can_halve or learning:
-            add("go on", "simple" if taken_over else noise, quarter, half=facts.can_halve)
-        if taken_over:
-            add("settle further", "simple", quarter)
+        if taken_over:  # a width measured on a rough signal would leave the volume to the regulariser
+            stages.append(FitStage("measure noise", "noise", "whole", "simple", _START, standardise=True))
+            add("go on", "simple", 2 * quarter)
+        elif facts.can_halve or learning:
+            add("go on", noise, quarter, half=facts.can_halve)
         if learning:
             learn = FitStage("learn noise on the volume", "noise", "whole", noise, schedule.learn)
             stages.append(replace(learn, standardise=taken_over))

@@ -197,9 +197,6 @@ def test_joint_fit_beats_least_squares_at_its_best_weight(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="0.5 % and 1.3 % of the range in 800 steps: a given model learnt with little noise needs more"
-)
 @pytest.mark.parametrize(
     "model", [noiseflow.SignalDependentGaussian, partial(noiseflow.SplineFlow, mean_preserving=True)]
 )
