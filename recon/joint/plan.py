@@ -61,7 +61,7 @@ class Schedule:
     """
 
     settle: int = 40
-    candidate: int = 60
+    candidate: int = 30
     adapt: int = 20
     refine: int = 20
     learn: int = 60

@@ -21,7 +21,7 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  60 x 2  chosen
+        slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
@@ -50,7 +50,7 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   choose noise                 candidates  60 x 2  chosen
+        slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
