@@ -9,6 +9,7 @@ from typing import Any
 from joint_accuracy import FIELDS, NOISES, PHANTOMS
 
 from noiseflow.io import atomic_path
+from recon.benchmarks.provenance import measured_on
 
 PAGE = Path(__file__).parent / "joint.md"
 _METHODS = ("joint", "oracle", "least squares")
@@ -55,14 +56,8 @@ def _head(content: Row) -> str:
         "",
         "Written by `python docs/benchmarks/joint.py page` from `results/joint.json`; each row is one command.",
         "",
-        "Measured on:",
-        "",
     ]
-    for machine in content["machines"]:
-        versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-        cores = f"{machine['cores']} cores, {machine['threads']} torch threads"
-        lines.append(f"- {machine['processor']}, {cores}; Python {machine['python']}, {versions}")
-    return "\n".join(lines)
+    return "\n".join([*lines, measured_on([content])])
 
 
 def _accuracy(rows: list[Row]) -> str:

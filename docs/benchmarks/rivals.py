@@ -24,6 +24,7 @@ from recon.benchmarks import needle as benchmark_needle
 from recon.benchmarks import paper as benchmark_paper
 from recon.benchmarks import rivals as benchmark_rivals
 from recon.benchmarks import search as benchmark_search
+from recon.benchmarks.provenance import measured_on
 from recon.benchmarks.scenes import Results
 
 HERE = Path(__file__).parent
@@ -70,7 +71,7 @@ def run_time(folder: Path) -> str:
             f"![PSNR over wall time for every method at {size}³]({_figure(size)})",
             _table(header, rows),
             f"{_runs(len(repeats))} Load of the machine before each cell: {min(loads):.1f} to {max(loads):.1f}.",
-            _machines(files),
+            measured_on(files),
         ]
     missing = [f"{size}³" for size in (64, 96, 128) if size not in sizes]
     gaps = [f"- {', '.join(missing)} on a CPU: not measured yet."] if missing else []
@@ -110,7 +111,7 @@ def paper_table(folder: Path) -> str:
         header, rows = benchmark_paper.table(content["cells"])
         absent = [method for method in benchmark_paper.METHODS if method not in content["cells"]]
         parts += [f"## {_scene(name)}", _table(header, rows), _standing(content["cells"]), _absent(absent)]
-        parts += [_command("paper-table", name), _machines([content])]
+        parts += [_command("paper-table", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "paper-table", " --size 96 --phantom cell")])
 
 
@@ -154,7 +155,7 @@ def ablations(folder: Path) -> str:
                 _table(header[1:], [row[1:] for row in rows if row[0] == group]),
             ]
             parts.append(_remark(group, cells))
-        parts += [_command("ablations", name), _machines([content])]
+        parts += [_command("ablations", name), measured_on([content])]
     gaps = "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
     return _joined([*parts, _nothing(folder, "ablations", " --size 64"), "## Not measured", gaps])
 
@@ -203,7 +204,7 @@ def needle(folder: Path) -> str:
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
             likeliest = min(chosen, key=lambda row: float(row[2]))
             parts += [f"Best by PSNR: {chosen[0][0]}; by NLL: {likeliest[0]}.", _absent(absent)]
-        parts += [_command("needle", name), _machines([content])]
+        parts += [_command("needle", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "needle")])
 
 
@@ -253,15 +254,6 @@ def _command(benchmark: str, name: str) -> str:
         size, noise, phantom, seed = name.rsplit("-", 5)[1:5]
         words += f" --size {size} --noise {noise} --phantom {phantom} --seed {seed}"
     return f"```sh\n{words} --out docs/benchmarks/results\npython docs/benchmarks/rivals.py\n```"
-
-
-def _machines(contents: Iterable[Content]) -> str:
-    told = []
-    for machine in (machine for content in contents for machine in content["machines"]):
-        versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-        threads = f"{machine['cores']} cores, {machine['threads']} threads"
-        told.append(f"- {machine['processor']}, {threads}, Python {machine['python']}, {versions}")
-    return "Measured on:\n\n" + "\n".join(dict.fromkeys(told))
 
 
 def _absent(names: Sequence[str]) -> str:

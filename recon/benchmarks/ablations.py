@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,6 @@ from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, 
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace
-from recon.joint.plan import Schedule
 from recon.joint.run import RunFit, run_fit
 from recon.metrics.metrics import compare
 
@@ -178,20 +177,7 @@ def _skipping(scene: Scene) -> list[Variant]:
     ]
 
 
-def _schedule(scene: Scene) -> list[Variant]:
-    """Half and twice of every number of steps and every learning rate of the plan."""
-    usual, found = Schedule(), [Variant("schedule", "as it is", partial(_once, scene), scene)]
-    for each in fields(usual):
-        value = getattr(usual, each.name)
-        for changed in (value // 2, value * 2) if isinstance(value, int) else (value / 2, value * 1.5):
-            schedule = replace(usual, **{each.name: changed})
-            found.append(
-                Variant("schedule", f"{each.name} {changed:g}", partial(_once, scene, schedule=schedule), scene)
-            )
-    return found
-
-
-GROUPS = (_likelihoods, _schedule, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
+GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
 """What changes, on one scene."""
 
 

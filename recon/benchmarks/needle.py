@@ -103,7 +103,7 @@ def run(results: Results, line: Callable[[str], None], *, quick: bool, seed: int
         for gap in list(GAPS)[:1] if quick else GAPS:
             parts = split(series, noise, gap, seed=seed)
             line(f"needle, {noise}, tilts left out: {gap}; {parts.given.num_tilts} tilts given")
-            for name, make in methods(parts.given, partial(_psnr, parts)).items():
+            for name, make in methods(parts.given, partial(psnr_of, parts)).items():
                 if quick and "TV" in name:
                     continue
                 cell = results.cell(f"{noise}/{gap}/{name}", lambda p=parts, m=make: _judged(p, m()))  # type: ignore[misc]
@@ -116,12 +116,13 @@ def _judged(parts: Split, found: Best) -> Cell:
         "setting": found.setting,
         "tried": found.tried,
         "at an end": found.at_an_end,
-        "psnr": _psnr(parts, found.volume),
+        "psnr": psnr_of(parts, found.volume),
         "nll": held_out_nll(predict(parts.given, found.volume, angles, likely=True), parts.left_out.images),
     }
 
 
-def _psnr(parts: Split, volume: Array) -> float:
+def psnr_of(parts: Split, volume: Array) -> float:
+    """PSNR of the tilts left out, dB."""
     predicted = predict(parts.given, volume, parts.left_out.tilt_angles)
     span = float(parts.target.max() - parts.target.min())
     return -10 * float(np.log10(np.mean((predicted - parts.target) ** 2) / span**2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow import io
+from recon.benchmarks.provenance import machine, origin
 from recon.metrics.comparison import project
 from recon.metrics.metrics import compare, compare_images
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -131,13 +131,13 @@ class Results:
             del self.cells[key]
 
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
-        """The cell of a name, computed and saved if it is not there, with the machine's number and its load before."""
+        """The cell of a name, computed and saved if it is not there, with commit, date, the machine's number and its load before."""
         if key not in self.cells:
             load, here = os.getloadavg()[0], machine()
             found = compute()
             if here not in self.content["machines"]:
                 self.content["machines"].append(here)
-            place = {"load": round(load, 1), "machine": self.content["machines"].index(here)}
+            place = {"load": round(load, 1), "machine": self.content["machines"].index(here)} | origin()
             self.cells[key] = plain(found | place)
             with io.atomic_path(self.path) as partial:
                 partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
@@ -167,33 +167,3 @@ def in_turn(functions: Sequence[Callable[[], Any]], *, repeats: int) -> list[tup
             results[index] = function()
             seconds[index].append(time.perf_counter() - started)
     return [(statistics.median(times), result) for times, result in zip(seconds, results, strict=True)]
-
-
-def machine() -> dict[str, Any]:
-    """Processor, memory and versions, for whoever compares the figures."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    versions = {}
-    for package in ("noiseflow", "torch", "numpy", "scipy", "scikit-image", "astra-toolbox", "quantem", "bm3d"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "versions": versions,
-    }
-
-
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

@@ -1,0 +1,80 @@
+"""Where a figure comes from: commit, date and machine, for each cell and for the head of a page."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from collections import Counter
+from collections.abc import Iterable
+from datetime import date
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+@cache
+def origin() -> dict[str, str]:
+    """Commit (with ``+`` where files differ from it; empty outside a checkout) and date of what is measured now."""
+    return {"commit": _commit(), "date": date.today().isoformat()}
+
+
+def _commit() -> str:
+    def git(*words: str) -> str:
+        here = Path(__file__).parent
+        found = subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True, timeout=10)
+        return found.stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py")
+        return git("rev-parse", "--short=7", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def measured_on(contents: Iterable[dict[str, Any]]) -> str:
+    """Markdown: the commits, dates and machines of the cells of some results."""
+    contents = list(contents)
+    cells = [cell for content in contents for cell in content["cells"].values()]
+    origins = Counter((cell.get("commit") or "an unrecorded commit", cell.get("date", "")) for cell in cells)
+    lines = [
+        f"- commit {commit}" + (f", {day}" if day else "") + f" ({count} row{'s' if count > 1 else ''})"
+        for (commit, day), count in sorted(origins.items(), key=lambda item: item[0][1])
+    ]
+    for machine_ in (machine_ for content in contents for machine_ in content["machines"]):
+        versions = ", ".join(f"{name} {version}" for name, version in machine_["versions"].items())
+        cores = f"{machine_['cores']} cores, {machine_['threads']} torch threads"
+        lines.append(f"- {machine_['processor']}, {cores}; Python {machine_['python']}, {versions}")
+    return "Measured on:\n\n" + "\n".join(dict.fromkeys(lines))
+
+
+def machine() -> dict[str, Any]:
+    """Processor, memory and versions, for whoever compares the figures."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    versions = {}
+    for package in ("noiseflow", "torch", "numpy", "scipy", "scikit-image", "astra-toolbox", "quantem", "bm3d"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": versions,
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
