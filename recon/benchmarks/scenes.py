@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import nn
 
@@ -131,7 +130,7 @@ class Results:
             del self.cells[key]
 
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
-        """The cell of a name, computed and saved if it is not there, with commit, date, the machine's number and its load before."""
+        """The cell of a name, computed and saved if it is not there, with commit, date, machine and its load before."""
         if key not in self.cells:
             load, here = os.getloadavg()[0], machine()
             found = compute()
