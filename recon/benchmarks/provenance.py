@@ -38,10 +38,7 @@ def measured_on(contents: Iterable[dict[str, Any]]) -> str:
     """Markdown: the commits, dates and machines of the cells of some results."""
     contents = list(contents)
     cells = [cell for content in contents for cell in content["cells"].values()]
-    origins = Counter(
-        (cell.get("commit") or "a commit that was not recorded (before 2026-11-23)", cell.get("date", ""))
-        for cell in cells
-    )
+    origins = Counter((cell.get("commit") or "an earlier commit, not recorded", cell.get("date", "")) for cell in cells)
     lines = [
         f"- commit {commit}" + (f", {day}" if day else "") + f" ({count} row{'s' if count > 1 else ''})"
         for (commit, day), count in sorted(origins.items(), key=lambda item: item[0][1])
