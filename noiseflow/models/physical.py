@@ -33,6 +33,7 @@ class PoissonGaussian(NoiseModelBase):
     """
 
     starts_most_likely = True  # `standardise` leaves little to climb
+    starts_anew = True  # its gain is that of the residuals; from the gain about a worse signal it would hardly move
     most_joint_steps = 15  # the exact sum over electrons takes long, and it starts at its most likely parameters
     origin: Tensor
     axes: Tensor
