@@ -1,6 +1,11 @@
 """Settings of Sphinx: `make docs` builds the pages into docs/_build/html."""
 
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "noiseflow"
 author = "The noiseflow developers"
@@ -22,3 +27,10 @@ napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = "noiseflow"
+
+
+def setup(app: Any) -> None:
+    """Write the reference of the commands before each build."""
+    import command_reference
+
+    app.connect("config-inited", command_reference.write)
