@@ -1,4 +1,4 @@
-"""Writes the reference of all commands, docs/api/generated/commands.md, from the commands themselves; Sphinx calls it on each build."""
+"""Writes the reference of all commands, docs/api/generated/commands.md, from the commands; Sphinx calls it on each build."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def page() -> str:
     program: Any = typer.main.get_command(build_app())
     parts = [
         "# Commands",
-        "Every command ends with exit code 0 (done), 1 (could not be done: one line says why and what to do), 2 (wrong usage) or 130 "
-        "(interrupted: one line says how to resume). With `--json` the last line of standard output is one JSON object.",
+        "Every command ends with exit code 0 (done), 1 (could not be done: one line says why and what to do), 2 (wrong usage) or "
+        "130 (interrupted: one line says how to resume). With `--json` the last line of standard output is one JSON object.",
     ]
     for name, command in program.commands.items():
         parts.append(f"## noiseflow {name}")
