@@ -20,6 +20,7 @@ import recon
 from noiseflow import metrics
 from noiseflow.fitting.selection import select
 from noiseflow.metrics.spatial import spatial_structure
+from recon.methods import find_method
 
 RANDOM = np.random.default_rng(0)
 SIGNAL = RANDOM.uniform(20, 200, (40, 48)).astype(np.float32)
@@ -39,6 +40,7 @@ MODELS: list[Callable[[], torch.nn.Module]] = [
     lambda: noiseflow.Digitised(noiseflow.Gaussian(), 1.0, 0.0, 255.0),
     lambda: noiseflow.ScanNoise(noiseflow.Gaussian()),
     lambda: noiseflow.WithMaps(noiseflow.Gaussian(), np.full(SIGNAL.shape, 1.1)),
+    noiseflow.ExcessNoise,
 ]
 
 
@@ -172,8 +174,9 @@ def instances() -> list[Any]:
         noiseflow.StaticScene(NOISY),
         *(pair, aligned, aligned.registration, calibration.Burst(FRAMES)),
         *(series, grid, reconstructor, result, result.volume, result.fit_result, result.signal_model, projector()),
-        *(kind((6, 5, 8)) for kind in (recon.VoxelField, recon.MultiresolutionField)),
+        *(kind((6, 5, 8)) for kind in (recon.VoxelField, recon.MultiresolutionField, recon.CoordinateNetwork)),
         *(recon.Linear(), recon.Transmission(torch.ones(7))),
+        *(recon.prepare(series), find_method("sirt")),
     ]
 
 
@@ -194,7 +197,8 @@ def test_objects_say_what_they_are_in_one_line(instances: list[Any]) -> None:
 
 @pytest.mark.slow
 def test_every_public_object_says_what_it_is_in_one_line(instances: list[Any], measured: list[Any]) -> None:
-    assert not public_classes() - {type(each) for each in [*instances, *measured]}
+    missing = public_classes() - {type(each) for each in [*instances, *measured]}
+    assert not missing, missing
     check_lines(measured)
     for kind, word in (("PhotonTransfer", "counts per electron"), ("DetectorPosterior", "read noise (electrons)")):
         assert word in next(repr(each) for each in measured if type(each).__name__ == kind)
@@ -223,6 +227,8 @@ def check_lines(objects: list[Any]) -> None:
         ("VolumeGrid", ["depth=6 voxels", "2.5 Å"]),
         ("SliceProjector", ["7 tilts -60° to 60°", "6 x 8 voxels"]),
         ("MultiresolutionField", ["6 x 5 x 8 voxels (z, y, x)", "per voxel"]),
+        ("Prepared", ["7 x 5 x 8 float32", "Screening("]),
+        ("Method", ["name='sirt'"]),
         ("Transmission", ["(7 tilts)", "detector units"]),
         ("FitResult", ["nats per pixel", " s,"]),
         ("JointReconstructor", ["weight=0.4", "num_steps=4"]),

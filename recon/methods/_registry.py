@@ -79,6 +79,7 @@ Finish = Callable[[Volume, Images], Reconstruction]
 Blockwise = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, Finish]]
 
 
+@described()
 @dataclass(frozen=True)
 class Method:
     """A method of reconstruction.

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.described import described
 from recon.series.evidence import Evidence
 from recon.series.tilt_series import TiltSeries, filled
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
 
 
+@described(tilt_axis="°", shifts="px", tilt_angles="°")
 @dataclass(frozen=True)
 class Alignment:
     """The way from aligned to raw images: a rotation about the middle, then a shift.

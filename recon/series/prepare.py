@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
@@ -22,6 +23,7 @@ Progress = Callable[[str, int, int, str], None]
 """``progress(title, done, total, note)``."""
 
 
+@described()
 @dataclass(frozen=True)
 class Prepared:
     """A tilt series ready to reconstruct, and what was found on the way.

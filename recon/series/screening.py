@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from torch import Tensor
 
+from noiseflow.described import described
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
@@ -27,6 +28,7 @@ _FEWEST = 8
 _EXCEPTIONS = 0.1  # of the tilts: more, and it is not the tilts that are wrong but what they are compared by
 
 
+@described()
 @dataclass(frozen=True)
 class Screening:
     """What a coarse reconstruction says of every tilt.
