@@ -30,7 +30,9 @@ class AtLevel(ModelAround):
     def __init__(self, model: nn.Module, level: float = 0.0) -> None:
         super().__init__(model)
         if self.model.needs_image or self.model.describes_single_readings:
-            raise ValueError("a level belongs inside: put rounding, clipping and image terms around AtLevel(model, level)")
+            raise ValueError(
+                "a level belongs inside: put rounding, clipping and image terms around AtLevel(model, level)"
+            )
         self.level = float(level)
 
     def forward(self, signal: Signal) -> NoiseDistribution:

@@ -99,7 +99,7 @@ def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruc
     model, noise_model = result.signal_model, result.noise_model
     if model is not None and isinstance(model.image_formation, Linear):
         response = model.image_formation
-        response.scaled_offset += level / float(response.gain * response.offset_unit)
+        response.scaled_offset.add_(level / float(response.gain * response.offset_unit))
     if chosen and noise_model is not None:
         noise_model = at_level(as_noise_model(noise_model), level)
     return replace(result, projections=result.projections + np.float32(level), noise_model=noise_model)

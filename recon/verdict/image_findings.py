@@ -15,7 +15,9 @@ _MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for 
 _AT_ANGLES = (
     0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
 )
-_GONIOMETER = 0.0175  # radians, one degree: beyond the repeatability of a stage; of wide images a pixel is less than that
+_GONIOMETER = (
+    0.0175  # radians, one degree: beyond the repeatability of a stage; of wide images a pixel is less than that
+)
 _TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.049
 _TURN_OFFSET = 2.3  # standard errors of the same: chance gives so many once in fifty; standard scenes reach 1.03
 _USUAL_EDGE, _BLURRED = 24.0, 0.5  # pixels from middle to edge that these hold for; what blurs images of any size
@@ -83,7 +85,9 @@ def _geometry(found: dict[str, Distortion], edge: float) -> list[Finding]:
     magnified, angle = found["magnification"], found["tilt angle"]
     strengths = {
         "grow and shrink": _strength(magnified, 2 * _PIXELS, _at_edge(_MAGNIFIED, edge)),
-        "seem taken at other angles": angle.rough / max(_AT_ANGLES, _GONIOMETER * edge) if angle.scatter > _SCATTER else 0.0,
+        "seem taken at other angles": angle.rough / max(_AT_ANGLES, _GONIOMETER * edge)
+        if angle.scatter > _SCATTER
+        else 0.0,
     }
     what = max(strengths, key=lambda each: strengths[each])
     if strengths[what] < 1:

@@ -22,8 +22,12 @@ _PATTERN, _PATTERN_CONTRAST = (
     1.6,
     0.02,
 )  # variance over that by chance; share of the contrast that it must reach to matter
-_STEADY = 0.015  # share of the structure that all tilts' residuals hold alike; standard scenes leave up to 0.006
-_STEADY_CHANCE, _STEADY_PART = 15.0, 0.3  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
+_ALIKE = 0.2  # of the fine pattern's variance: gains of single pixels share −0.1 or less, misfit at edges 0.4 and more
+_STEADY = 0.03  # share of the structure that all tilts' residuals hold alike; standard scenes leave up to 0.019
+_STEADY_CHANCE, _STEADY_PART = (
+    15.0,
+    0.3,
+)  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -93,16 +97,19 @@ def _dead(lines: Array, span: float) -> int:
 def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Fine structure of the residuals' mean over the tilts, against what independent tilts would leave."""
     fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
-    steady = float(np.var(fine.mean(0)))
+    mean = fine.mean(0, keepdims=True)
+    steady = float(np.var(mean))
+    alike = max(neighbours(mean, axis) for axis in (1, 2)) / max(steady, 1e-30)
     ratio = steady * len(fine) / max(float(np.var(fine)), 1e-30)
     evidence = {
         "fixed pattern": {
             "over chance": ratio,
+            "neighbours alike": alike,
             "share of contrast": float(np.sqrt(steady)) / max(residuals.contrast, 1e-30),
         }
     }
     size = evidence["fixed pattern"]["share of contrast"]
-    if ratio < _PATTERN or size < _PATTERN_CONTRAST:
+    if ratio < _PATTERN or size < _PATTERN_CONTRAST or alike > _ALIKE:
         return evidence, []
     sentence = f"the residuals hold a pattern of the detector's pixels, {size:.1%} of the contrast and {ratio:.1f} times chance"
     return evidence, [
