@@ -6,17 +6,23 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import torch
 from torch import nn
 
-from noiseflow import Digitisation, Digitised
+from noiseflow import AtLevel, Digitisation, Digitised
+from noiseflow.models.around import as_noise_model
+from noiseflow.models.at_level import at_level
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.signal_model import TomographySignal
 from recon.methods._registry import Finish, Method, Settings
 from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Images, Solve, with_halo
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.views import far_level, lowered_by
 
 Options = Callable[[Settings], dict[str, Any]]
 """From what a user settled to further options of a `JointReconstructor`."""
@@ -32,7 +38,9 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
     """
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
-        result = reconstructor(settings, options)(tilt_series, grid, progress=settings.progress)
+        level = _level(tilt_series, settings)
+        result = reconstructor(settings, options)(lowered_by(tilt_series, level), grid, progress=settings.progress)
+        result = _raised(result, level, chosen="noise_model" not in options(settings))
         return replace(result, method=name, choices=_choices(result, settings, tilt_series))
 
     def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int]:
@@ -78,6 +86,25 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     return JointReconstructor(**(shared | options(settings)))
 
 
+def _level(tilt_series: TiltSeries, settings: Settings) -> float:
+    """What is taken off the images before the fit; nothing under a calibrated noise model, which knows its detector's level."""
+    return 0.0 if settings.noise_model is not None else far_level(tilt_series)
+
+
+@torch.no_grad()
+def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruction:
+    """The result of lowered images in the units of those given; noise models that were `chosen` may depend on the level."""
+    if not level:
+        return result
+    model, noise_model = result.signal_model, result.noise_model
+    if model is not None and isinstance(model.image_formation, Linear):
+        response = model.image_formation
+        response.scaled_offset.add_(level / float(response.gain * response.offset_unit))
+    if chosen and noise_model is not None:
+        noise_model = at_level(as_noise_model(noise_model), level)
+    return replace(result, projections=result.projections + np.float32(level), noise_model=noise_model)
+
+
 def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries) -> dict[str, float | str]:
     model = result.signal_model
     if model is None or result.noise_model is None:
@@ -100,7 +127,9 @@ def _describe_defocus(defocus: float, model: TomographySignal) -> str:
 
 def _describe(noise_model: nn.Module) -> str:
     """A noise model in a few words."""
+    if isinstance(noise_model, AtLevel):
+        return _describe(noise_model.model)
     if not isinstance(noise_model, Digitised):
         return type(noise_model).__name__
     found = Digitisation(noise_model.step, noise_model.low, noise_model.high)
-    return f"{type(noise_model.model).__name__}, {found.in_words()}"
+    return f"{_describe(noise_model.model)}, {found.in_words()}"

@@ -24,6 +24,7 @@ from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Images, Solve, solve_in_blocks
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.views import first_copies
 
 
 @described()
@@ -182,7 +183,7 @@ def reconstruct(
         return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
-        return found.run(tilt_series, grid, chosen)
+        return _run(found, tilt_series, grid, chosen)
     if slices_at_once < 1:
         raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
     if found.blockwise is None:
@@ -192,3 +193,13 @@ def reconstruct(
         raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
     solve, finish = found.blockwise(tilt_series, grid, chosen)
     return finish(*solve_in_blocks(solve, tilt_series, grid, Path(scratch), slices_at_once))
+
+
+def _run(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+    """Run a method on a series by rising angle; a fit sees copies once, or their noise would count as signal."""
+    first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)
+    kept, place = np.unique(first, return_inverse=True)
+    if len(kept) == len(first):
+        return method.run(tilt_series, grid, settings)
+    result = method.run(tilt_series.select(kept), grid, settings)
+    return replace(result, projections=result.projections[place])

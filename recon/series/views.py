@@ -11,6 +11,7 @@ from recon.series.tilt_series import TiltSeries
 
 _TWINS = 0.1  # of the mean step: tilts so near to each other show the same view
 _SAMPLE = 100_000
+_FAR = 16.0  # spreads of the pixel values: a level so high takes four of the 24 bits that float32 has for the contrast
 
 
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
@@ -53,6 +54,45 @@ def every_nth_view(tilt_angles: NDArray[np.float64], count: int) -> NDArray[np.b
     return np.asarray(np.abs(numbers - numbers.max() / 2).astype(np.int64) % count == count // 2)
 
 
+def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
+    """(tilt,) the number of the first tilt of equal angle, image and mask: copies to the last pixel, which say nothing new.
+
+    Args:
+        tilt_series: by rising angle.
+    """
+    angles, images, used = tilt_series.tilt_angles, tilt_series.images, tilt_series.mask
+    numbers = np.arange(len(angles))
+    for number in range(1, len(angles)):
+        for other in range(number - 1, -1, -1):
+            if angles[other] != angles[number]:
+                break
+            same_mask = used is None or np.array_equal(used[other], used[number])
+            if same_mask and np.array_equal(images[other], images[number]):
+                numbers[number] = numbers[other]
+                break
+    return numbers
+
+
+def far_level(tilt_series: TiltSeries) -> float:
+    """The dark level of linear images where it is far beyond their spread, which it would take digits from; else zero.
+
+    It is that of the darkest hundredth of the pixels: noise models that count electrons then begin to count near zero.
+    """
+    level = level_of(tilt_series, quantile=0.01)
+    step = max(1, tilt_series.images.shape[1] // 64)
+    return level if abs(level) > _FAR * float(np.std(tilt_series.images[:, ::step], dtype=np.float64)) else 0.0
+
+
+def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
+    """Images minus a level, subtracted in float64 and kept in float32; the series itself where the level is zero."""
+    if not level:
+        return tilt_series
+    lowered = np.empty(tilt_series.images.shape, dtype=np.float32)
+    for image, result in zip(tilt_series.images, lowered, strict=True):
+        result[...] = image.astype(np.float64) - level
+    return replace(tilt_series, images=lowered)
+
+
 def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
     """Linear images minus their median pixel value, in float32, and that value: a large constant costs no digits so.
 
@@ -61,17 +101,14 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
     images, level = tilt_series.images, level_of(tilt_series)
     if not level:
         return replace(tilt_series, images=np.asarray(images, dtype=np.float32)), 0.0
-    lowered = np.empty(images.shape, dtype=np.float32)
-    for image, result in zip(images, lowered, strict=True):
-        result[...] = image.astype(np.float64) - level
-    return replace(tilt_series, images=lowered), level
+    return lowered_by(tilt_series, level), level
 
 
-def level_of(tilt_series: TiltSeries) -> float:
-    """The median pixel value of linear images, zero for bright field."""
+def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
+    """The median pixel value of linear images, or that at another quantile; zero for bright field."""
     images = tilt_series.images
     if tilt_series.mode != "linear":
         return 0.0
     step = max(1, images.size // (_SAMPLE * len(images)))
     sample = np.concatenate([np.sort(image, axis=None)[::step] for image in images]).astype(np.float64)
-    return float(np.quantile(sample, 0.5, method="nearest"))
+    return float(np.quantile(sample, quantile, method="nearest"))

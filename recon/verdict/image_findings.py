@@ -15,7 +15,12 @@ _MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for 
 _AT_ANGLES = (
     0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
 )
-_TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.046
+_GONIOMETER = (
+    0.0175  # radians, one degree: beyond the repeatability of a stage; of wide images a pixel is less than that
+)
+_TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.049
+_TURN_OFFSET = 2.3  # standard errors of the same: chance gives so many once in fifty; standard scenes reach 1.03
+_USUAL_EDGE, _BLURRED = 24.0, 0.5  # pixels from middle to edge that these hold for; what blurs images of any size
 _BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
 _RESIDUAL = 0.06  # share of the structure that the volume leaves
 
@@ -25,6 +30,7 @@ def image_findings(
 ) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings of the residuals at full resolution."""
     (share, error), white = residuals.unexplained(), residuals.whiteness()
+    edge = residuals.images.shape[2] / 2
     evidence = {
         "residual structure": share,
         "residual structure error": error,
@@ -32,7 +38,7 @@ def image_findings(
         "noise over contrast": residuals.noise / max(residuals.contrast, 1e-30),
         "distortions": {name: _as_dict(one) for name, one in found.items()},
     }
-    findings = [*_shifts(found), *_geometry(found), *_turned(found), *_beam(found)]
+    findings = [*_shifts(found), *_geometry(found, edge), *_turned(found, edge), *_beam(found)]
     if share - 3 * error > _RESIDUAL:
         words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
         findings.append(
@@ -70,11 +76,18 @@ def _shifts(found: dict[str, Distortion]) -> list[Finding]:
     return [Finding("alignment", strengths[where], words, "align the series first, or use --refine-alignment")]
 
 
-def _geometry(found: dict[str, Distortion]) -> list[Finding]:
+def _at_edge(pixels: float, edge: float) -> float:
+    """A limit on turns and magnifications, pixels at the edge: the same share of a wider image, up to what blurs it visibly."""
+    return max(pixels, min(_BLURRED, pixels * edge / _USUAL_EDGE))
+
+
+def _geometry(found: dict[str, Distortion], edge: float) -> list[Finding]:
     magnified, angle = found["magnification"], found["tilt angle"]
     strengths = {
-        "grow and shrink": _strength(magnified, 2 * _PIXELS, _MAGNIFIED),
-        "seem taken at other angles": angle.rough / _AT_ANGLES if angle.scatter > _SCATTER else 0.0,
+        "grow and shrink": _strength(magnified, 2 * _PIXELS, _at_edge(_MAGNIFIED, edge)),
+        "seem taken at other angles": angle.rough / max(_AT_ANGLES, _GONIOMETER * edge)
+        if angle.scatter > _SCATTER
+        else 0.0,
     }
     what = max(strengths, key=lambda each: strengths[each])
     if strengths[what] < 1:
@@ -88,11 +101,11 @@ def _geometry(found: dict[str, Distortion]) -> list[Finding]:
     ]
 
 
-def _turned(found: dict[str, Distortion]) -> list[Finding]:
+def _turned(found: dict[str, Distortion], edge: float) -> list[Finding]:
     turn = found["rotation"]
     strength = max(
-        _strength(turn, 2 * _PIXELS, 2 * _SMOOTH_PIXELS),
-        abs(turn.mean) / _TURN if abs(turn.offset) > _OFFSET else 0.0,
+        _strength(turn, 2 * _PIXELS, _at_edge(2 * _SMOOTH_PIXELS, edge)),
+        abs(turn.mean) / _at_edge(_TURN, edge) if abs(turn.offset) > _TURN_OFFSET else 0.0,
     )
     if strength < 1:
         return []

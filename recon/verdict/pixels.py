@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.series.tilt_series import TiltSeries
-from recon.verdict.residuals import Residuals
+from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
@@ -22,6 +22,12 @@ _PATTERN, _PATTERN_CONTRAST = (
     1.6,
     0.02,
 )  # variance over that by chance; share of the contrast that it must reach to matter
+_ALIKE = 0.2  # of the fine pattern's variance: gains of single pixels share −0.1 or less, misfit at edges 0.4 and more
+_STEADY = 0.03  # share of the structure that all tilts' residuals hold alike; standard scenes leave up to 0.019
+_STEADY_CHANCE, _STEADY_PART = (
+    15.0,
+    0.3,
+)  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -30,7 +36,7 @@ def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[
     images = residuals.images
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
-    for check in (_saturation, _spikes, _lines, _pattern):
+    for check in (_saturation, _spikes, _lines, _pattern, _uneven):
         found, finding = check(tilt_series, images, residuals)
         evidence |= found
         findings += finding
@@ -91,18 +97,36 @@ def _dead(lines: Array, span: float) -> int:
 def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Fine structure of the residuals' mean over the tilts, against what independent tilts would leave."""
     fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
-    steady = float(np.var(fine.mean(0)))
+    mean = fine.mean(0, keepdims=True)
+    steady = float(np.var(mean))
+    alike = max(neighbours(mean, axis) for axis in (1, 2)) / max(steady, 1e-30)
     ratio = steady * len(fine) / max(float(np.var(fine)), 1e-30)
     evidence = {
         "fixed pattern": {
             "over chance": ratio,
+            "neighbours alike": alike,
             "share of contrast": float(np.sqrt(steady)) / max(residuals.contrast, 1e-30),
         }
     }
     size = evidence["fixed pattern"]["share of contrast"]
-    if ratio < _PATTERN or size < _PATTERN_CONTRAST:
+    if ratio < _PATTERN or size < _PATTERN_CONTRAST or alike > _ALIKE:
         return evidence, []
     sentence = f"the residuals hold a pattern of the detector's pixels, {size:.1%} of the contrast and {ratio:.1f} times chance"
     return evidence, [
         Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")
     ]
+
+
+def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Smooth structure that stays where it is in all residuals: illumination or a detector that is not flat."""
+    mean = residuals.residual.mean(0, keepdims=True)
+    steady, power = neighbours(mean, 1), float(np.mean(residuals.residual**2))
+    share = steady / max(neighbours(images - images.mean(), 1), 1e-30)
+    score = steady * len(images) * float(np.sqrt(mean.size)) / max(power, 1e-30)
+    part = steady / max(neighbours(residuals.residual, 1), 1e-30)
+    evidence = {"steady structure": {"share": share, "score": score, "part": part}}
+    if share < _STEADY or score < _STEADY_CHANCE or part < _STEADY_PART:
+        return evidence, []
+    sentence = f"all residuals hold the same smooth structure, {share:.1%} of that of the images, whatever the tilt"
+    advice = "correct the images with flats and darks, or for uneven illumination"
+    return evidence, [Finding("pattern", min(2.9, share / _STEADY), sentence, advice)]

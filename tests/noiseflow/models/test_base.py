@@ -28,6 +28,7 @@ MODELS = {
     "columns": lambda: noiseflow.ScanNoise(noiseflow.Gaussian(), along="column"),
     "maps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)),
     "rounded maps": lambda: noiseflow.Digitised(noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)), 0.1),
+    "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.projection.wbp import angular_shares
 from recon.series.prepare import prepare
@@ -98,6 +100,54 @@ def test_methods_alone_do_not_depend_on_order_or_twins(series: TiltSeries, metho
         for changed, tolerance in ((shuffled(series), 1e-5), (doubled(series), 0.01)):
             found = reconstruct(changed, VolumeGrid.of(series), method=method).volume.attenuation
             assert np.sqrt(np.mean((found - wanted) ** 2)) < tolerance * np.sqrt(np.mean(wanted**2))
+
+
+@pytest.fixture(scope="module")
+def small() -> TiltSeries:
+    density = make_phantom("particles", 16, generator=np.random.default_rng(0))
+    clean, _ = clean_tilt_series(density, ANGLES, acquisition=ACQUISITIONS["low-dose"])
+    return add_noise(clean, ACQUISITIONS["low-dose"].noise(), seed=1)
+
+
+def fitted(series: TiltSeries, method: str) -> Array:
+    """Few steps: what is the same step by step stays so."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = reconstruct(series, VolumeGrid.of(series), method=method, weight=1.0, num_steps=12)
+    return made.volume.attenuation
+
+
+FITTED = ("doubled tilts", "constant added")
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("method", ["l2", pytest.param("joint", marks=pytest.mark.slow)])
+def test_a_fit_of_the_same_series_in_other_words_gives_the_same_volume(small: TiltSeries, method: str) -> None:
+    wanted = fitted(small, method)
+    for change in FITTED:
+        how, back, _ = CHANGES[change]
+        found = back(fitted(how(small), method))
+        assert np.sqrt(np.mean((found - wanted) ** 2)) < 1e-4 * np.sqrt(np.mean(wanted**2)), change
+
+
+@pytest.mark.slow
+def test_a_far_level_comes_back_in_projections_offset_and_noise_model(small: TiltSeries) -> None:
+    options = {"method": "joint", "weight": 1.0, "num_steps": 12}
+    low, high = reconstruct(small, **options), reconstruct(raised(small), **options)
+    np.testing.assert_allclose(high.projections - 1e5, low.projections, atol=0.02)
+    np.testing.assert_allclose(high.response["offset"], np.array(low.response["offset"]) + 1e5, atol=0.02)
+    signals = np.linspace(1.0, 5.0, 5)
+    near, far = low.noise_model(signals), high.noise_model(signals + 1e5)
+    np.testing.assert_allclose(far.variance, near.variance, rtol=0.02)
+    np.testing.assert_allclose(far.mean - 1e5, near.mean, atol=0.02)
+
+
+@pytest.mark.parametrize("shape", [(41, 24, 24), (40, 25, 23), (5, 7, 9)])
+def test_held_out_pixels_are_those_of_the_mirrored_series(shape: tuple[int, int, int]) -> None:
+    mask = block_mask(shape, share=0.3, generator=torch.Generator().manual_seed(0))
+    assert mask.shape == shape
+    assert torch.equal(mask, mask.flip(2))
+    assert torch.equal(mask, mask.flip(0, 1))
 
 
 def test_twins_and_opposite_views_share_a_number() -> None:

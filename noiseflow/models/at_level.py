@@ -1,0 +1,73 @@
+"""Noise models of a detector that adds a large constant, computed without it: float32 has no digits to spare."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.picked import Signal, given_to, values_of
+from noiseflow.models.around import ModelAround
+from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.digitised import Digitised
+
+
+class AtLevel(ModelAround):
+    """A noise model of signals and observations above a constant level.
+
+    The observation of a signal s is that of the model inside at s − level, plus the level.
+
+    Args:
+        model: the noise model of values above the level, of single pixels, neither rounding nor clipping; see `at_level`.
+        level: detector units.
+
+    Raises:
+        ValueError: a model that needs images, or that rounds or clips.
+    """
+
+    level: float = 0.0
+
+    def __init__(self, model: nn.Module, level: float = 0.0) -> None:
+        super().__init__(model)
+        if self.model.needs_image or self.model.describes_single_readings:
+            raise ValueError(
+                "a level belongs inside: put rounding, clipping and image terms around AtLevel(model, level)"
+            )
+        self.level = float(level)
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        values = values_of(signal)
+        base: NoiseDistribution = self.model(values - self.level)
+        return base.rescaled(torch.ones_like(values), torch.full_like(values, self.level))
+
+    def standardise(self, signal: Signal, observation: Tensor) -> None:
+        """Standardise the model inside on values above the level."""
+        self.model.standardise(given_to(self.model, values_of(signal) - self.level), observation - self.level)
+
+    @property
+    def one_pixel(self) -> NoiseModelBase:
+        return self
+
+    @property
+    def fitted_range(self) -> tuple[float, float] | None:
+        inside = self.model.fitted_range
+        return None if inside is None else (inside[0] + self.level, inside[1] + self.level)
+
+    def config(self) -> dict[str, float]:
+        """The level."""
+        return {"level": self.level}
+
+    def extra_repr(self) -> str:
+        return f"level={self.level:g}"
+
+
+def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
+    """A noise model that was fitted to values above a level, for the values themselves; rounding and clipping stay outside.
+
+    Args:
+        model: of single pixels.
+        level: detector units.
+    """
+    if isinstance(model, Digitised):
+        return Digitised(at_level(model.model, level), model.step, model.low + level, model.high + level)
+    return AtLevel(model, level)

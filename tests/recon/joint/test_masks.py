@@ -1,0 +1,35 @@
+"""What is masked never reaches a fitted volume: other values there give the same volume, to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.methods import reconstruct
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+
+def masked(value: float) -> TiltSeries:
+    """A series of which a patch of every image is masked and holds `value`."""
+    density = make_phantom("particles", 16, generator=np.random.default_rng(0))
+    acquisition = ACQUISITIONS["low-dose"]
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
+    noisy = add_noise(clean, acquisition.noise(), seed=1)
+    mask = np.ones(noisy.images.shape, bool)
+    mask[:, 5:9, 6:11] = False
+    return replace(noisy, images=np.where(mask, noisy.images, np.float32(value)), mask=mask)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("method", ["l2", pytest.param("joint", marks=pytest.mark.slow)])
+def test_values_under_the_mask_do_not_change_the_volume(method: str) -> None:
+    low, high = (masked(value) for value in (2.0, 3.0))
+    volumes = [
+        reconstruct(series, VolumeGrid.of(series), method=method, weight=1.0, num_steps=12).volume.attenuation
+        for series in (low, high)
+    ]
+    np.testing.assert_array_equal(*volumes)
