@@ -45,7 +45,7 @@ def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
     )
 
 
-def is_narrow(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, mode: Tensor) -> Tensor:
+def is_narrow(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
     """Where `cell_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
     with torch.no_grad():
         width, gap = high - low, (low + high) / 2 - (mode - rate)
@@ -53,15 +53,15 @@ def is_narrow(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, mode:
 
 
 def cell_and_slopes(
-    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, mode: Tensor, *, slopes: bool
+    low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
     """log P(low < residual ≤ high) of narrow cells, and its derivatives with respect to all four arguments where asked for.
 
     Args:
         low, high: (n,) observation − rate, electrons, float64.
         rate: (n,) expected electrons, float64.
-        read_noise: scalar, electrons, float64.
         mode: (n,) that of `posterior_mode`.
+        read_noise: scalar, electrons, float64.
     """
     variance, sigma = read_noise**2, float(read_noise)
     middle, half = (low + high) / 2, (high - low) / 2

@@ -11,7 +11,7 @@ It serves wherever the law is smooth on the scale of an electron, and for the Po
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -63,42 +63,104 @@ def log_contour_integral(
 
     `factor` takes Im s and returns its real and imaginary parts; `at_zero` is its value at Im s = 0.
     """
-    variance = read_noise**2
-    tilted = tilted_rate(rate, line)
-    rise = torch.where(line.abs() < 1, rate * torch.expm1(line.clamp(-1, 1)), tilted - rate)
-    exponent = rise - line * (rate + residual) + variance * line**2 / 2
-    drift = rise + variance * line - residual
-    with torch.no_grad():
-        spacing = 1 / (_NODES_PER_DEVIATION * torch.sqrt(tilted + variance))
-        reach = torch.sqrt(22 / (variance / 2 + 2 / math.pi**2 * tilted))
-        reach = torch.where(reach < math.pi, reach, torch.sqrt(44 / variance))
-        count = int((reach / spacing).max()) + 1 if reach.numel() else 0
+    path = _Path(residual, rate, read_noise, line)
     total = at_zero / 2
-    for node in range(1, count + 1):
-        t = node * spacing
-        size = torch.exp(-2 * tilted * torch.sin(t / 2) ** 2 - variance * t**2 / 2)
-        phase = tilted * (torch.sin(t) - t) + t * drift
-        real, imaginary = factor(t)
-        total = total + size * (real * torch.cos(phase) - imaginary * torch.sin(phase))
-    return exponent + torch.log(total * spacing / math.pi)
+    for t in path.nodes():
+        real, imaginary = path.value(t)
+        along, across = factor(t)
+        total = total + along * real - across * imaginary
+    return path.exponent + torch.log(total * path.spacing / math.pi)
+
+
+class _Path:
+    """exp(K(s) − s·observation) along Re s = line: its logarithm at the real axis, and the rest at the nodes above it."""
+
+    def __init__(self, residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor) -> None:
+        self._variance = variance = read_noise**2
+        self._tilted = tilted = tilted_rate(rate, line)
+        rise = torch.where(line.abs() < 1, rate * torch.expm1(line.clamp(-1, 1)), tilted - rate)
+        self.exponent = rise - line * (rate + residual) + variance * line**2 / 2
+        self._drift = rise + variance * line - residual
+        with torch.no_grad():
+            self.spacing = 1 / (_NODES_PER_DEVIATION * torch.sqrt(tilted + variance))
+            reach = torch.sqrt(22 / (variance / 2 + 2 / math.pi**2 * tilted))
+            reach = torch.where(reach < math.pi, reach, torch.sqrt(44 / variance))
+            self._count = int((reach / self.spacing).max()) + 1 if reach.numel() else 0
+
+    def nodes(self) -> Iterator[Tensor]:
+        """Im s of each node, of all pixels."""
+        for node in range(1, self._count + 1):
+            yield node * self.spacing
+
+    def value(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Real and imaginary part, over the value at the real axis."""
+        size = torch.exp(-2 * self._tilted * torch.sin(t / 2) ** 2 - self._variance * t**2 / 2)
+        phase = self._tilted * (torch.sin(t) - t) + t * self._drift
+        return size * torch.cos(phase), size * torch.sin(phase)
 
 
 def contour_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     middle, half = (low + high) / 2, (high - low) / 2
     line = saddle_point(middle, rate, read_noise)
-    a = line * half
-    shrink = torch.exp(-2 * a.abs())  # sinh and cosh are scaled by exp(−|a|)
-    sinh, cosh = -torch.sign(line) * torch.expm1(-2 * a.abs()), 1 + shrink
-    tiny = a.abs() < 1e-4
-    flat = 2 * half * torch.exp(-a.abs()) * (1 + a**2 / 6)
-    at_zero = torch.where(tiny, flat, sinh / torch.where(tiny, torch.ones_like(line), line))
+    sinh, cosh, at_zero = _cell_at_zero(line, half)
 
     def factor(t: Tensor) -> tuple[Tensor, Tensor]:
         real, imaginary = sinh * torch.cos(t * half), cosh * torch.sin(t * half)
         square = line**2 + t**2
         return (real * line + imaginary * t) / square, (imaginary * line - real * t) / square
 
-    return a.abs() + log_contour_integral(middle, rate, read_noise, line, at_zero, factor)
+    return (line * half).abs() + log_contour_integral(middle, rate, read_noise, line, at_zero, factor)
+
+
+def is_smooth_cell(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    """Where the integrals over a cell are a short contour's, boolean: neither wider than the noise nor far too steep."""
+    steepness = saddle_point((low + high) / 2, rate, read_noise).abs()
+    return (high - low).detach() <= torch.minimum(torch.sqrt(rate + read_noise**2), 4 / steepness).detach()
+
+
+def contour_and_slopes(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """`contour_log_interval`, and its derivatives with respect to all four arguments where asked for, at the same nodes.
+
+    With s = line + it and q = 2·sinh(s·half)/s the factor of a cell's mass, that of the density at the cell's upper and lower
+    end is exp(∓s·half), of the derivative by the rate q·(eˢ − 1), and by the read noise q·read_noise·s².
+    """
+    if not slopes:
+        return contour_log_interval(low, high, rate, read_noise), ()
+    middle, half = (low + high) / 2, (high - low) / 2
+    line = saddle_point(middle, rate, read_noise)
+    sinh, cosh, at_zero = _cell_at_zero(line, half)
+    bottom, top = torch.exp((line * half).clamp(max=0) * 2), torch.exp((-line * half).clamp(max=0) * 2)
+    path = _Path(middle, rate, read_noise, line)
+    mass, by_rate, by_noise = at_zero / 2, at_zero / 2, line * sinh / 2
+    at_low, at_high = bottom / 2, top / 2
+    for t in path.nodes():
+        real, imaginary = path.value(t)
+        cosine, sine = torch.cos(t * half), torch.sin(t * half)
+        at_low = at_low + bottom * (real * cosine - imaginary * sine)
+        at_high = at_high + top * (real * cosine + imaginary * sine)
+        square = line**2 + t**2
+        q_real = (sinh * cosine * line + cosh * sine * t) / square
+        q_imaginary = (cosh * sine * line - sinh * cosine * t) / square
+        cell, turned = real * q_real - imaginary * q_imaginary, real * q_imaginary + imaginary * q_real
+        mass = mass + cell
+        by_rate = by_rate + cell * torch.cos(t) - turned * torch.sin(t)
+        by_noise = by_noise + cell * (line**2 - t**2) - turned * (2 * line * t)
+    value = (line * half).abs() + path.exponent + torch.log(mass * path.spacing / math.pi)
+    of_low, of_high = -at_low / mass, at_high / mass
+    of_rate = torch.exp(line.clamp(max=60)) * by_rate / mass - 1 + of_low + of_high
+    return value, (of_low, of_high, of_rate, read_noise * by_noise / mass)
+
+
+def _cell_at_zero(line: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """2·sinh and 2·cosh of line·half, and 2·sinh(line·half)/line, all scaled by exp(−|line·half|)."""
+    a = line * half
+    shrink = torch.exp(-2 * a.abs())
+    sinh, cosh = -torch.sign(line) * torch.expm1(-2 * a.abs()), 1 + shrink
+    tiny = a.abs() < 1e-4
+    flat = 2 * half * torch.exp(-a.abs()) * (1 + a**2 / 6)
+    return sinh, cosh, torch.where(tiny, flat, sinh / torch.where(tiny, torch.ones_like(line), line))
 
 
 def contour_log_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,13 +28,16 @@ from noiseflow.distributions.electron_cells import (
     posterior_mode,
 )
 from noiseflow.distributions.electron_contour import (
+    contour_and_slopes,
     contour_log_interval,
     contour_log_mass,
+    is_smooth_cell,
     log_contour_integral,
     positive_rate,
     saddle_point,
     tilted_rate,
 )
+from noiseflow.distributions.electron_peaks import is_near_peak, peaks_and_slopes
 from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
 from noiseflow.distributions.normal import log_normal_cdf, log_normal_interval
 
@@ -99,8 +103,7 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *,
         narrow = width.detach() <= 3
         direct = _lattice_log_interval
     else:
-        steepness = saddle_point((low + high) / 2, rate, read_noise).abs()
-        narrow = width.detach() <= torch.minimum(torch.sqrt(rate + read_noise**2), 4 / steepness).detach()
+        narrow = is_smooth_cell(low, high, rate, read_noise)
         direct = contour_log_interval
     if bool(narrow.all()):
         return direct(low, high, rate, read_noise)
@@ -125,20 +128,47 @@ def interval_and_slopes(
         read_noise: scalar, electrons, float64.
         slopes: whether the derivatives are wanted, (n,) each.
     """
-    if not LEAST_READ_NOISE <= float(read_noise) <= MOST_READ_NOISE:
-        return _slowly(low, high, rate, read_noise, slopes=slopes)
-    mode = posterior_mode(low, high, rate, read_noise)
-    narrow = is_narrow(low, high, rate, read_noise, mode)
-    if bool(narrow.all()):
-        return cell_and_slopes(low, high, rate, read_noise, mode, slopes=slopes)
-    others = ~narrow
-    value, slow = _slowly(low[others], high[others], rate[others], read_noise, slopes=slopes)
-    cells, fast = cell_and_slopes(low[narrow], high[narrow], rate[narrow], read_noise, mode[narrow], slopes=slopes)
-    first, *rest = (
-        torch.empty_like(low).masked_scatter_(narrow, cell).masked_scatter_(others, other)
-        for cell, other in zip((cells, *fast), (value, *slow), strict=True)
-    )
-    return first, tuple(rest)
+    sigma = float(read_noise)
+    mode = posterior_mode(low, high, rate, read_noise) if sigma <= MOST_READ_NOISE else rate
+    found = [torch.empty_like(low) for _ in range(5 if slopes else 1)]
+    left, cells = torch.arange(low.numel(), device=low.device), (low, high, rate, mode)
+    for suits, way in _ways(sigma):
+        here = suits(*cells, read_noise)
+        if bool(here.all()):
+            value, parts = way(*cells, read_noise, slopes=slopes)
+            for out, part in zip(found, (value, *parts), strict=True):
+                out[left] = part
+            break
+        if bool(here.any()):
+            value, parts = way(*(each[here] for each in cells), read_noise, slopes=slopes)
+            for out, part in zip(found, (value, *parts), strict=True):
+                out[left[here]] = part
+            left, cells = left[~here], tuple(each[~here] for each in cells)  # type: ignore[assignment]
+    return found[0], tuple(found[1:])
+
+
+def _ways(read_noise: float) -> list[tuple[Callable[..., Tensor], Callable[..., Any]]]:
+    """Which cells suit a way to compute them, and that way: the fastest first, and last one that suits all."""
+    everything = (_always, _without_mode(_slowly))
+    smooth = (_without_mode(is_smooth_cell), _without_mode(contour_and_slopes))
+    if read_noise > MOST_READ_NOISE:
+        return [smooth, everything]
+    narrow = (is_narrow, cell_and_slopes)
+    if read_noise >= _RESOLVED:
+        return [narrow, smooth, everything]
+    peaks = (is_near_peak, peaks_and_slopes)
+    return [narrow, peaks, everything] if read_noise >= LEAST_READ_NOISE else [peaks, everything]
+
+
+def _always(low: Tensor, *rest: Tensor) -> Tensor:
+    return torch.ones_like(low, dtype=torch.bool)
+
+
+def _without_mode(function: Callable[..., Any]) -> Callable[..., Any]:
+    def called(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, **options: Any) -> Any:
+        return function(low, high, rate, read_noise, **options)
+
+    return called
 
 
 def _slowly(

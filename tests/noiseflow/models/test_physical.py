@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import noiseflow
+from noiseflow.distributions import electrons
 from noiseflow.distributions.base import log_normal_cdf
 from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
 from noiseflow.models.physics_distribution import ndtri_exp
@@ -406,3 +407,30 @@ def test_impossible_detector_is_refused(gain: float, read_noise: float) -> None:
 def test_mixture_without_components_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one"):
         noiseflow.Mixture(0)
+
+
+@pytest.mark.parametrize("read_noise", [0.02, 0.2, 0.9, 3.0, 10.0])
+def test_cells_and_slopes_are_those_of_the_exact_integral(read_noise: float) -> None:
+    """Every fast way to a cell's mass and its closed derivatives against the general one under autograd."""
+    generator = torch.Generator().manual_seed(0)
+    rate = 200 * torch.rand(400, generator=generator, dtype=torch.float64) ** 3 + 1e-3
+    electrons_seen = torch.poisson(rate, generator=generator)
+    read = read_noise * torch.randn(400, generator=generator, dtype=torch.float64)
+    width = torch.tensor([0.05, 0.5, 2.5, 20.0], dtype=torch.float64).repeat(100)
+    low = electrons_seen + read - rate - width * torch.rand(400, generator=generator, dtype=torch.float64)
+    noise = torch.tensor(read_noise, dtype=torch.float64)
+    found, slopes = electrons.interval_and_slopes(low, low + width, rate, noise, slopes=True)
+    exact, exact_slopes = electrons._slowly(low, low + width, rate, noise, slopes=True)
+    assert torch.allclose(found, exact, rtol=0, atol=1e-6)
+    for slope, expected in zip(slopes, exact_slopes, strict=True):
+        assert torch.allclose(slope, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_slope_by_the_rate_without_light_is_what_a_first_electron_adds() -> None:
+    low, noise = torch.tensor([-0.9], dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
+    rate, step = torch.zeros(1, dtype=torch.float64), 1e-7
+    _, slopes = electrons.interval_and_slopes(low, low + 2.4, rate, noise, slopes=True)
+    at, after = (
+        electrons.interval_and_slopes(low, low + 2.4, rate + more, noise, slopes=False)[0] for more in (0.0, step)
+    )
+    assert float(slopes[2]) == pytest.approx(float((after - at) / step), abs=1e-5)
