@@ -249,11 +249,11 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
         return figures
     factor = correlation.factor
 
-    def times(value: Interval | None, by: float) -> Interval | None:
-        return None if value is None else Interval(value.median * by, value.q05 * by, value.q95 * by)
+    def times(value: Interval, by: float) -> Interval:
+        return Interval(value.median * by, value.q05 * by, value.q95 * by)
 
-    gain, noise = times(figures.gain, factor), times(figures.dark_noise, 1 / np.sqrt(factor))
-    assert gain is not None
+    gain = times(figures.gain, factor)
+    noise = None if figures.dark_noise is None else times(figures.dark_noise, 1 / np.sqrt(factor))
     dsnu = None if figures.dsnu is None else figures.dsnu / factor
     current = None if figures.dark_current is None else figures.dark_current / factor
     return replace(

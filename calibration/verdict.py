@@ -12,6 +12,7 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.figures import (
     LARGEST_DISAGREEMENT,
     LARGEST_MISFIT,
+    LARGEST_UNEVENNESS,
     Figures,
     correctable,
     disagrees,
@@ -36,6 +37,10 @@ twice the goal."""
 
 BIAS = 0.02
 """Relative error of the gain that may go without a warning: the goal of the calibration."""
+
+MOST_UNEVEN_CODES = 0.05
+"""Relative deviation of the converter's code widths, from which on a user should know: good converters keep within a few
+percent of a step, and the entropy of the noise moves by half its square, a thousandth of a nat."""
 
 MOST_CHANGED = 0.005
 """Share of the pixels in places that change, from which on the user should know that they were left out."""
@@ -190,7 +195,14 @@ def _shape(detector: Detector, figures: Figures) -> list[Reason]:
         text = f"the shape of the noise says {gain:.4g} counts/e⁻ and its variance {line.gain:.4g}."
         grade: Grade = "bad" if abs(gain / line.gain - 1) > 5 * LARGEST_DISAGREEMENT else "doubtful"
         found.append(Reason("shape against variance", grade, text + by_line))
-    if detector.uneven:
+    if detector.codes > MOST_UNEVEN_CODES:
+        text = (
+            f"the converter's codes are uneven: their widths differ by {detector.codes:.0%} rms from their neighbours'"
+        )
+        text += ". Frames that were rescaled and rounded again look so, and cameras that join two converters; gain and variance"
+        text += " hardly change, but a noise model that rounds evenly does not repeat these steps"
+        found.append(Reason("uneven codes", "doubtful", text + ". Give raw frames if these are not."))
+    if detector.uneven > LARGEST_UNEVENNESS:
         text = f"the pixels' own variances differ by {detector.uneven:.0%} rms at equal signal (sCMOS, hot pixels)."
         found.append(Reason("uneven pixels", "doubtful", text + " Flats and darks give per-pixel maps." + by_line))
     if line.bent:

@@ -10,13 +10,13 @@ import numpy as np
 
 from calibration.detector.cells import collect_cells
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
-from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
+from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
-from calibration.exposures.scaling import ring_mean, spread_by_level
+from calibration.exposures.scaling import ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
@@ -45,8 +45,10 @@ class Detector:
         line: the photon-transfer points and line.
         levels: the histograms.
         offset: offset measured by dark frames and its standard error, counts; None without.
-        misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector.
+        misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector. Where the converter's codes
+            are uneven, of several codes together, which tell the shape of the noise.
         uneven: relative deviation of the pixels' own variances, at equal signal, in a burst of four frames or more; 0: none.
+        codes: relative deviation (rms) of the widths of the converter's codes; 0: none.
         dark_deviation: of the dark frames over time, counts rms, without rounding; None without dark frames.
     """
 
@@ -57,6 +59,7 @@ class Detector:
     misfit: float
     uneven: float = 0.0
     dark_deviation: float | None = None
+    codes: float = 0.0
 
 
 def measure_detector(
@@ -101,8 +104,9 @@ def measure_detector(
             "the noise grows so little with the signal that the gain cannot be told from none; give the exposure ratio, "
             "dark frames, or exposures of more electrons"
         )
-    line, chi_squared = fit_photon_transfer(levels), misfit(levels, posterior.most_likely)
-    return Detector(posterior, line, levels, offset, chi_squared, unevenness(pairs), dark_deviation(dark))
+    line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
+    chi_squared = misfit(levels, posterior.most_likely, merged=MERGED if codes else 1)
+    return Detector(posterior, line, levels, offset, chi_squared, unevenness(pairs), dark_deviation(dark), codes)
 
 
 def _with_cells(
@@ -135,26 +139,6 @@ def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
         found.append((gain, offset, float(np.sqrt(read)) / gain))
     gain, offset, read_noise = (float(np.median(column)) for column in zip(*found, strict=True))
     return gain, offset, read_noise
-
-
-def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0) -> float:
-    """χ² per degree of freedom of the histograms, over cells where at least `least` readings are expected.
-
-    Args:
-        levels: from `collect_levels` and `collect_cells`.
-        parameters: (3,) gain, offset, read noise.
-        least: readings expected.
-    """
-    gain, offset, read_noise = (np.array([value]) for value in parameters)
-    squares, freedom = 0.0, -3
-    for one in levels:
-        number = one.histogram.sum(axis=1, keepdims=True)
-        expected = number * LevelMasses(one).masses(gain, offset, read_noise)[0]
-        used = expected > least
-        departure = one.weight[:, None] * (one.histogram - expected) ** 2
-        squares += float(np.sum(departure[used] / expected[used]))
-        freedom += int(used.sum()) - len(number) - int(np.sum(one.scale < 0))
-    return squares / max(freedom, 1)
 
 
 def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
@@ -231,29 +215,6 @@ def dark_deviation(dark: Burst | None) -> float | None:
         return None
     rounding = rounding_step(dark.frames[0]) ** 2 / 12
     return float(np.sqrt(max(float(dark.frames.var(axis=0, ddof=1).mean()) - rounding, 0.0)))
-
-
-def unevenness(pairs: Sequence[AlignedPair]) -> float:
-    """Relative deviation of the pixels' variances at equal signal, from disjoint frame differences of a burst.
-
-    Squares of independent differences correlate over the pixels only where some pixels are noisier than others.
-
-    Returns:
-        0 for fewer than four frames, or where nothing stands out of five standard errors.
-    """
-    if len(pairs) < 4 or pairs[0].frames == 1:
-        return 0.0
-    mask = np.logical_and.reduce([pair.mask for pair in pairs])
-    level = np.mean([pair.short[mask] for pair in pairs], axis=0)
-    squares = []
-    for first, second in zip(pairs[::2], pairs[1::2], strict=False):
-        difference = (first.short - second.short)[mask]
-        standard = np.clip(difference / spread_by_level(level, difference), -5, 5) ** 2
-        squares.append(standard / standard.mean() - 1)
-    products = np.array([np.mean(a * b) for i, a in enumerate(squares) for b in squares[:i]])
-    error = np.mean([np.mean(one**2) for one in squares]) / np.sqrt(mask.sum() * len(products))
-    found = float(products.mean())
-    return float(np.sqrt(found)) if found > 5 * error else 0.0
 
 
 def _burst_readings(burst: Burst, dark: bool) -> list[Readings]:

@@ -104,7 +104,19 @@ def test_only_a_compressed_frame_is_called_so():
     assert not block_compressed(CASES["both Gaussian-filtered, 0.8"](5).short)
 
 
-@pytest.mark.xfail(strict=True, reason="pixels of uneven gain in a burst are not flagged yet")
+def test_a_comb_of_codes_is_flagged_as_such_and_does_not_make_the_figures_bad():
+    generator = np.random.default_rng(3)
+    scene = sim.random_scene(generator, 128)
+    short, long = sim.clean(generator, scene / 10)
+    move = (short % 2 == 1) & (generator.random(short.shape) < 0.3)
+    found = measure_exposures([ExposurePair(short + np.where(move, generator.choice([-1, 1], short.shape), 0), long)])
+    assert "uneven codes" in [one.name for one in found.verdict.reasons]
+    assert found.verdict.grade == "doubtful"
+    assert found.detector.misfit < 1.3
+    even = measure_exposures([ExposurePair(short, long)])
+    assert "uneven codes" not in [one.name for one in even.verdict.reasons]
+
+
 def test_uneven_pixels_are_seen_in_a_burst():
     generator = np.random.default_rng(3)
     scene = sim.random_scene(generator, 128)

@@ -7,7 +7,7 @@ from scipy import ndimage, stats
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
-from calibration.detector.measure import dark_offset, measure_detector, misfit
+from calibration.detector.measure import dark_offset, measure_detector
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import (
     NUM_WALKERS,
@@ -16,6 +16,7 @@ from calibration.detector.posterior import (
     potential_scale_reduction,
     sample_posterior,
 )
+from calibration.detector.shape import misfit
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
 from calibration.registration.aligned import align_with

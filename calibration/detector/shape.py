@@ -1,0 +1,155 @@
+"""How far the histograms depart from a Poisson-Gaussian detector's: in shape, in the converter's codes, from pixel to pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from calibration.detector.levels import Levels
+from calibration.detector.likelihood import LevelMasses
+from calibration.exposures.frames import Image
+from calibration.exposures.scaling import fit_line, spread_by_level
+from calibration.registration.aligned import AlignedPair
+
+MERGED = 4
+"""Codes taken together where single ones are uneven: four of a usual comb hold equal shares."""
+
+NEIGHBOURS = 9
+"""Codes over which the shape of a distribution is straight, so that what is left is the codes' own."""
+
+LEAST_DEVIATION = 2.0
+"""Codes per standard deviation of the noise, from which on neither shape nor single electrons alternate from code to code."""
+
+CLEAR = 5.0
+"""Standard errors beyond which codes are held to be uneven."""
+
+CLEAR_PIXELS = 4.0
+"""Standard errors beyond which pixels are: two tests of a burst reach them by chance once in 10⁴ bursts."""
+
+ROUNDS = 12
+"""Orders in which the frames of a burst are paired: each pairing adds information, twelve hold nearly all of it."""
+
+CUT = 5.0
+"""Standard deviations at which differences are cut, so that single outliers do not speak for all pixels."""
+
+
+def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
+    """χ² per degree of freedom of the histograms, over cells where at least `least` readings are expected.
+
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+        parameters: (3,) gain, offset, read noise.
+        least: readings expected.
+        merged: neighbouring cells of the readings' histograms that are taken together.
+    """
+    squares, freedom = 0.0, -3
+    for one, histogram, expected in _expected(levels, parameters):
+        if one.absolute and merged > 1:
+            histogram, expected = (_merged(values, merged) for values in (histogram, expected))
+        used = expected > least
+        departure = one.weight[:, None] * (histogram - expected) ** 2
+        squares += float(np.sum(departure[used] / expected[used]))
+        freedom += int(used.sum()) - len(histogram) - int(np.sum(one.scale < 0))
+    return squares / max(freedom, 1)
+
+
+def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 50.0) -> float:
+    """Relative deviation (rms) of the widths of the converter's codes from their neighbours'; 0 where none stands out.
+
+    A converter's differential non-linearity, or whole numbers that were rescaled and rounded again, favour some codes in
+    every level alike. Only codes fine enough for the noise are compared, so that no peaks of single electrons alternate.
+
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+        parameters: (3,) gain, offset, read noise.
+        least: readings expected of a code.
+    """
+    seen: dict[int, list[float]] = {}
+    gain, _, read_noise = parameters
+    for one, histogram, expected in _expected(levels, parameters):
+        fine = (one.width == one.step) & (one.step * LEAST_DEVIATION < gain * read_noise)
+        for row in np.flatnonzero(fine) if one.absolute else ():
+            first = round(one.origin[row] / one.step[row] + 0.5)
+            for cell in np.flatnonzero(expected[row] > 1):
+                total = seen.setdefault(first + int(cell), [0.0, 0.0])
+                total[0] += float(histogram[row, cell])
+                total[1] += float(expected[row, cell])
+    codes = [
+        code for code in range(min(seen, default=0), max(seen, default=-1) + 1) if seen.get(code, [0, 0])[1] > least
+    ]
+    if len(codes) < 4 * NEIGHBOURS:
+        return 0.0
+    counted, expected_all = np.array([seen[code] for code in codes]).T
+    ratio = counted / expected_all
+    departure = ratio - ndimage.uniform_filter1d(ratio, NEIGHBOURS)
+    noise = (1 - 1 / NEIGHBOURS) * ndimage.uniform_filter1d(ratio, NEIGHBOURS) / expected_all
+    excess = float(np.sum(departure**2 / noise)) - len(codes)
+    share = float(np.sum(departure**2 - noise)) / len(codes)
+    return float(np.sqrt(share)) if excess > CLEAR * np.sqrt(2 * len(codes)) and share > 0 else 0.0
+
+
+def unevenness(pairs: Sequence[AlignedPair]) -> float:
+    """Relative deviation (rms) of the pixels' variances at equal signal, in a burst.
+
+    Squares of differences of disjoint pairs of frames correlate over the pixels only where some pixels are noisier than
+    others. Dim pixels, where read noise is seen, count more.
+
+    Returns:
+        0 for fewer than four frames or a moving scene, or where nothing stands out of `CLEAR_PIXELS` standard errors.
+    """
+    if len(pairs) < 4 or pairs[0].frames == 1 or _moved(pairs):
+        return 0.0
+    mask = np.logical_and.reduce([pair.mask for pair in pairs])
+    frames = np.stack([(pair.short[mask] - pair.scaling.intercept) / pair.scaling.slope for pair in pairs])
+    level = frames.mean(
+        0
+    )  # of the frames themselves: given it, Poisson counts have just its variance, however steep the scene
+    squares = frames.var(axis=0, ddof=1)
+    line = fit_line(level, squares)
+    spread = np.sqrt(np.maximum(line(level), 1e-3 * squares.mean()))
+    spread *= spread_by_level(level, (frames[0] - frames[1]) / spread)
+    products, power = _products(frames, spread)
+    independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
+    found = 0.0
+    for weight in (np.ones_like(spread), (spread.min() / spread) ** 4):
+        mean = float(np.average(products, weights=weight))
+        error = power / np.sqrt(independent) * float(np.sqrt(np.sum(weight**2)) / weight.sum())  # of even pixels
+        found = max(found, mean if mean > CLEAR_PIXELS * error else 0.0)
+    return float(np.sqrt(found))
+
+
+def _products(frames: Image, spread: Image) -> tuple[Image, float]:
+    """(N,) mean product of the squares of two disjoint frame differences, less 1 each; its mean is the squared unevenness. And
+    the variance of such a square, about 2."""
+    generator = np.random.default_rng(0)
+    total, power = np.zeros(frames.shape[1]), 0.0
+    for _ in range(ROUNDS):
+        order = generator.permutation(len(frames))
+        even = order[: len(order) // 2 * 2]
+        difference = (frames[even[::2]] - frames[even[1::2]]) / (np.sqrt(2) * spread)
+        squares = np.clip(difference - np.median(difference, axis=1, keepdims=True), -CUT, CUT) ** 2
+        squares = squares / squares.mean(axis=1, keepdims=True) - 1
+        number, power = len(squares), power + float(np.mean(squares**2)) / ROUNDS
+        total += (squares.sum(0) ** 2 - (squares**2).sum(0)) / (number * (number - 1))
+    return total / ROUNDS, power
+
+
+def _moved(pairs: Sequence[AlignedPair]) -> bool:
+    """Whether frames were moved onto each other before they were compared: then their differences are of other pixels."""
+    others = (np.sum([pair.short for pair in pairs[1:]], axis=0)) / (len(pairs) - 1)
+    first, mask = pairs[0], pairs[0].mask
+    return bool(np.std((first.long - others)[mask]) > 0.05 * np.std((first.short - others)[mask]))
+
+
+def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Levels, Image, Image]]:
+    """Each set of levels, its histograms and those expected, (L, cells)."""
+    gain, offset, read_noise = (np.array([value]) for value in parameters)
+    for one in levels:
+        number = one.histogram.sum(axis=1, keepdims=True)
+        yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
+
+
+def _merged(values: Image, number: int) -> Image:
+    return np.asarray(values.reshape(len(values), -1, number).sum(-1))
