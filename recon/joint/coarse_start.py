@@ -14,7 +14,6 @@ from torch.nn import functional
 from noiseflow import Gaussian, fit
 from recon.fields.fields import Field, MultiresolutionField
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import block_mask
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import attenuation_scale, rough_volume
@@ -58,9 +57,7 @@ def coarse_start(
     rate = learning_rate(start, field)
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
-    held_out = block_mask(tuple(images.shape), block=1, generator=generator)
-    options: dict[str, Any] = {"mask": use, "held_out": held_out, "generator": generator}
-    fit(Gaussian(), signal_model, images, digitise=False, num_steps=num_steps, **options)
+    fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
     return field.volume() / binning
 
 

@@ -96,16 +96,7 @@ def noise_share(images: NDArray[Any]) -> float:
 
 
 def block_mask(shape: tuple[int, ...], *, share: float = 0.1, block: int = 4, generator: torch.Generator) -> Tensor:
-    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away.
-
-    The mask of a mirrored series is the mirrored mask, upside down and with u and the order of the tilts reversed: a file
-    written the other way round gives the same volume.
-    """
-    tilts, width, height = shape
-    some, upper = -(-tilts // 2), -(-height // 2)
-    coarse = torch.rand((some, -(-width // block), -(-upper // block)), generator=generator) < share
-    quarter = coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, :width, :upper]
-    half = torch.cat([quarter, quarter[:, :, : height // 2].flip(2)], 2)
-    if tilts % 2:  # the middle image is its own mirror image
-        half[-1, width - width // 2 :] = half[-1, : width // 2].flip(0)
-    return torch.cat([half, half[: tilts // 2].flip(0, 1)])
+    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away."""
+    tilts, *sides = shape
+    coarse = torch.rand((tilts, *(-(-side // block) for side in sides)), generator=generator) < share
+    return coarse.repeat_interleave(block, 1).repeat_interleave(block, 2)[:, : sides[0], : sides[1]]
