@@ -177,7 +177,10 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         add("coarse", "simple" if taken_over else noise, quarter, half=True)
     if quarter and taken_over:
         add("go on", "simple", 3 * quarter - sum(stage.num_steps for stage in stages))
-        stages.append(FitStage("learn noise on the volume", "noise", "whole", noise, schedule.refine, standardise=True))
+        if not facts.settled:  # blocks of one volume share the noise model that the slab has taught
+            stages.append(
+                FitStage("learn noise on the volume", "noise", "whole", noise, schedule.refine, standardise=True)
+            )
     add("fit", noise, num_steps - sum(stage.num_steps for stage in stages if stage.kind == "signal"))
     return stages
 

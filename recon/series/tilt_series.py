@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -88,8 +89,15 @@ class TiltSeries:
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
     def rows(self, rows: slice) -> TiltSeries:
-        """Some rows (y) of all images."""
-        return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
+        """Some rows (y) of all images; they may be flat, where the whole is not."""
+        return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
+
+    def with_images(self, images: NDArray[Any], mask: NDArray[np.bool_] | None) -> TiltSeries:
+        """The same series with a part of its images, which were checked, or with copies of them."""
+        part = copy.copy(self)
+        object.__setattr__(part, "images", images)
+        object.__setattr__(part, "mask", mask)
+        return part
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice.
