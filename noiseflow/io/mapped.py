@@ -18,6 +18,12 @@ IN_MEMORY = 2**28
 """Bytes up to which a temporary array is kept in memory: a file would only cost time."""
 
 
+def is_large(path: str | Path) -> bool:
+    """Whether a file is better left on the disk."""
+    file = Path(str(path).partition("::")[0])
+    return file.is_file() and file.stat().st_size > IN_MEMORY
+
+
 def is_mapped(array: NDArray[Any]) -> bool:
     """Whether an array, or what it is a view of, lies in a file."""
     base: Any = array

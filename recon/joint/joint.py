@@ -104,6 +104,7 @@ class JointReconstructor:
         start, part = self._start(tilt_series, grid), tilt_series.rows(rows)
         model = self._model(start, part, replace(grid, height=rows.stop - rows.start), rows=rows)
         run = self._slab(part, model, progress, share=noise_share(tilt_series.images))
+        run.fit_whole()  # of the slab: the response, and what is left for the noise, are those of a whole fit
         return run.settled(rows, start)
 
     @kept_memory()

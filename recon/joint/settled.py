@@ -76,8 +76,8 @@ class PlannedRun:
         return self.runner.result
 
     def settled(self, slices: slice, start: Start) -> Settled:
-        """What the slab has settled."""
-        model = self.runner.tasks["slab"].signal_model
+        """What a slab has settled, which was the whole of this run."""
+        model = self.runner.tasks["whole"].signal_model
         return Settled(
             simple=self.runner.models["simple"],
             noise_model=self.noise_model,

@@ -86,7 +86,7 @@ class FittedBlock:
     near: TomographySignal | None = None
 
     def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, Images]:
-        fit = replace(self.fit, prefix=f"{self.fit.prefix}slices from {block.rows.start}: ")
+        fit = replace(self.fit, prefix=f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: ")
         grid = replace(self.grid, height=block.wide.stop - block.wide.start)
         projector = None if self.near is None else self.near.projector
         found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)

@@ -116,16 +116,17 @@ def _store(path: Path, array: NDArray[Any]) -> None:
 
 
 def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: list[Block], files: BlockFiles) -> None:
-    """Blocks as tasks, each of which writes its own file: nothing large travels, and what a dead worker had is done by another."""
-    from dask.distributed import as_completed
+    """Blocks as tasks, each of which writes its own file: nothing large travels, and another worker does what a dead one had."""
+    import dask.distributed
 
     source = StoredSeries.of(tilt_series, files.folder.absolute())
     files = BlockFiles(files.folder.absolute())
     left = [part for part in parts if not files.finished(part)]
     shared = client.scatter(replace(method, finish=_no_result), broadcast=True, hash=False)
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
+    library: Any = dask.distributed  # it has no types
     try:
-        for task in as_completed(tasks):
+        for task in library.as_completed(tasks):
             task.result()
     finally:
         client.cancel(tasks)
