@@ -126,7 +126,7 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
     library: Any = dask.distributed  # it has no types
     try:
-        for task in library.as_completed(tasks):
+        for task in library.as_completed(tasks, loop=client.loop):
             task.result()
     finally:
         client.cancel(tasks)
