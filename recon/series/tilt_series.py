@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.described import described, size_of
+from noiseflow.io import mapped
+from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
 
@@ -102,12 +104,19 @@ class TiltSeries:
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice.
 
-        Evenly spaced tilts are views of the images, so mapped ones stay on the disk.
+        Evenly spaced tilts are views of the images, so mapped ones stay on the disk; others go to a temporary file where the
+        images are mapped and large.
         """
         tilts = evenly(tilts, self.num_tilts)
+        if not isinstance(tilts, slice) and is_mapped(self.images) and self.images.nbytes > mapped.IN_MEMORY:
+            numbers = np.arange(self.num_tilts)[tilts]
+            shape = (len(numbers), *self.images.shape[1:])
+            images = mapped.mapped_copy((self.images[number] for number in numbers), shape, self.images.dtype)
+        else:
+            images = self.images[tilts]
         mask = None if self.mask is None else self.mask[tilts]
         beam = None if self.beam is None else self.beam[tilts]
-        return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
+        return replace(self, images=images, tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
 
 
 @described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")
