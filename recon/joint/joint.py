@@ -205,7 +205,7 @@ class JointReconstructor:
     def _facts(
         self, tilt_series: TiltSeries, whole: TomographySignal, *, share: float | None = None
     ) -> tuple[Facts, slice, nn.Module | None]:
-        """What is known before any fit, the slices to choose on, and the given noise model; `share` is the noise of all slices."""
+        """What is known before any fit, the slices to choose on, and the given noise model; `share` is all slices' noise."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and (noise_share(tilt_series.images) if share is None else share) < _QUIET
