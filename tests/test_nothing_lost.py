@@ -172,7 +172,7 @@ def test_what_a_killed_run_in_blocks_left_is_cleared(files: Path, tmp_path: Path
         4,
     ]
     process = start(words, tmp_path / "log")
-    wait_for(lambda: bool(list(tmp_path.glob(".volume-*/blocks.npy"))), process)
+    wait_for(lambda: bool(list(tmp_path.glob("volume.npy.checkpoint/blocks-*/volume-*.npy"))), process)
     kill(process)
     assert list(tmp_path.glob(".volume-*"))
     finish(["sample", files / "model.safetensors", files / "clean.npy", "-o", tmp_path / "other.npy"], tmp_path / "log")

@@ -101,9 +101,16 @@ def reserve(path: Path, num_bytes: int) -> None:
     Raises:
         OSError: the disk has not as much room.
     """
+    with path.open("r+b") as stream:
+        reserve_room(stream.fileno(), num_bytes)
+
+
+def reserve_room(handle: int, num_bytes: int) -> None:
+    """The same for an open file, which becomes as long. Raises as `reserve`."""
     if hasattr(os, "posix_fallocate"):
-        with path.open("r+b") as stream:
-            os.posix_fallocate(stream.fileno(), 0, num_bytes)
+        os.posix_fallocate(handle, 0, num_bytes)
+    else:
+        os.ftruncate(handle, num_bytes)
 
 
 def _require_writable(folder: Path) -> None:

@@ -19,7 +19,15 @@ from noiseflow.commands.console import (
     step_report,
 )
 from recon.commands.options import load_noise_model, method_of
-from recon.commands.running import memory_line, open_journal, scratch_beside, stoppable, warnings_as_lines
+from recon.commands.running import (
+    disk_line,
+    memory_line,
+    open_journal,
+    scratch_beside,
+    slices_for,
+    stoppable,
+    warnings_as_lines,
+)
 from recon.methods._names import method_names
 
 if TYPE_CHECKING:
@@ -95,7 +103,14 @@ def reconstruct(
         ),
     ] = 0.0,
     slices_at_once: Annotated[
-        int | None, typer.Option(min=1, help="Reconstruct in blocks of so many slices, where memory is short.")
+        int | None,
+        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen by itself where memory is short."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Reconstruct blocks in so many processes at a time (extra [distributed]).")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the blocks.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
     checkpoint_interval: Annotated[float, typer.Option(min=0, help="Seconds between checkpoints.")] = 60.0,
@@ -124,10 +139,12 @@ def reconstruct(
     Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
     """
     from noiseflow.io import locked, require_other
+    from noiseflow.io.mapped import is_large
     from recon.commands.inputs import files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.methods import find_method, settings_of
     from recon.report.page import read_reference
+    from recon.scale.cluster import client_of
     from recon.series.tilt_series import VolumeGrid
 
     output = Output(json)
@@ -141,6 +158,10 @@ def reconstruct(
     settings_of(**options)
     if fsc and slices_at_once is not None:
         raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
+    if fsc and (workers is not None or scheduler is not None):
+        raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --workers and --scheduler")
+    if workers is not None and scheduler is not None:
+        raise ValueError("--scheduler has workers of its own; leave out --workers")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
@@ -156,7 +177,7 @@ def reconstruct(
             invert_contrast=invert_contrast,
             mask=mask,
             mask_nan=mask_nan,
-            mapped=slices_at_once is not None,
+            mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with step_report(json_mode=json) as progress:
             prepared = prepare(
@@ -173,16 +194,22 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once)
+        if slices_at_once is None and not fsc:
+            many = workers if scheduler is None else 2
+            slices_at_once = slices_for(tilt_series, grid, method, chosen_device, many)
+        memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
         output.line(memory)
+        if slices_at_once is not None:
+            output.line(disk_line(tilt_series, grid, slices_at_once))
         if dry_run:
             _show_plan(tilt_series, grid, options, memory, output)
             return
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
-        with stoppable(journal, context), scratch_beside(out) as scratch:
+        with stoppable(journal, context), scratch_beside(out) as scratch, client_of(workers, scheduler) as client:
             if slices_at_once is not None:
-                options |= {"slices_at_once": slices_at_once, "scratch": scratch}
+                options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
+                options["keep"] = journal.keep
             with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
             verdict = targets.write(

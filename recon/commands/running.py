@@ -111,13 +111,19 @@ def warnings_as_lines(output: Output) -> Iterator[list[str]]:
 
 
 def memory_line(
-    tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, slices_at_once: int | None = None
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    method: str,
+    device: Any,
+    slices_at_once: int | None = None,
+    workers: int = 1,
 ) -> str:
     """One line about the memory needed and available.
 
     Raises:
         MemoryError: it does not fit.
     """
+    from noiseflow.io.mapped import is_mapped
     from recon.scale.blocks import block_memory
     from recon.scale.memory import needed_memory, require_memory
 
@@ -125,7 +131,36 @@ def memory_line(
     if slices_at_once is None:
         return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
     block = block_memory(tilt_series, grid, slices_at_once, fitted=fitted)
-    return require_memory(needed_memory(*block, fitted=fitted) + tilt_series.images.nbytes, device)
+    held = 0 if is_mapped(tilt_series.images) else tilt_series.images.nbytes
+    return require_memory(needed_memory(*block, fitted=fitted) * workers + held, device)
+
+
+def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
+    """Slices of a block, where the whole volume does not fit into memory or workers share it; else None.
+
+    Raises:
+        MemoryError: not even a few slices fit.
+    """
+    from recon.methods import find_method
+    from recon.scale.memory import available_memory, choose_slices
+
+    found, available = find_method(method), available_memory(device)
+    if found.blockwise is None:
+        return None
+    if available is None:
+        return None if workers is None else -(-grid.height // workers)
+    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1)
+
+
+def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int) -> str:
+    """One line about the blocks and the room on the disk that they take until the volume is whole."""
+    from recon.scale.blocks import HALO, blocks
+
+    parts = blocks(grid.height, slices_at_once, HALO)
+    listed = sum(part.wide.stop - part.wide.start for part in parts)
+    num_bytes = 4 * ((listed + 2 * grid.height) * grid.depth * grid.width)
+    num_bytes += 4 * tilt_series.num_tilts * tilt_series.images.shape[2] * (listed + grid.height)
+    return f"blocks: {len(parts)} of {slices_at_once} slices at most; disk: about {num_bytes / 2**30:.1f} GiB meanwhile"
 
 
 @contextlib.contextmanager

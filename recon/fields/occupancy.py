@@ -64,6 +64,16 @@ class Occupancy(nn.Module):
         return part
 
     @torch.no_grad()
+    def wants(self, gradient: Tensor, projector: Projector, cost: float) -> Tensor:
+        """The blocks of voxels that the data want occupied; arguments as of `retest`."""
+        options: dict[str, Any] = {"ceil_mode": True, "divisor_override": 1}
+        # slices are projected one by one: those of a block may be added up before
+        slabs = functional.avg_pool2d(gradient[None, None], (1, self.block), **options)[0, 0]
+        lattice = projector.backproject(slabs).view(*self.mask.shape[:2], -1)
+        gain = -functional.avg_pool3d(lattice[None, None], (self.block, self.block, 1), **options)[0, 0]
+        return gain > 6 * self.block**2 * cost
+
+    @torch.no_grad()
     def retest(self, gradient: Tensor, projector: Projector, cost: float) -> None:
         """Occupy the blocks that the data wants, in every tenth call.
 
@@ -75,12 +85,7 @@ class Occupancy(nn.Module):
         self.num_steps += 1
         if int(self.num_steps) % _RETEST_EVERY:
             return
-        options: dict[str, Any] = {"ceil_mode": True, "divisor_override": 1}
-        # slices are projected one by one: those of a block may be added up before
-        slabs = functional.avg_pool2d(gradient[None, None], (1, self.block), **options)[0, 0]
-        lattice = projector.backproject(slabs).view(*self.mask.shape[:2], -1)
-        gain = -functional.avg_pool3d(lattice[None, None], (self.block, self.block, 1), **options)[0, 0]
-        wanted = gain > 6 * self.block**2 * cost
+        wanted = self.wants(gradient, projector, cost)
         lasting, self.wanted = wanted & self.wanted, wanted
         for axis, size in enumerate(self.mask.shape):
             lasting = lasting.repeat_interleave(self.block, axis).narrow(axis, 0, size)

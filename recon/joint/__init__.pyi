@@ -1,2 +1,2 @@
 from .joint import JointReconstructor as JointReconstructor
-from .joint import Settled as Settled
+from .settled import Settled as Settled

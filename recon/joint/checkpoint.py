@@ -24,6 +24,8 @@ from torch import Tensor, nn
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.io import atomic_path
+from noiseflow.io.ownership import is_own
+from noiseflow.io.partials import clear_all_leftovers
 from recon.joint.stages import Stage
 from recon.joint.state_files import discard_states
 from recon.joint.state_files import read_state as read_state
@@ -33,7 +35,7 @@ StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)`` after every step of every fit."""
 
 _FORMAT = "noiseflow checkpoint 2"
-_RUN, _CURRENT = "run.json", "current.safetensors"
+_RUN, _CURRENT, _BLOCKS = "run.json", "current.safetensors", "blocks-"
 _RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
 
 
@@ -170,8 +172,21 @@ class Journal:
 
         return progress
 
+    def keep(self, prefix: str = "") -> Path:
+        """The folder of the finished blocks of a volume, named by the prefix of its fits; gone with the journal."""
+        if self._fresh:
+            self._start()
+        return self.folder / f"{_BLOCKS}{hashlib.blake2b(prefix.encode(), digest_size=4).hexdigest()}"
+
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
+        for blocks in self.folder.glob(f"{_BLOCKS}*"):
+            clear_all_leftovers(blocks)
+            for file in blocks.glob("*.npy"):
+                if is_own(file):
+                    file.unlink()
+            if not any(blocks.iterdir()):
+                blocks.rmdir()
         discard_states(self.folder, _RUN)
 
     def _finished(self, name: str) -> Path:

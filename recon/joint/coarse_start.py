@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,27 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 _COARSE = 24
 _LEAST_BINNING = 4
 _HIGHEST_RATE, _RATE = 0.4, 0.6
+
+
+@dataclass(frozen=True)
+class Start:
+    """What all slices of a series begin with.
+
+    Attributes:
+        rough: (z, y, x) the coarse volume of all slices, attenuation per voxel of the whole grid.
+        response: the detector's, as it suits that volume.
+        height: slices of the series.
+    """
+
+    rough: Tensor
+    response: Transmission | Linear
+    height: int
+
+    def rows(self, rows: slice) -> Tensor:
+        """The coarse volume of some slices, with as many layers along y as there are slices."""
+        depth, _, width = self.rough.shape
+        stretched = functional.interpolate(self.rough[None, None], (depth, self.height, width), mode="trilinear")
+        return stretched[0, 0, :, rows].contiguous()
 
 
 def coarse_start(
@@ -84,9 +107,7 @@ def _binned(
     tilt_series: TiltSeries, grid: VolumeGrid, binning: int
 ) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
     """The series averaged over squares of pixels, with a mask, and the projector from a lattice of voxels as large."""
-    use = np.ones(tilt_series.images.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask
-    share = _means(use, binning)
-    images = _means(np.where(use, tilt_series.images, 0), binning) / share.clip(min=1e-6)
+    images, share = (np.stack(parts) for parts in zip(*_binned_images(tilt_series, binning), strict=True))
     mask = share > 0
     images[~mask] = images[mask].mean()
     projector = SliceProjector(
@@ -94,13 +115,21 @@ def _binned(
         depth=-(-grid.depth // binning),
         width=-(-grid.width // binning),
         detector_width=images.shape[2],
-        detector_offset=-(use.shape[2] % binning) / 2 / binning,
+        detector_offset=-(tilt_series.images.shape[2] % binning) / 2 / binning,
     )
     return TiltSeries(images, tilt_series.tilt_angles, None, tilt_series.mode), mask, projector
 
 
-def _means(images: NDArray[Any], size: int) -> NDArray[np.float32]:
+def _binned_images(tilt_series: TiltSeries, binning: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Image by image, for a series may be larger than memory: means of the used pixels of each square, and their share."""
+    for number, image in enumerate(tilt_series.images):
+        use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
+        share = _means(use, binning)
+        yield _means(np.where(use, image, 0), binning) / share.clip(min=1e-6), share
+
+
+def _means(image: NDArray[Any], size: int) -> NDArray[np.float32]:
     """Means of squares of `size` pixels; what is left over at the far edges is left out."""
-    tensor = torch.from_numpy(np.asarray(images, dtype=np.float32))
-    means: NDArray[np.float32] = functional.avg_pool2d(tensor[:, None], size)[:, 0].numpy()
+    tensor = torch.from_numpy(np.asarray(image, dtype=np.float32))
+    means: NDArray[np.float32] = functional.avg_pool2d(tensor[None], size)[0].numpy()
     return means

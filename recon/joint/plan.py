@@ -140,6 +140,10 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
         FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold),
     ]
+    if (
+        facts.quiet and not facts.simple_is_final
+    ):  # a width measured on a rough signal leaves the volume to the regulariser
+        stages.append(FitStage("measure noise", "noise", "slab", "simple", _START, standardise=True))
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
     elif facts.learn_noise:
@@ -176,8 +180,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     learning = facts.learn_noise and not facts.settled and noise == "chosen"
     if quarter:  # the simple noise pulls at a rough signal steadily
         add("begin", "simple", quarter, half=facts.can_halve)
-        if taken_over:  # a width measured on a rough signal would leave the volume to the regulariser
-            stages.append(FitStage("measure noise", "noise", "whole", "simple", _START, standardise=True))
+        if taken_over:
             add("go on", "simple", 2 * quarter)
         elif facts.can_halve or learning:
             add("go on", noise, quarter, half=facts.can_halve)

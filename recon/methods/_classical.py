@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
-from recon.methods._registry import Finish
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Images, Solve
+from recon.scale.blocks import Block, Blockwise, Images
 from recon.series.first_guess import contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import every_nth_view, level_of, view_numbers, without_level
@@ -82,7 +81,7 @@ def in_blocks(
     device: torch.device | str,
     solve_problem: Callable[[LineIntegralProblem], Tensor],
     choices: dict[str, float | str],
-) -> tuple[Solve, Finish]:
+) -> Blockwise:
     """A method whose slices do not depend on each other, block by block, under the response of the whole series."""
     level = level_of(tilt_series)
     response = estimate_response(tilt_series, level=level).to(device)
@@ -94,8 +93,8 @@ def in_blocks(
         device=device,
     )
 
-    def solve(rows: slice) -> tuple[Images, Images]:
-        lowered = np.asarray(tilt_series.images[:, rows] - np.float64(level), dtype=np.float32)
+    def solve(part: TiltSeries, block: Block) -> tuple[Images, Images]:
+        lowered = np.asarray(part.images - np.float64(level), dtype=np.float32)
         images = torch.from_numpy(lowered).to(device)
         problem = LineIntegralProblem(response.invert(images).contiguous().detach(), projector, response, level)
         volume = solve_problem(problem)
@@ -104,7 +103,7 @@ def in_blocks(
     def finish(volume: Volume, projections: Images) -> Reconstruction:
         return Reconstruction(volume, projections, name, choices=choices)
 
-    return solve, finish
+    return Blockwise(solve, finish)
 
 
 def best_window(

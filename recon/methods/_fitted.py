@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,14 @@ from noiseflow.models.around import as_noise_model
 from noiseflow.models.at_level import at_level
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
+from recon.joint.run import Progress, run_fit
+from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
-from recon.methods._registry import Finish, Method, Settings
+from recon.methods._registry import Method, Settings
 from recon.projection.defocused_projector import DefocusedProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Images, Solve, with_halo
+from recon.scale.blocks import HALO, Block, Blockwise, Images
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import far_level, lowered_by
 
@@ -46,16 +48,10 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
     def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int]:
         return reconstructor(settings, options).plan(tilt_series, grid)
 
-    def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[Solve, Finish]:
+    def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
         fit = reconstructor(settings, options)
         settled = fit.settle(tilt_series, grid, progress=settings.progress)
-
-        def solve(rows: slice) -> tuple[Images, Images]:
-            wide, inner = with_halo(rows, grid.height)
-            block = replace(fit, prefix=f"{fit.prefix}slices from {rows.start}: ")
-            part, part_grid = tilt_series.rows(wide), replace(grid, height=wide.stop - wide.start)
-            found = block.fit(part, part_grid, settled, progress=settings.progress)
-            return found.volume.attenuation[:, inner], found.projections[:, inner]
+        solve = FittedBlock(fit, settled.portable(), grid, settings.progress, settled.signal_model)
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
@@ -65,7 +61,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
             }
             return replace(result, choices=_choices(result, settings, tilt_series) | where)
 
-        return solve, finish
+        return Blockwise(solve, finish, HALO)
 
     return Method(
         name,
@@ -77,6 +73,36 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         plan=make_plan,
         blockwise=blockwise,
     )
+
+
+@dataclass(frozen=True)
+class FittedBlock:
+    """Fits the slices of a block under what is settled for all.
+
+    Attributes:
+        fit: the joint fit.
+        settled: by it, for all slices.
+        grid: of the whole volume.
+        progress: called with the steps done, those expected, and a note; None on another machine.
+        near: a signal model whose projector can be used again; None on another machine.
+    """
+
+    fit: JointReconstructor
+    settled: Settled
+    grid: VolumeGrid
+    progress: Progress | None = None
+    near: TomographySignal | None = None
+
+    def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, Images]:
+        fit = replace(self.fit, prefix=f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: ")
+        grid = replace(self.grid, height=block.wide.stop - block.wide.start)
+        projector = None if self.near is None else self.near.projector
+        found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)
+        return found.volume.attenuation, found.projections
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what belongs to this process: progress bar, journal and matrices."""
+        return self.__dict__ | {"progress": None, "near": None, "fit": replace(self.fit, run_fit=run_fit)}
 
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:

@@ -22,8 +22,9 @@ from recon.joint.stages import RunStage, run_stage
 from recon.methods._names import GROUP, method_names
 from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Images, Solve, solve_in_blocks
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.scale.blocks import Blockwise
+from recon.scale.running import reconstruct_in_blocks
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import first_copies
 
 
@@ -43,6 +44,8 @@ class Settings:
         device: where to compute.
         progress: called with the steps done, those expected, and a note.
         prefix: of the names of fits, where one run makes several volumes.
+        keep: gives the folder in which finished blocks are kept for a run that resumes; by default they are kept until the volume
+            is whole. It is called with the prefix.
         run_fit, run_stage: run every fit and every other long piece of work; a `recon.joint.checkpoint.Journal` keeps what each
             has reached.
 
@@ -60,6 +63,7 @@ class Settings:
     device: torch.device | str = "cpu"
     progress: Progress | None = None
     prefix: str = ""
+    keep: Callable[[str], Path] | None = None
     run_fit: RunFit = run_fit
     run_stage: RunStage = run_stage
 
@@ -76,8 +80,7 @@ class Settings:
 
 Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
 MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], int]]
-Finish = Callable[[Volume, Images], Reconstruction]
-Blockwise = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, Finish]]
+SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
 @described()
@@ -93,8 +96,7 @@ class Method:
         keeps_noise_model: whether it takes a calibrated noise model; another refuses one.
         learns_noise: whether its result has a noise model.
         plan: the stages of its fit, and the slices of the slab that choices are made on; None where nothing is planned.
-        blockwise: settles what all slices share, and returns what reconstructs some of them and what makes the result of all
-            their volumes and projections; None where slices cannot be reconstructed apart.
+        blockwise: settles what all slices share; None where slices cannot be reconstructed apart.
     """
 
     name: str
@@ -104,7 +106,7 @@ class Method:
     keeps_noise_model: bool = False
     learns_noise: bool = False
     plan: MakePlan | None = None
-    blockwise: Blockwise | None = None
+    blockwise: SettleBlocks | None = None
 
 
 @cache
@@ -151,6 +153,7 @@ def reconstruct(
     method: str = "auto",
     slices_at_once: int | None = None,
     scratch: str | Path | None = None,
+    client: Any = None,
     **settings: Any,
 ) -> Reconstruction:
     """Reconstruct a volume from a tilt series.
@@ -160,7 +163,9 @@ def reconstruct(
         grid: voxels and their size; by default one voxel per pixel and as deep as wide.
         method: one of `method_names`.
         slices_at_once: reconstruct in blocks of so many slices, where memory is short.
-        scratch: with `slices_at_once`, a new ``.npy`` file that holds the volume; the result maps it to memory.
+        scratch: with `slices_at_once`, a new ``.npy`` or MRC file that holds the volume; the result maps it to memory.
+        client: with `slices_at_once`, a ``dask.distributed.Client`` whose workers reconstruct the blocks; they must see the
+            folder of `scratch`.
         **settings: the attributes of `Settings`.
 
     Returns:
@@ -178,6 +183,7 @@ def reconstruct(
             method=method,
             slices_at_once=slices_at_once,
             scratch=scratch,
+            client=client,
             **settings,
         )
         return replace(result, projections=result.projections[np.argsort(order)])
@@ -191,8 +197,16 @@ def reconstruct(
         raise ValueError(f"--slices-at-once does not know --method {method}: choose {', '.join(able)}")
     if scratch is None:
         raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
-    solve, finish = found.blockwise(tilt_series, grid, chosen)
-    return finish(*solve_in_blocks(solve, tilt_series, grid, Path(scratch), slices_at_once))
+    method_in_blocks = found.blockwise(tilt_series, grid, chosen)
+    return reconstruct_in_blocks(
+        method_in_blocks,
+        tilt_series,
+        grid,
+        scratch=Path(scratch),
+        folder=None if chosen.keep is None else chosen.keep(chosen.prefix),
+        slices_at_once=slices_at_once,
+        client=client,
+    )
 
 
 def _run(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from recon.joint.stages import Repeated
 from recon.methods._classical import LineIntegralProblem, best_num_iterations, classical, in_blocks
-from recon.methods._registry import Finish, Method, Settings
+from recon.methods._registry import Method, Settings
 from recon.projection.sirt import sirt
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Solve
+from recon.scale.blocks import Blockwise
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
@@ -24,7 +24,7 @@ def _run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Recon
     return classical("sirt", problem, iterations.value, grid, {"iterations": count})
 
 
-def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[Solve, Finish]:
+def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
     count = settings.num_steps or best_num_iterations(tilt_series, grid, run_stage=settings.run_stage)
     return in_blocks(
         "sirt",

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from recon.methods._classical import LineIntegralProblem, best_window, classical, in_blocks
-from recon.methods._registry import Finish, Method, Settings
+from recon.methods._registry import Method, Settings
 from recon.projection.wbp import WINDOWS, wbp
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Solve
+from recon.scale.blocks import Blockwise
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
@@ -21,7 +21,7 @@ def _run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Recon
     return classical("wbp", problem, volume, grid, {"window": window, "cutoff": cutoff})
 
 
-def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[Solve, Finish]:
+def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
     window, cutoff = _filter(tilt_series, grid, settings)
     return in_blocks(
         "wbp",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector, from_columns, from_rays, to_columns, to_rays
-from recon.projection.sparse import PanelledMatrix
+from recon.projection.sparse import PanelledMatrix, build_panelled
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
@@ -65,8 +65,13 @@ class SliceProjector(Projector):
         self.tilt_angles = angles
         self.depth, self.width, self.detector_width = depth, width, detector_width
         self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
-        rays, voxels, weights = _joseph(angles, self.detector_offset, depth, width, detector_width)
-        self._set_entries(rays, voxels, weights, device=device, dtype=dtype)
+        self._halves: dict[tuple[int, ...], SliceProjector] = {}
+        if torch.device(device).type == "cpu":
+            self._build_panels(dtype)
+        else:
+            self._set_entries(
+                *_joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
+            )
 
     def __repr__(self) -> str:
         low, high = self.tilt_angles.min(), self.tilt_angles.max()
@@ -74,6 +79,25 @@ class SliceProjector(Projector):
         return (
             f"SliceProjector({self.num_tilts} tilts {low:g}° to {high:g}°, {self.depth} x {self.width} voxels (z, x) to "
             f"{self.detector_width} pixels, {kind} on {self.device})"
+        )
+
+    def _build_panels(self, dtype: torch.dtype) -> None:
+        """Both matrices from a few tilts at a time: all entries at once would take several times the memory of the matrices."""
+        shape = (self.num_tilts * self.detector_width, self.depth * self.width)
+        self.matrix, self.transposed = build_panelled(
+            (
+                _joseph(
+                    self.tilt_angles[start : start + _PANEL],
+                    self.detector_offset[start : start + _PANEL],
+                    self.depth,
+                    self.width,
+                    self.detector_width,
+                )
+                for start in range(0, self.num_tilts, _PANEL)
+            ),
+            shape,
+            panels=(_PANEL * self.width, _PANEL * self.detector_width),
+            dtype=dtype,
         )
 
     def _set_entries(
@@ -118,6 +142,7 @@ class SliceProjector(Projector):
         parts = []
         for number in range(int(layer.max(initial=0)) + 1):
             here, part = layer == number, copy.copy(self)
+            part._halves = {}
             part._set_entries(rays[here], voxels[here], weights[here], device=self.device, dtype=self.dtype)
             parts.append(part)
         return parts
@@ -133,16 +158,19 @@ class SliceProjector(Projector):
 
     def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> SliceProjector:
         """The projector of a voxel grid half as fine, see `Projector.half`."""
-        middle = first_columns + num_columns - 1 - (self.detector_width - 1) / 2
-        return SliceProjector(
-            tilt_angles=self.tilt_angles,
-            depth=depth,
-            width=width,
-            detector_width=num_columns,
-            detector_offset=(middle + self.detector_offset) / 2,
-            dtype=self.dtype,
-            device=self.device,
-        )
+        key = (depth, width, num_columns, *first_columns.tolist())
+        if key not in self._halves:  # blocks of one volume ask for the same one
+            middle = first_columns + num_columns - 1 - (self.detector_width - 1) / 2
+            self._halves[key] = SliceProjector(
+                tilt_angles=self.tilt_angles,
+                depth=depth,
+                width=width,
+                detector_width=num_columns,
+                detector_offset=(middle + self.detector_offset) / 2,
+                dtype=self.dtype,
+                device=self.device,
+            )
+        return self._halves[key]
 
 
 class _Product(torch.autograd.Function):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -97,14 +97,53 @@ class PanelledMatrix:
         return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
 
 
+Entries = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.floating[Any]]]
+"""Row, column and value of entries."""
+
+
+def build_panelled(
+    groups: Iterable[Entries], shape: tuple[int, int], *, panels: tuple[int, int], dtype: torch.dtype
+) -> tuple[PanelledMatrix, PanelledMatrix]:
+    """A matrix and its transpose from groups of entries, whose memory is let go of one by one.
+
+    Args:
+        groups: entries of so many whole rows as a panel of the transpose has columns, counted from the first of them.
+        shape: rows and columns.
+        panels: columns of a panel of the matrix, and of its transpose.
+        dtype: of the values.
+    """
+    from scipy.sparse import csr_array, vstack
+
+    kind = torch.empty((), dtype=dtype).numpy().dtype
+    pieces: list[list[Any]] = [[] for _ in range(0, shape[1], panels[0])]
+    transposed: list[Tensor] = []
+    for number, (rows, columns, values) in enumerate(groups):
+        size = (min(panels[1], shape[0] - number * panels[1]), shape[1])
+        group = csr_array((values.astype(kind), (columns, rows)), shape=size[::-1])
+        transposed.append(csr_tensor(group))
+        for start, piece in zip(range(0, shape[1], panels[0]), pieces, strict=True):
+            piece.append(group[start : start + panels[0]].T.tocsr())
+    matrix = []
+    for piece in pieces:
+        matrix.append(csr_tensor(vstack(piece, format="csr")))
+        piece.clear()
+    return PanelledMatrix(matrix), PanelledMatrix(transposed)
+
+
+def index_type(*counts: int) -> type[np.signedinteger[Any]]:
+    """The smaller type of index that holds all these counts: entries, rows and columns of a large matrix pass 2³¹."""
+    return np.int32 if max(counts) < 2**31 else np.int64
+
+
 def csr_tensor(matrix: Any) -> Tensor:
     """A SciPy CSR matrix as a tensor."""
     matrix.sort_indices()
+    kind = index_type(matrix.nnz, *matrix.shape)
     with warnings.catch_warnings():  # torch announces that CSR is in beta
         warnings.simplefilter("ignore")
         return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int32)),
-            torch.from_numpy(matrix.indices.astype(np.int32)),
+            torch.from_numpy(matrix.indptr.astype(kind, copy=False)),
+            torch.from_numpy(matrix.indices.astype(kind, copy=False)),
             torch.from_numpy(matrix.data),
             size=matrix.shape,
         )

@@ -34,7 +34,7 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
-    residuals = Residuals.of(tilt_series, expected_images(result))
+    residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)
     angles = residuals.tilt_angles
     shifts = {name: found[name].values for name in ("shift across", "shift along y")}

@@ -1,66 +1,148 @@
-"""A volume of any height, block of slices by block: memory for one block."""
+"""A volume of any height, block of slices by block: memory for one block.
+
+What all slices share is settled once, on a slab and a coarse volume of all of them. A block is fitted with a halo of slices that
+its neighbours fit too; around each border one block fades into the next. A finished block is a file, which is never computed
+twice, wherever and in whatever order blocks are computed.
+"""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.files import reserve
+from noiseflow.io import atomic_path
+from noiseflow.io.mapped import create_volume, finish_volume, temporary_map
+from noiseflow.io.numpy_files import write as write_npy
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
+if TYPE_CHECKING:
+    from recon.reconstruction import Reconstruction
+
 Images = NDArray[np.float32]
-Solve = Callable[[slice], tuple[Images, Images]]
-"""``solve(rows)`` reconstructs some slices: their part of the volume (z, rows, x) and of the projections (tilt, rows, u)."""
 
-HALO = 6
-"""Slices on either side of a block that a fit sees and does not keep, so that the regulariser sees across the border."""
+HALO = 8
+"""Slices on either side of a block that a fit sees too, so that the regulariser sees across the border."""
 
+_FADE = 4  # slices on either side of a border; the outer half of the halo feels where its block ends
 SETTLED_ON = 32
 """Slices on which what all blocks share is settled."""
 
 
-def solve_in_blocks(
-    solve: Solve, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path, slices_at_once: int
+@dataclass(frozen=True)
+class Block:
+    """Slices that are reconstructed together.
+
+    Attributes:
+        rows: the block's own.
+        wide: these and their halo.
+        height: slices of the whole volume.
+    """
+
+    rows: slice
+    wide: slice
+    height: int
+
+
+@dataclass(frozen=True)
+class Blockwise:
+    """A method that reconstructs slices apart.
+
+    Attributes:
+        solve: from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
+            (tilt, y, u).
+        finish: makes the result of the whole volume and its projections.
+        halo: slices that a block sees beyond its own.
+    """
+
+    solve: Callable[[TiltSeries, Block], tuple[Images, Images]]
+    finish: Callable[[Volume, Images], Reconstruction]
+    halo: int = 0
+
+
+def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
+    """Blocks of nearly equal height, of so many slices at most."""
+    count = -(-height // slices_at_once)
+    ends = [round(number * height / count) for number in range(count + 1)]
+    return [
+        Block(slice(start, stop), slice(max(0, start - halo), min(height, stop + halo)), height)
+        for start, stop in pairwise(ends)
+    ]
+
+
+@dataclass(frozen=True)
+class BlockFiles:
+    """The finished blocks of one volume.
+
+    Attributes:
+        folder: theirs alone.
+    """
+
+    folder: Path
+
+    def finished(self, block: Block) -> bool:
+        """Whether a block need not be computed again."""
+        return self._path("projections", block).is_file()  # which is written last
+
+    def write(self, block: Block, volume: Images, projections: Images) -> None:
+        """Keep what a block gave; each file is whole or not there."""
+        for name, array in (("volume", volume), ("projections", projections)):
+            with atomic_path(self._path(name, block)) as partial:
+                write_npy(partial, np.asarray(array, dtype=np.float32))
+
+    def read(self, block: Block) -> tuple[Images, Images]:
+        """The same, mapped to memory."""
+        volume, projections = (np.load(self._path(name, block), mmap_mode="r") for name in ("volume", "projections"))
+        return volume, projections
+
+    def _path(self, name: str, block: Block) -> Path:
+        return self.folder / f"{name}-{block.wide.start:07d}-{block.wide.stop:07d}.npy"
+
+
+def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files: BlockFiles) -> None:
+    """Reconstruct one block, where that is not done."""
+    if not files.finished(block):
+        files.write(block, *method.solve(tilt_series.rows(block.wide), block))
+
+
+def assemble(
+    parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
 ) -> tuple[Volume, Images]:
-    """Reconstruct block by block.
-
-    Args:
-        solve: reconstructs some slices.
-        tilt_series: the images; a memory-mapped array will do.
-        grid: of the whole volume.
-        scratch: a new ``.npy`` file that holds the volume.
-        slices_at_once: slices of a block.
-
-    Returns:
-        The volume, mapped to memory, and the projections (tilt, y, u), in a file that is gone when they are let go of.
+    """The volume, in a new file, and the projections (tilt, y, u), in one that is gone when they are let go of.
 
     Raises:
-        OSError: the disk has no room for the volume.
+        OSError: the disk has no room for them.
     """
-    volume = np.lib.format.open_memmap(scratch, "w+", np.float32, grid.shape)
-    reserve(scratch, scratch.stat().st_size)
-    with tempfile.TemporaryFile(dir=scratch.parent) as file:
-        projections = np.memmap(file, np.float32, "w+", shape=tilt_series.images.shape)
-    for rows in blocks(grid.height, slices_at_once):
-        volume[:, rows], projections[:, rows] = solve(rows)
-        volume.flush()
-    return Volume(volume, grid.voxel_size), projections
+    size = grid.voxel_size
+    volume = create_volume(scratch, grid.shape, None if size is None else (size, size, size))
+    projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent)
+    overlaps = (
+        min(below.wide.stop - below.rows.stop, above.rows.start - above.wide.start) for below, above in pairwise(parts)
+    )
+    fade = min([_FADE, *overlaps, min(part.rows.stop - part.rows.start for part in parts) // 2])
+    for number, part in enumerate(parts):
+        for target, found in zip((volume, projections), files.read(part), strict=True):
+            first = part.rows.start + (fade if number else 0)
+            stop = part.rows.stop + (fade if number < len(parts) - 1 else 0)
+            if number and fade:
+                _fade_in(target, found, part, fade)
+            target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
+    finish_volume(scratch, volume)
+    return Volume(volume, size), projections
 
 
-def blocks(height: int, slices_at_once: int) -> Iterator[slice]:
-    """Neighbouring slices, so many at a time."""
-    yield from (slice(start, min(start + slices_at_once, height)) for start in range(0, height, slices_at_once))
-
-
-def with_halo(rows: slice, height: int) -> tuple[slice, slice]:
-    """Some slices with their halo, and where they lie in it."""
-    wide = slice(max(0, rows.start - HALO), min(height, rows.stop + HALO))
-    return wide, slice(rows.start - wide.start, rows.stop - wide.start)
+def _fade_in(target: Images, found: Images, block: Block, fade: int) -> None:
+    """From the block below, which stands there already, to this one, about their border."""
+    rows = slice(block.rows.start - fade, block.rows.start + fade)
+    share = ((np.arange(2 * fade) + 0.5) / (2 * fade)).astype(np.float32)[:, None]
+    above = found[:, rows.start - block.wide.start : rows.stop - block.wide.start]
+    for below, new in zip(target[:, rows], above, strict=True):  # section by section: views of the target
+        below += share * (new - below)
 
 
 def block_memory(

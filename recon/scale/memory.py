@@ -6,11 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 64, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 _BASE = 400 * 2**20
+_SHARE = 0.6  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
+_STEP = 8  # slices: blocks of a few more or fewer cost as much
 
 
 def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
@@ -27,6 +30,34 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     volume = depth * height * width
     needed: int = _BASE + per_voxel * volume + per_pixel * tilt_series.images.size + _PER_RAY_STEP * ray_steps
     return needed
+
+
+def choose_slices(
+    tilt_series: TiltSeries, grid: VolumeGrid, available: int, *, fitted: bool = True, workers: int = 1
+) -> int | None:
+    """Slices of a block that fit into memory, or None where the whole volume does.
+
+    Args:
+        tilt_series: the images.
+        grid: of the whole volume.
+        available: bytes.
+        fitted: as of `needed_memory`.
+        workers: blocks at a time.
+
+    Raises:
+        MemoryError: not even a few slices fit.
+    """
+    room = int(_SHARE * available / workers)
+    if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted) <= room:
+        return None
+    most = -(-grid.height // workers)
+    for slices in range(most - most % _STEP or most, 0, -_STEP):
+        if needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted) <= room:
+            return slices
+    raise MemoryError(
+        f"not even {_STEP} slices of this reconstruction fit into {_human(room)}; give a smaller --thickness, fewer --workers, "
+        "or bin or crop the images"
+    )
 
 
 def available_memory(device: Any = "cpu") -> int | None:

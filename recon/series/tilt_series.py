@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.described import described, size_of
+from noiseflow.io import mapped
+from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
 
@@ -88,18 +91,32 @@ class TiltSeries:
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
     def rows(self, rows: slice) -> TiltSeries:
-        """Some rows (y) of all images."""
-        return replace(self, images=self.images[:, rows], mask=None if self.mask is None else self.mask[:, rows])
+        """Some rows (y) of all images; they may be flat, where the whole is not."""
+        return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
+
+    def with_images(self, images: NDArray[Any], mask: NDArray[np.bool_] | None) -> TiltSeries:
+        """The same series with a part of its images, which were checked, or with copies of them."""
+        part = copy.copy(self)
+        object.__setattr__(part, "images", images)
+        object.__setattr__(part, "mask", mask)
+        return part
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
         """The series of some of its tilts, by index, boolean mask or slice.
 
-        Evenly spaced tilts are views of the images, so mapped ones stay on the disk.
+        Evenly spaced tilts are views of the images, so mapped ones stay on the disk; others go to a temporary file where the
+        images are mapped and large.
         """
         tilts = evenly(tilts, self.num_tilts)
+        if not isinstance(tilts, slice) and is_mapped(self.images) and self.images.nbytes > mapped.IN_MEMORY:
+            numbers = np.arange(self.num_tilts)[tilts]
+            shape = (len(numbers), *self.images.shape[1:])
+            images = mapped.mapped_copy((self.images[number] for number in numbers), shape, self.images.dtype)
+        else:
+            images = self.images[tilts]
         mask = None if self.mask is None else self.mask[tilts]
         beam = None if self.beam is None else self.beam[tilts]
-        return replace(self, images=self.images[tilts], tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
+        return replace(self, images=images, tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
 
 
 @described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")

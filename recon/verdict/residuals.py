@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,13 +35,14 @@ class Residuals:
     height: Array
 
     @classmethod
-    def of(cls, tilt_series: TiltSeries, projections: Array) -> Residuals:
-        """The residuals of a series under the projections of its volume, (tilt, y, u)."""
+    def of(cls, tilt_series: TiltSeries, projections: Array | Callable[[slice], Array]) -> Residuals:
+        """The residuals of a series under the projections of its volume, (tilt, y, u), or what gives those of some rows."""
         count, height, width = tilt_series.images.shape
         rows = contrast_slab(tilt_series, max(8, _MOST_PIXELS // (count * width)))
         order = np.argsort(tilt_series.tilt_angles, kind="stable")
         images = tilt_series.images[order, rows].astype(np.float32)
-        predicted = np.asarray(projections[order, rows], dtype=np.float32)
+        of_rows = projections(rows) if callable(projections) else projections[:, rows]
+        predicted = np.asarray(of_rows[order], dtype=np.float32)
         residual = images - predicted
         if tilt_series.mask is not None:
             residual = np.where(tilt_series.mask[order, rows], residual, np.float32(0))

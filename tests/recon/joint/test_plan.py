@@ -83,11 +83,11 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, offset held
+        slab   measure noise                noise       10  simple
         slab   learn noise                  noise       20  chosen
         slab   adapt                        signal      20  chosen, rate 0.5, offset held, warm-up
         slab   refine noise                 noise       20  chosen
         whole  begin                        signal      60  simple, rate 0.6, offset held
-        whole  measure noise                noise       10  simple
         whole  go on                        signal      120  simple, rate 0.6, offset held
         whole  learn noise on the volume    noise       60  chosen
         whole  fit                          signal      60  chosen, rate 0.6, offset held

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from noiseflow import io
+from noiseflow.io.mapped import create_volume, finish_volume, is_mapped
+from noiseflow.io.ownership import is_own
 from recon.methods import reconstruct
 from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series, write_tilt_series
 from recon.simulate.phantoms import shells
@@ -125,3 +127,35 @@ def test_what_lies_beyond_a_block_reaches_into_it(scene, tmp_path):
         volumes.append(found.volume.attenuation)
     difference = np.sqrt(np.mean((volumes[1] - volumes[0]) ** 2, axis=(0, 2)))
     assert difference[7] > 0.2 * difference[8]
+
+
+def test_tilts_of_a_large_mapped_series_in_any_order_stay_on_the_disk(scene, tmp_path, monkeypatch):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    series = read_tilt_series(tmp_path / "tilts.mrc", mapped=True)
+    chosen = np.array([5, 2, 9, 3])
+    assert not is_mapped(series.select(chosen).images)
+    monkeypatch.setattr("noiseflow.io.mapped.IN_MEMORY", 0)
+    found = series.select(chosen)
+    assert is_mapped(found.images)
+    np.testing.assert_array_equal(found.images, noisy.images[chosen])
+    np.testing.assert_array_equal(found.tilt_angles, noisy.tilt_angles[chosen])
+
+
+def test_indices_are_wider_where_there_are_more_than_32_bits_count():
+    from recon.projection.sparse import index_type
+
+    assert index_type(2**31 - 1, 5) is np.int32
+    assert index_type(5, 2**31) is np.int64
+
+
+@pytest.mark.parametrize("name", ["v.npy", "v.mrc"])
+def test_a_volume_that_is_filled_part_by_part_is_a_whole_file(tmp_path, name):
+    part = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    volume = create_volume(tmp_path / name, part.shape, (2.0, 2.0, 2.0))
+    volume[:] = part
+    finish_volume(tmp_path / name, volume)
+    found = io.read(tmp_path / name)
+    np.testing.assert_array_equal(found.data, part)
+    assert is_own(tmp_path / name)
+    assert found.voxel_size == ((2.0, 2.0, 2.0) if name == "v.mrc" else None)

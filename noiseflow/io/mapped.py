@@ -1,0 +1,110 @@
+"""Arrays that live on the disk: temporary ones, and output files that are filled part by part."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.files import reserve_room
+from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
+from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start, signature
+
+IN_MEMORY = 2**28
+"""Bytes up to which a temporary array is kept in memory: a file would only cost time."""
+
+
+def is_large(path: str | Path) -> bool:
+    """Whether a file is better left on the disk."""
+    file = Path(str(path).partition("::")[0])
+    return file.is_file() and file.stat().st_size > IN_MEMORY
+
+
+def is_mapped(array: NDArray[Any]) -> bool:
+    """Whether an array, or what it is a view of, lies in a file."""
+    base: Any = array
+    while base is not None:
+        if isinstance(base, np.memmap):
+            return True
+        base = getattr(base, "base", None)
+    return False
+
+
+def temporary_map(
+    shape: Sequence[int], dtype: Any, *, folder: str | Path | None = None, in_memory: int = 0
+) -> NDArray[Any]:
+    """An array of zeros in a file without a name, gone when the array is let go of.
+
+    Args:
+        shape: of the array.
+        dtype: its number type.
+        folder: where the file lies; by default the system's folder for temporary files, which ``TMPDIR`` names.
+        in_memory: bytes up to which memory takes the place of the file.
+
+    Raises:
+        OSError: the disk has not as much room.
+    """
+    num_bytes = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
+    if num_bytes <= max(in_memory, 1):  # an empty file cannot be mapped
+        return np.zeros(tuple(shape), dtype)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        reserve_room(file.fileno(), num_bytes)
+        return np.memmap(file, dtype, "r+", shape=tuple(shape))
+
+
+def mapped_copy(sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any) -> NDArray[Any]:
+    """Sections, one after the other, in a temporary file. Raises as `temporary_map`."""
+    result = temporary_map(shape, dtype)
+    for target, section in zip(result, sections, strict=True):
+        target[...] = section
+    return result
+
+
+def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | None = None) -> NDArray[np.float32]:
+    """A new MRC or ``.npy`` file of float32 zeros, mapped to memory, whose room on the disk is taken.
+
+    An MRC file's statistics are those of an unfinished file: see `finish_volume`.
+
+    Raises:
+        OSError: the disk has not as much room.
+        ValueError: another suffix.
+    """
+    if path.suffix.lower() == ".npy":
+        start = npy_start()
+        described = repr({"descr": "<f4", "fortran_order": False, "shape": shape}).encode()
+        with path.open("wb") as stream:
+            stream.write(start + described.ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n")
+            begin = stream.tell()
+    elif path.suffix.lower() in MRC_SUFFIXES:
+        import mrcfile
+
+        with mrcfile.new_mmap(path, shape, mrc_mode=2, fill=None, overwrite=True) as file:
+            file.set_volume()
+            file.add_label(signature())
+            if voxel_size is not None:
+                file.voxel_size = voxel_size[::-1]
+            begin = 1024
+    else:
+        raise ValueError(f"{path}: only .npy and MRC files are filled part by part")
+    with path.open("r+b") as stream:
+        reserve_room(stream.fileno(), begin + 4 * int(np.prod(shape, dtype=object)))
+    return np.memmap(path, "<f4", "r+", begin, shape)
+
+
+def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
+    """Write what is left of a volume that was filled, and the statistics that an MRC header holds."""
+    if isinstance(volume, np.memmap):
+        volume.flush()
+    if path.suffix.lower() not in MRC_SUFFIXES:
+        return
+    import mrcfile
+
+    total = sum(float(part.sum(dtype=np.float64)) for part in volume) / volume.size
+    squares = sum(float(np.sum((part - total) ** 2, dtype=np.float64)) for part in volume)
+    with mrcfile.mmap(path, "r+") as file:
+        file.header.dmin, file.header.dmax, file.header.dmean = volume.min(), volume.max(), total
+        file.header.rms = np.sqrt(squares / volume.size)

@@ -1,0 +1,93 @@
+"""A plan with its runner, and what its stages on a slab settle for all slices of a series."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+
+from torch import Tensor, nn
+
+from noiseflow import FitResult
+from recon.joint.coarse_start import Start
+from recon.joint.plan import Facts, FitStage
+from recon.joint.run import Runner
+from recon.joint.signal_model import TomographySignal
+from recon.joint.weight import WeightChoice
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What a slab has settled for all slices of a series.
+
+    Attributes:
+        simple: simple noise to begin with.
+        noise_model: the noise model of choice.
+        weight: of the regulariser.
+        weight_choice: the evidence for it, where it was chosen.
+        response: state of the image formation.
+        scale: of the field.
+        facts: what was known of the series.
+        start: the coarse volume that every block begins with.
+        slices: those that it was settled on.
+        signal_model: of these slices, as fitted; None where it was left behind.
+        fit_result: of the last fit of them.
+    """
+
+    simple: nn.Module
+    noise_model: nn.Module
+    weight: float
+    weight_choice: WeightChoice | None
+    response: dict[str, Tensor]
+    scale: float
+    facts: Facts
+    start: Start
+    slices: slice
+    signal_model: TomographySignal | None
+    fit_result: FitResult
+
+    def portable(self) -> Settled:
+        """The same without the projector's matrices, which every machine makes for itself."""
+        return replace(self, signal_model=None)
+
+
+class PlannedRun:
+    """A plan with its runner: choices on the slab first, then the volume."""
+
+    def __init__(self, facts: Facts, stages: list[FitStage], runner: Runner) -> None:
+        self.facts, self.stages, self.runner = facts, stages, runner
+        self.weight_choice: WeightChoice | None = None
+
+    @property
+    def noise_model(self) -> nn.Module:
+        """The noise model of choice."""
+        simple = self.facts.simple_is_final and not self.facts.quiet
+        return self.runner.models["simple" if simple else "chosen"]
+
+    def choose(self) -> None:
+        """The stages on the slab; the whole volume starts from the response found there."""
+        self.runner.run([stage for stage in self.stages if stage.where == "slab"])
+        self.weight_choice = self.runner.weight_choice
+        slab, whole = (self.runner.tasks[where].signal_model for where in ("slab", "whole"))
+        whole.image_formation.load_state_dict(copy.deepcopy(slab.image_formation.state_dict()))
+
+    def fit_whole(self) -> FitResult:
+        """The stages on the whole volume."""
+        self.runner.run([stage for stage in self.stages if stage.where == "whole"])
+        return self.runner.result
+
+    def settled(self, slices: slice, start: Start) -> Settled:
+        """What a slab has settled, which was the whole of this run."""
+        model = self.runner.tasks["whole"].signal_model
+        return Settled(
+            simple=self.runner.models["simple"],
+            noise_model=self.noise_model,
+            weight=model.weight,
+            weight_choice=self.weight_choice,
+            response=copy.deepcopy(model.image_formation.state_dict()),
+            scale=float(model.field.scale),
+            facts=self.facts,
+            start=start,
+            slices=slices,
+            signal_model=model,
+            fit_result=self.runner.result,
+        )

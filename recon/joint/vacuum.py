@@ -1,0 +1,40 @@
+"""Whether there is anything to fit in a block of slices."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from noiseflow.distributions.picked import needs_image
+from recon.joint.task import Task
+
+
+def stays_empty(task: Task, noise_model: nn.Module) -> bool:
+    """Whether a block that begins without an occupied voxel would stay so: a fit of it would take all its steps for nothing.
+
+    It is the test of `recon.fields.occupancy.Occupancy`: no block of voxels gains more likelihood by being raised than its total
+    variation costs.
+
+    Args:
+        task: of the block, before any fit.
+        noise_model: that the block would be fitted with.
+    """
+    model = task.signal_model
+    occupancy = model.occupancy
+    if occupancy is None or bool(occupancy.mask.any()) or needs_image(noise_model):
+        return False
+    train = ~task.held_out if task.use is None else task.use & ~task.held_out
+    num_train = max(1, int(train.sum()))
+    lines = torch.zeros_like(task.observation, requires_grad=True)
+    signal = model.image_formation(lines)
+    slope = torch.empty_like(signal)
+    for image, seen, use, result in zip(signal, task.observation, train, slope, strict=True):
+        shown = image.detach().requires_grad_()  # one by one, for a likelihood takes much memory
+        loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
+        (result[...],) = torch.autograd.grad(loss, shown)
+    signal.backward(slope)
+    gradient = lines.grad
+    if gradient is None or not bool(torch.isfinite(gradient).all()):
+        return False
+    cost = model.weight / (float(model.field.scale) * model.num_pixels)
+    return not bool(occupancy.wants(gradient.view(-1, model.field.height), model.projector, cost).any())

@@ -1,0 +1,52 @@
+"""A Dask client on workers of this machine, or on those of a scheduler anywhere (extra ``[distributed]``)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_PATIENCE = 20  # s; a scheduler that is there answers within one
+
+
+@contextmanager
+def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """A ``dask.distributed.Client``, closed at the end; None where neither workers nor a scheduler are asked for.
+
+    Args:
+        workers: processes on this machine, which share its cores.
+        scheduler: address of a scheduler, ``tcp://HOST:PORT``.
+
+    Raises:
+        ModuleNotFoundError: dask.distributed is not installed.
+        ConnectionError: no scheduler answers there.
+    """
+    if workers is None and scheduler is None:
+        yield None
+        return
+    try:
+        import dask.distributed
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "--workers and --scheduler need dask.distributed; install it with: pip install 'noiseflow[distributed]'"
+        ) from error
+    library: Any = dask.distributed  # it has no types
+    if scheduler is not None:
+        try:
+            client = library.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise ConnectionError(
+                f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or mend --scheduler"
+            ) from error
+        with client:
+            yield client
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    options: dict[str, Any] = {"dashboard_address": None, "processes": True, "silence_logs": 50}
+    threads = max(1, cores // (workers or 1))
+    with (
+        library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
+        library.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

@@ -1,0 +1,144 @@
+"""Runs the blocks of a volume: one after the other in this process, or as tasks of a Dask cluster."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from noiseflow.io import atomic_path
+from noiseflow.io.numpy_files import write as write_npy
+from recon.reconstruction import Reconstruction
+from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+_ONE_AT_A_TIME = threading.Lock()
+"""A worker with several threads gives them all to one block: a second one would need its memory again."""
+
+
+def reconstruct_in_blocks(
+    method: Blockwise,
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    *,
+    scratch: Path,
+    folder: Path | None,
+    slices_at_once: int,
+    client: Any = None,
+) -> Reconstruction:
+    """Reconstruct block by block.
+
+    Args:
+        method: what reconstructs a block.
+        tilt_series: the images; a memory-mapped array will do.
+        grid: of the whole volume.
+        scratch: a new ``.npy`` or MRC file that holds the volume, which the result maps to memory.
+        folder: keeps the finished blocks, and those of a former run are taken from there; None keeps none.
+        slices_at_once: slices of a block, at most.
+        client: a Dask client whose workers see `folder`; None computes here.
+
+    Raises:
+        OSError: the disk has no room.
+    """
+    parts = blocks(grid.height, slices_at_once, method.halo)
+    with _folder(folder, scratch.parent) as kept:
+        files = BlockFiles(kept)
+        if client is None:
+            for part in parts:
+                solve_block(method, tilt_series, part, files)
+        else:
+            _on_cluster(client, method, tilt_series, parts, files)
+        return method.finish(*assemble(parts, files, tilt_series, grid, scratch))
+
+
+@contextmanager
+def _folder(folder: Path | None, beside: Path) -> Iterator[Path]:
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix=".blocks-", dir=beside) as name:
+            yield Path(name)
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+
+
+@dataclass(frozen=True)
+class StoredSeries:
+    """A tilt series whose images lie in a file that every worker sees.
+
+    Attributes:
+        path: the ``.npy`` file of the images.
+        series: all else, of two rows only.
+        mask: the ``.npy`` file of the mask, or None.
+    """
+
+    path: Path
+    series: TiltSeries
+    mask: Path | None
+
+    @classmethod
+    def of(cls, tilt_series: TiltSeries, folder: Path) -> StoredSeries:
+        """Write the images, and the mask, where they are not there."""
+        path, mask = folder / "series.npy", None if tilt_series.mask is None else folder / "mask.npy"
+        _store(path, tilt_series.images)
+        if mask is not None and tilt_series.mask is not None:
+            _store(mask, tilt_series.mask)
+        few = tilt_series.rows(slice(0, 2))
+        return cls(path, few.with_images(np.array(few.images), None), mask)
+
+    def open(self) -> TiltSeries:
+        """The series, mapped to memory.
+
+        Raises:
+            FileNotFoundError: this machine does not see the file.
+        """
+        try:
+            images = np.load(self.path, mmap_mode="r")
+            mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"a worker does not see {self.path}; write the output to a disk that all workers share"
+            ) from error
+        return self.series.with_images(images, mask)
+
+
+def _store(path: Path, array: NDArray[Any]) -> None:
+    if not path.exists():
+        with atomic_path(path) as partial:
+            write_npy(partial, array)
+
+
+def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: list[Block], files: BlockFiles) -> None:
+    """Blocks as tasks, each of which writes its own file: nothing large travels, and another worker does what a dead one had."""
+    import dask.distributed
+
+    source = StoredSeries.of(tilt_series, files.folder.absolute())
+    files = BlockFiles(files.folder.absolute())
+    left = [part for part in parts if not files.finished(part)]
+    shared = client.scatter(replace(method, finish=_no_result), broadcast=True, hash=False)
+    tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
+    library: Any = dask.distributed  # it has no types
+    try:
+        for task in library.as_completed(tasks, loop=client.loop):
+            task.result()
+    finally:
+        client.cancel(tasks)
+
+
+def _no_result(*_: Any) -> Any:
+    raise RuntimeError("a worker makes blocks, and the client makes the result of them")
+
+
+def _solve_stored(method: Blockwise, source: StoredSeries, block: Block, files: BlockFiles) -> None:
+    from dask.distributed import get_worker
+
+    with _ONE_AT_A_TIME:
+        torch.set_num_threads(max(1, get_worker().state.nthreads))
+        solve_block(method, source.open(), block, files)

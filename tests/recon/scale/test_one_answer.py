@@ -1,0 +1,172 @@
+"""Blocks give the volume of a whole fit: as good, and without seams; on Dask workers too, though one of them dies."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from noiseflow import Gaussian
+from recon.joint.checkpoint import Journal
+from recon.joint.joint import JointReconstructor
+from recon.joint.run import run_fit
+from recon.joint.task import block_mask
+from recon.methods import reconstruct
+from recon.metrics.metrics import compare
+from recon.scale.blocks import BlockFiles, block_memory, blocks
+from recon.scale.memory import choose_slices, needed_memory
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+
+def scene(phantom, size, step=3.0):
+    density = make_phantom(phantom, size, generator=np.random.default_rng(1))
+    clean, unit = clean_tilt_series(density, np.arange(-60, 61, step), acquisition=ACQUISITIONS["clipped"])
+    return density * unit, add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phantom", ["shells", "slab"])
+def test_blocks_are_as_good_as_a_whole_fit_and_show_no_seam(phantom, tmp_path):
+    truth, noisy = scene(phantom, 48)
+    whole = reconstruct(noisy, method="joint").volume.attenuation
+    found = reconstruct(noisy, method="joint", slices_at_once=16, scratch=tmp_path / "v.npy").volume.attenuation
+    if phantom == "shells":  # of the slab, which leaves no vacuum, three blocks lose 0.1 dB
+        assert compare(found, truth).psnr > compare(whole, truth).psnr - 0.02
+    jumps = [np.abs(np.diff(volume, axis=1)).mean((0, 2)) for volume in (truth, whole, found)]
+    for border in (15, 31):
+        near = [index for index in range(border - 8, border + 9) if index != border]
+        of_truth, of_whole, of_found = (jump[border] / np.median(jump[near]) for jump in jumps)
+        assert of_found < 1.1 * max(of_truth, of_whole)
+
+
+def test_held_out_pixels_of_blocks_are_those_of_the_whole():
+    shape = (3, 21, 50)
+    whole = block_mask(shape, generator=torch.Generator().manual_seed(4))
+    for block in blocks(50, 13, 5):
+        part = block_mask(shape, rows=block.wide, generator=torch.Generator().manual_seed(4))
+        assert torch.equal(part, whole[:, :, block.wide])
+
+
+def test_blocks_cover_every_slice_once():
+    for height, at_once in ((65, 64), (64, 64), (7, 100), (100, 7)):
+        parts = blocks(height, at_once, 8)
+        assert [row for part in parts for row in range(height)[part.rows]] == list(range(height))
+        assert max(part.rows.stop - part.rows.start for part in parts) <= at_once
+
+
+def test_a_finished_block_is_not_computed_again(tmp_path):
+    _, noisy = scene("shells", 20, 12.0)
+    options = {"method": "l2", "weight": 0.5, "num_steps": 8, "slices_at_once": 10}
+    journal = Journal(tmp_path / "kept", {})
+    first = reconstruct(noisy, scratch=tmp_path / "a.npy", keep=journal.keep, **options).volume.attenuation
+    (part,) = [part for part in blocks(20, 10, 8) if part.rows.start == 0]
+    files = BlockFiles(journal.keep())
+    volume, projections = (np.array(array) for array in files.read(part))
+    files.write(part, volume + 1, projections)
+    again = Journal(tmp_path / "kept", {}, resume=True)
+    second = reconstruct(noisy, scratch=tmp_path / "b.npy", keep=again.keep, **options).volume.attenuation
+    np.testing.assert_allclose(second[:, :6], first[:, :6] + 1, atol=1e-5)
+    np.testing.assert_array_equal(second[:, 14:], first[:, 14:])
+    again.discard()
+    assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.parametrize("density", [0.0, 0.1])
+def test_a_block_of_vacuum_takes_no_step(density):
+    """The lower half holds nothing, and the images say so: no fit. Where they show a faint object there, it is fitted."""
+    generator = np.random.default_rng(0)
+    images = np.ones((21, 64, 32), np.float32)
+    images[:, 8:20, 10:22] = 0.5
+    images[:, 40:52, 10:22] -= density
+    images += 0.02 * generator.standard_normal(images.shape).astype(np.float32)
+    noisy, grid, rows, names = TiltSeries(images, np.arange(-60, 61, 6.0)), VolumeGrid(32, 64, 32), slice(32, 64), []
+
+    def counted(name, *arguments, **options):
+        names.append(name)
+        return run_fit(name, *arguments, **options)
+
+    fit = JointReconstructor(weight=4.0, num_steps=20, noise_model=Gaussian, run_fit=counted)
+    settled = fit.settle(noisy, grid)
+    settled = replace(settled, response={name: torch.zeros_like(value) for name, value in settled.response.items()})
+    if density:  # too little for the coarse volume to show
+        settled = replace(settled, start=replace(settled.start, rough=settled.start.rough.clone()))
+        settled.start.rough[:, settled.start.rough.shape[1] // 2 :] = 0
+    names.clear()
+    found = fit.fit(noisy.rows(rows), replace(grid, height=32), settled, rows=rows)
+    assert found.volume.attenuation.any() == bool(names) == bool(density)
+    assert found.projections.shape == (21, 32, 32)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_changes_not_a_bit(tmp_path):
+    dask = pytest.importorskip("dask.distributed")
+    _, noisy = scene("shells", 32, 6.0)
+    options = {"method": "l2", "weight": 0.5, "num_steps": 60, "slices_at_once": 8}
+    volumes = []
+    for kill in (False, True):
+        with (
+            dask.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+            dask.Client(cluster, set_as_default=False) as client,
+        ):
+            journal = Journal(tmp_path / f"kept-{kill}", {})
+            if kill:
+                victim = next(iter(client.run(os.getpid).values()))
+                watch = _kill_once(victim, journal.keep())
+            found = reconstruct(noisy, scratch=tmp_path / f"{kill}.npy", keep=journal.keep, client=client, **options)
+            if kill:
+                watch.join(60)
+                assert victim not in client.run(os.getpid).values()
+            volumes.append(np.array(found.volume.attenuation))
+    np.testing.assert_array_equal(*volumes)
+
+
+def _kill_once(process: int, folder: Path):
+    """Kill a worker once the first block is whole and others are being fitted."""
+    import threading
+    import time
+
+    def watch() -> None:
+        for _ in range(6000):
+            if list(folder.glob("projections-*.npy")):
+                break
+            time.sleep(0.01)
+        os.kill(process, signal.SIGKILL)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    return thread
+
+
+def test_an_unreachable_scheduler_is_one_line(monkeypatch):
+    pytest.importorskip("dask.distributed")
+    from recon.scale import cluster
+
+    monkeypatch.setattr(cluster, "_PATIENCE", 0.5)
+    with (
+        pytest.raises(ConnectionError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"),
+        cluster.client_of(None, "tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_slices_are_chosen_by_the_memory_that_is_free():
+
+    class Virtual(TiltSeries):  # of 79 images of 1000², without their pixels
+        def __init__(self):
+            object.__setattr__(self, "images", np.broadcast_to(np.float32(1), (79, 1000, 1000)))
+            object.__setattr__(self, "mask", None)
+            object.__setattr__(self, "tilt_angles", np.arange(79.0))
+
+    series, grid = Virtual(), VolumeGrid(1000, 1000, 1000)
+    assert choose_slices(series, grid, 2**40) is None
+    slices = choose_slices(series, grid, 12 * 2**30)
+    assert slices is not None
+    assert needed_memory(*block_memory(series, grid, slices, fitted=True)) < 12 * 2**30
+    assert choose_slices(series, grid, 24 * 2**30, workers=2) == slices
+    with pytest.raises(MemoryError, match="--thickness"):
+        choose_slices(series, grid, 2**30)
