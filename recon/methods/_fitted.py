@@ -9,6 +9,8 @@ from typing import Any
 from torch import nn
 
 from noiseflow import Digitisation, Digitised
+from recon.fields.regularisers._names import DEFAULT
+from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.signal_model import TomographySignal
@@ -75,6 +77,7 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit that a method makes of what a user settled."""
     names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    shared["regulariser"] = find_regulariser(settings.regulariser)
     return JointReconstructor(**(shared | options(settings)))
 
 
@@ -88,6 +91,8 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
+    if settings.regulariser != DEFAULT:
+        choices["regulariser"] = settings.regulariser
     return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
 
 
