@@ -22,10 +22,11 @@ from joint_accuracy import NOISES, PHANTOMS, true_noise
 
 from noiseflow import Gaussian, io
 from noiseflow.commands.console import Output
+from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.benchmarks.scenes import Results, make_scene
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.uncertainty import error_bars, left_out_coverage, voxel_coverage
+from recon.uncertainty import error_bars, left_out_ranks, share_within, voxel_coverage
 
 HERE = Path(__file__).parent
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
@@ -66,14 +67,17 @@ def left_out(phantom: str, *, noise: str = "clipped", size: int, tilts: str, sam
     for name, model in models.items():
         method = {"learnt": "joint", "true": "joint", "Gaussian": "l2"}[name]
         settings = {} if model is None or method == "l2" else {"noise_model": model}
-        row[name] = left_out_coverage(scene.noisy, every=_GAP, num_samples=samples, method=method, **settings)
+        ranks = left_out_ranks(scene.noisy, every=_GAP, num_samples=samples, method=method, **settings)
+        row[name] = {"covered": share_within(ranks), "distance": kolmogorov_smirnov(ranks.ravel())}
     return row
 
 
 def page(cells: dict[str, Row]) -> str:
     """The page as Markdown."""
     lines = [(HERE / "uncertainty_head.md").read_text(encoding="utf-8").rstrip(), "", "## With the truth", ""]
-    lines += ["| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | error bars : fit |"]
+    lines += [
+        "| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | error bars : fit |"
+    ]
     lines += ["|---|---|---|---|---|---|---|---|---|"]
     for row in (row for key, row in cells.items() if key.startswith("coverage/")):
         shares = [f"{100 * row[name]:.0f} %" for name in ("occupied covered", "too low", "too high", "vacuum covered")]
@@ -83,9 +87,18 @@ def page(cells: dict[str, Row]) -> str:
         )
     rows = [row for key, row in cells.items() if key.startswith("left-out/")]
     if rows:
-        lines += ["", "## Tilts left out", "", "| phantom | noise | learnt | true | Gaussian (wrong) |", "|---|---|---|---|---|"]
+        lines += [
+            "",
+            "## Tilts left out",
+            "",
+            "| phantom | noise | learnt | true | Gaussian (wrong) |",
+            "|---|---|---|---|---|",
+        ]
         for row in rows:
-            shares = [f"{100 * row[name]:.1f} %" for name in ("learnt", "true", "Gaussian")]
+            shares = [
+                f"{100 * row[name]['covered']:.1f} % ({row[name]['distance']:.3f})"
+                for name in ("learnt", "true", "Gaussian")
+            ]
             lines.append(f"| {row['phantom']} | {row['noise']} | {' | '.join(shares)} |")
     return "\n".join(lines) + "\n"
 

@@ -22,7 +22,7 @@ def measure(
     level: Annotated[float, typer.Option(help="Share of the truth that intervals should hold.")] = 0.9,
     json: JsonOption = False,
 ) -> None:
-    """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals where error bars stand beside it.
+    """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals where it has error bars.
 
     Error bars are the files VOLUME_std and VOLUME_bias that `noiseflow reconstruct --uncertainty 16` writes.
     """
@@ -41,9 +41,10 @@ def measure(
         result["voxels above"] = vars(count)
         size = found.voxel_size
         if size is not None:
-            cubed = {name: None if value is None else value * (size / 10) ** 3 for name, value in vars(count).items()}
-            result["volume above (nm³)"] = cubed
-            rows.append((f"volume above {above:g} (nm³)", type(count)(**cubed).in_words()))
+            ends = (None if end is None else end * (size / 10) ** 3 for end in (count.low, count.high))
+            cubed = type(count)(count.value * (size / 10) ** 3, *ends)
+            result["volume above (nm³)"] = vars(cubed)
+            rows.append((f"volume above {above:g} (nm³)", cubed.in_words()))
     output.table(("figure", "value" if bars is None else f"value ({100 * level:g} % interval)"), rows)
     profile = None
     if line is not None:
@@ -54,7 +55,9 @@ def measure(
         profile = dict(zip(names, columns, strict=True))
     if bars is None:
         output.line(f"no error bars beside {volume}: noiseflow reconstruct --uncertainty 16 writes them")
-    output.result({"volume": volume, "region": region, "level": level, **result, "line": profile, "error_bars": bars is not None})
+    output.result(
+        {"volume": volume, "region": region, "level": level, **result, "line": profile, "error_bars": bars is not None}
+    )
 
 
 def _read(path: Path) -> Volume:
@@ -91,7 +94,9 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
     std, bias = (_read(each) for each in paths.values())
     for each, where in zip((std, bias), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
-            raise ValueError(f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}: of another volume")
+            raise ValueError(
+                f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}: of another volume"
+            )
     return Uncertainty(std, bias, 0)
 
 

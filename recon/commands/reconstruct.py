@@ -62,7 +62,8 @@ def reconstruct(
     uncertainty: Annotated[
         int,
         typer.Option(
-            min=0, help="Write error bars, VOLUME_std and VOLUME_bias, from so many samples of the posterior; 16 are usual."
+            min=0,
+            help="Write error bars, VOLUME_std and VOLUME_bias, from so many samples of the posterior; 16 are usual.",
         ),
     ] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
@@ -141,9 +142,7 @@ def reconstruct(
     from recon.series.tilt_series import VolumeGrid
 
     output = Output(json)
-    targets = Targets(
-        out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0
-    )
+    targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
     require_other(out, tilts, angles, transforms, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
@@ -155,9 +154,7 @@ def reconstruct(
     if fsc and slices_at_once is not None:
         raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
     if uncertainty and slices_at_once is not None:
-        raise ValueError(
-            "--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once"
-        )
+        raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:

@@ -18,8 +18,8 @@ from recon.commands.inputs import Prepared
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.verdict.judge import judge
 from recon.uncertainty.result import error_bar_paths
+from recon.verdict.judge import judge
 from recon.verdict.verdict import Verdict
 
 

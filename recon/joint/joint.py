@@ -190,7 +190,12 @@ class JointReconstructor:
             occupancy = Occupancy(rough / made.scale, grid.shape).to(self.device)
             occupancy = occupancy if occupancy.share < _WORTHWHILE else None
         formation = response.to(self.device)
-        kept = {"weight": weight, "regulariser": self.regulariser, "learning_rate": rate, "occupancy": occupancy}
+        kept: dict[str, Any] = {
+            "weight": weight,
+            "regulariser": self.regulariser,
+            "learning_rate": rate,
+            "occupancy": occupancy,
+        }
         return TomographySignal(made, projector, formation, **kept)
 
     def _facts(self, tilt_series: TiltSeries, whole: TomographySignal) -> tuple[Facts, slice, nn.Module | None]:

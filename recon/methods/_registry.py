@@ -144,7 +144,11 @@ def settings_of(method: str, **settings: Any) -> Settings:
     if chosen.noise_model is not None and not found.keeps_noise_model:
         able = [name for name in method_names() if find_method(name).keeps_noise_model]
         raise ValueError(f"--noise-model: method {method} has no use for one; use --method {', '.join(able)}")
-    wanted = {"defocus": chosen.defocus, "regulariser": chosen.regulariser != DEFAULT, "uncertainty": chosen.uncertainty}
+    wanted = {
+        "defocus": chosen.defocus,
+        "regulariser": chosen.regulariser != DEFAULT,
+        "uncertainty": chosen.uncertainty,
+    }
     for name in [name for name, value in wanted.items() if value and not found.fitted]:
         able = [name for name in method_names() if find_method(name).fitted]
         raise ValueError(f"--{name}: method {method} fits no volume; use --method {', '.join(able)}")
@@ -209,5 +213,5 @@ def reconstruct(
 def _with_error_bars(result: Reconstruction, tilt_series: TiltSeries, settings: Settings) -> Reconstruction:
     from recon.uncertainty.posterior import error_bars
 
-    options = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
+    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
     return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))

@@ -1,4 +1,4 @@
-from .coverage import left_out_coverage as left_out_coverage
+from .coverage import left_out_ranks as left_out_ranks
 from .coverage import predictive_ranks as predictive_ranks
 from .coverage import share_within as share_within
 from .coverage import voxel_coverage as voxel_coverage

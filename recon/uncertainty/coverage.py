@@ -60,18 +60,16 @@ def share_within(ranks: NDArray[Any], level: float = 0.9) -> float:
     return float((np.abs(ranks - 0.5) <= level / 2).mean())
 
 
-def left_out_coverage(
-    tilt_series: TiltSeries, *, every: int = 8, num_samples: int = 16, level: float = 0.9, **settings: Any
-) -> float:
-    """The share of pixels of tilts left out whose central predictive interval holds them.
+def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int = 16, **settings: Any) -> NDArray[Any]:
+    """Ranks of the pixels of tilts left out in their predictive distributions, see `predictive_ranks`.
 
     A volume is fitted to the other tilts, its posterior sampled, and each sample projected and put through the noise model.
+    Samples are moved so that their mean is the volume, for it is the volume that error bars stand around.
 
     Args:
         tilt_series: with one detector response for all tilts.
         every: of so many tilts one is left out, and neither end.
         num_samples: of the posterior.
-        level: of the interval.
         **settings: of `recon.reconstruct`.
 
     Raises:
@@ -80,7 +78,9 @@ def left_out_coverage(
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     left = order[every // 2 : -1 : every]
     if every < 2 or not left.size:
-        raise ValueError(f"{len(order)} tilts: leaving out one of {every} leaves nothing to judge by; give a smaller number")
+        raise ValueError(
+            f"{len(order)} tilts: leaving out one of {every} leaves nothing to judge by; give a smaller number"
+        )
     kept, judged = tilt_series.select(np.setdiff1d(order, left)), tilt_series.select(left)
     kept = kept.select(np.argsort(kept.tilt_angles, kind="stable"))
     outcome = replace(reconstruct(kept, **settings), uncertainty=None)
@@ -95,11 +95,13 @@ def left_out_coverage(
     if any(parameter.numel() > 1 for parameter in formation.parameters()):
         raise ValueError("the response differs from tilt to tilt: what it is at tilts left out is not known")
     depth, _, width = volumes[0].shape
+    moved = torch.from_numpy(outcome.volume.attenuation) - torch.stack(volumes).mean(0).cpu()
     pixels = judged.images.shape[2]
     A = SliceProjector(tilt_angles=judged.tilt_angles, depth=depth, width=width, detector_width=pixels)
     with torch.no_grad():
-        rays = [from_rays(A.project(to_columns(volume.cpu())), len(left)) for volume in volumes]
+        rays = [from_rays(A.project(to_columns(volume.cpu() + moved)), len(left)) for volume in volumes]
         signals = torch.stack([formation.cpu()(each) for each in rays])
     ranks = predictive_ranks(outcome.noise_model.cpu(), signals, observation)
     use = np.ones(ranks.shape, np.bool_) if judged.mask is None else judged.mask
-    return share_within(ranks[use], level)
+    found: NDArray[Any] = ranks[use]
+    return found

@@ -18,7 +18,7 @@ _SAFE = 1.2  # a power iteration of few steps comes out low
 
 
 class Energy:
-    """Minus the log-density of occupied voxels, in units of the field's scale: −log p(observation | volume) + weight · regulariser.
+    """Minus the log-density of a volume, in units of the field's scale: −log p(observation | volume) + weight · regulariser.
 
     Args:
         model: signal model, as fitted.
@@ -50,7 +50,9 @@ class Energy:
 
     def _rays(self, units: Tensor) -> Tensor:
         values = units * self.scale
-        return self.model.projector.project(values) if self.model.occupancy is None else self.model.tiles.project(values)
+        return (
+            self.model.projector.project(values) if self.model.occupancy is None else self.model.tiles.project(values)
+        )
 
     def _misfit(self, units: Tensor) -> Tensor:
         """Its gradient is that of minus the log-likelihood; its value is not, where a table gives the slope alone."""
@@ -61,11 +63,12 @@ class Energy:
         return -log_prob[self.train].sum()
 
     def _cost(self, units: Tensor) -> Tensor:
-        values, scale = units * self.scale, _SOFTENED * self.scale
-        if self.model.occupancy is not None:
-            return self.weight * self.model.regulariser.of_tiles(values, self.model.tiles, scale)
-        field = self.model.field
-        return self.weight * self.model.regulariser(values.view(field.depth, field.width, field.height), scale)
+        values, scale, model = units * self.scale, _SOFTENED * self.scale, self.model
+        if model.occupancy is not None:
+            cost = model.regulariser.of_tiles(values, model.tiles, scale)
+        else:
+            cost = model.regulariser(values.view(model.field.depth, model.field.width, model.field.height), scale)
+        return self.weight * cost
 
     def gradient(self, units: Tensor) -> Tensor:
         """Of the energy, nats per unit."""
@@ -82,7 +85,9 @@ class Energy:
         start, found = _slope(part, self.start), 0.0
         for _ in range(_POWER_STEPS):
             direction = direction * self.filled
-            step = 0.01 * direction / direction.abs().max().clamp_min(1e-30)  # units: within what smoothing makes quadratic
+            step = (
+                0.01 * direction / direction.abs().max().clamp_min(1e-30)
+            )  # units: within what smoothing makes quadratic
             direction = _slope(part, self.start + step) - start
             found = float(direction.norm() / step.norm().clamp_min(1e-30))
         return found

@@ -60,8 +60,8 @@ def mean_of_region(
 ) -> Measurement:
     """Mean attenuation of a region.
 
-    How errors of neighbours correlate is not in the error bars. The interval holds for any correlation, and is too wide where they
-    are independent: the standard deviation of a mean is at most the mean of the standard deviations.
+    How errors of neighbours correlate is not in the error bars. The interval holds for any correlation, and is too wide where
+    they are independent: the standard deviation of a mean is at most the mean of the standard deviations.
 
     Args:
         volume: (z, y, x) attenuation per voxel.
@@ -72,7 +72,9 @@ def mean_of_region(
     value = float(volume[region].mean(dtype=np.float64))
     if uncertainty is None:
         return Measurement(value)
-    spread, bias = (float(part.attenuation[region].mean(dtype=np.float64)) for part in (uncertainty.std, uncertainty.bias))
+    spread, bias = (
+        float(part.attenuation[region].mean(dtype=np.float64)) for part in (uncertainty.std, uncertainty.bias)
+    )
     half = quantile(level) * float(np.hypot(spread, bias))
     return Measurement(value, value - half, value + half)
 

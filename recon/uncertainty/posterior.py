@@ -26,8 +26,8 @@ _SHARE = 0.1  # of the pixels, left out as in the fit, so that the posterior kno
 class Posterior:
     """A chain of volumes that are compatible with the images and with the regulariser, as a stage: one step gives one sample.
 
-    A step goes down the gradient of `Energy` and is disturbed by Gaussian noise; what would be negative is reflected. Noise model,
-    weight and detector response stay as the fit left them.
+    A step goes down the gradient of `Energy` and is disturbed by Gaussian noise; what would be negative is reflected. Noise
+    model, weight and detector response stay as the fit left them.
 
     Args:
         outcome: a fitted reconstruction.
@@ -119,7 +119,8 @@ def error_bars(
 ) -> Uncertainty:
     """Standard deviation and bias of every voxel of a fitted volume, from samples of its posterior.
 
-    The posterior is what noise model and weight say: the likelihood of the images that the fit saw, times exp(−weight · regulariser).
+    The posterior is what noise model and weight say: the likelihood of the pixels that were fitted, times
+    exp(−weight · regulariser).
     Where the missing wedge hides something, only the regulariser speaks. Voxels that count as vacuum have no spread.
 
     Args:

@@ -1,4 +1,4 @@
-"""The names of all regularisers, without importing any: every module of this folder without an underscore is one, but the contract."""
+"""The names of all regularisers, without importing any: modules of this folder without an underscore, but the contract."""
 
 from __future__ import annotations
 

@@ -1,12 +1,17 @@
 """Error bars: a posterior that is known is sampled rightly, a wrong noise model is found out, and figures carry intervals."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
+import typer
+from typer.testing import CliRunner
 
 from noiseflow import Gaussian, io
+from noiseflow.metrics.evaluation import kolmogorov_smirnov
+from recon.commands.measure import measure
 from recon.fields.fields import VoxelField
 from recon.fields.regularisers import Regulariser
 from recon.joint.signal_model import TomographySignal
@@ -21,7 +26,7 @@ from recon.uncertainty import (
     Posterior,
     Uncertainty,
     error_bars,
-    left_out_coverage,
+    left_out_ranks,
     line_profile,
     mean_of_region,
     predictive_ranks,
@@ -36,9 +41,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def scene():
-    density = particles(16, generator=np.random.default_rng(1))
-    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=ACQUISITIONS["clipped"])
+    density = particles(16, generator=np.random.default_rng(1), count=10)
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
     return add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+
+
+def measure_volume(*words):
+    app = typer.Typer()
+    app.command()(measure)
+    result = CliRunner().invoke(app, [*map(str, words), "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout.splitlines()[-1])
 
 
 class Nothing(Regulariser):
@@ -46,7 +60,8 @@ class Nothing(Regulariser):
         return 0 * volume.sum()
 
 
-def test_spread_of_a_gaussian_posterior_is_that_of_linear_algebra():
+def test_spread_of_a_gaussian_posterior_is_that_of_linear_algebra(monkeypatch):
+    monkeypatch.setattr("recon.uncertainty.posterior._SHARE", 0.0)  # every pixel counts
     angles, deviation = np.arange(-80, 81, 8.0), 0.05
     projector = SliceProjector(tilt_angles=angles, depth=4, width=4, detector_width=6)
     field = VoxelField((4, 24, 4))
@@ -57,20 +72,26 @@ def test_spread_of_a_gaussian_posterior_is_that_of_linear_algebra():
     images = np.ascontiguousarray(model.signal().detach().view(len(angles), 6, 24).numpy().transpose(0, 2, 1))
     outcome = Reconstruction(Volume(model.volume().numpy()), images, "joint", noise, signal_model=model)
     A = projector.project(torch.eye(16)).double()
-    precision = 0.9 * A.T @ A / deviation**2  # a tenth of the pixels is left out
-    expected = torch.linalg.inv(precision).diagonal().sqrt().view(4, 4)
     chain = Posterior(outcome, TiltSeries(images, angles, mode="linear"), 150)
+    stiffness, modes = torch.linalg.eigh(A.T @ A / deviation**2)
+    variance = 1 / (stiffness * (1 - chain.step_size * stiffness / 2))  # of a chain of finite steps
+    expected = (modes**2 @ variance).sqrt().view(4, 4)
     while chain.done < chain.num_steps:
         chain.step()
     found = torch.from_numpy(chain.result().std.attenuation).square().mean(1).sqrt()
-    assert float((found / expected).log().abs().mean()) < 0.1
+    assert (
+        float((found / expected).log().abs().mean()) < 0.15
+    )  # a chain of this length is not done with the slackest mode
 
 
 def test_samples_repeat_themselves_and_go_on_where_they_were(scene):
     outcome = reconstruct(scene, VolumeGrid.of(scene), weight=0.4, num_steps=10)
     whole = Posterior(outcome, scene, 2)
     whole.step()
-    kept = {**whole.state(), "moments": {k: v.clone() if torch.is_tensor(v) else v for k, v in whole.moments.state().items()}}
+    kept = {
+        **whole.state(),
+        "moments": {k: v.clone() if torch.is_tensor(v) else v for k, v in whole.moments.state().items()},
+    }
     kept["units"] = kept["units"].clone()
     whole.step()
     again = Posterior(outcome, scene, 2)
@@ -94,10 +115,12 @@ def test_error_bars_that_cannot_be_made_are_refused(scene, tmp_path):
 
 def test_wrong_noise_model_is_found_out_on_left_out_pixels(scene):
     settings = {"weight": 0.4, "num_steps": 40, "method": "joint"}
-    right = left_out_coverage(scene, num_samples=4, noise_model=ACQUISITIONS["clipped"].noise(), **settings)
-    wrong = left_out_coverage(scene, num_samples=4, noise_model=Gaussian(0.12), **settings)
-    assert 0.87 < right < 0.93
-    assert abs(wrong - 0.9) > 0.05
+    right = left_out_ranks(scene, num_samples=4, noise_model=ACQUISITIONS["clipped"].noise(), **settings)
+    wrong = left_out_ranks(scene, num_samples=4, noise_model=Gaussian(0.12), **settings)
+    assert 0.87 < share_within(right) < 0.93
+    assert kolmogorov_smirnov(right) < 0.05
+    assert not 0.87 < share_within(wrong) < 0.93
+    assert kolmogorov_smirnov(wrong) > 0.1
 
 
 def test_ranks_of_what_a_detector_clips_are_uniform():
@@ -137,10 +160,12 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     assert set(result["uncertainty"]) == {"std", "bias"}
     assert result["choices"]["regulariser"] == "second-order"
     assert io.read(tmp_path / "v_std.mrc").data.shape == (16, 16, 16)
-    measured = run_command("measure", tmp_path / "v.mrc", "--region", "4:12,4:12,4:12", "--above", 0.01, "--line", "8,8,0:8,8,15")
+    measured = measure_volume(
+        tmp_path / "v.mrc", "--region", "4:12,4:12,4:12", "--above", 0.01, "--line", "8,8,0:8,8,15"
+    )
     assert measured["mean"]["low"] < measured["mean"]["value"] < measured["mean"]["high"]
     assert measured["voxels above"]["low"] <= measured["voxels above"]["value"] <= measured["voxels above"]["high"]
     assert len(measured["line"]["high"]) == 16
     (tmp_path / "v_bias.mrc").unlink()
     with pytest.raises(ValueError, match="missing"):
-        run_command("measure", tmp_path / "v.mrc")
+        measure_volume(tmp_path / "v.mrc")
