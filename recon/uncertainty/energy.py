@@ -59,7 +59,7 @@ class Energy:
         signal: Tensor = self.model.image_formation(self._rays(units).view(self.observation.shape))
         if self.table is not None:
             return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train, signal.reshape(-1))
-        log_prob = self.noise_model(signal).log_prob(self.observation).reshape(-1)
+        log_prob: Tensor = self.noise_model(signal).log_prob(self.observation).reshape(-1)
         return -log_prob[self.train].sum()
 
     def _cost(self, units: Tensor) -> Tensor:
