@@ -6,7 +6,13 @@ import warnings
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-GROUPS = ("noiseflow.commands", "noiseflow.methods", "noiseflow.noise_models", "noiseflow.self_tests")
+GROUPS = (
+    "noiseflow.commands",
+    "noiseflow.methods",
+    "noiseflow.noise_models",
+    "noiseflow.regularisers",
+    "noiseflow.self_tests",
+)
 _OWN = "noiseflow"
 
 

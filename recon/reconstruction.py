@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from noiseflow import FitResult
     from recon.joint.signal_model import TomographySignal
     from recon.joint.weight import WeightChoice
+    from recon.uncertainty.result import Uncertainty
 
 
 @described(projections="detector units")
@@ -34,6 +35,8 @@ class Reconstruction:
         signal_model: field, projector and image formation, as fitted; None where the method has none.
         weight_choice: the weights tried and their held-out likelihoods, where the weight was chosen.
         choices: what was chosen or estimated, by name, for a table.
+        likelihood: the noise model under which the volume was fitted, where `noise_model` only describes what the fit left.
+        uncertainty: error bars of the volume, where they were asked for.
     """
 
     volume: Volume
@@ -44,6 +47,8 @@ class Reconstruction:
     signal_model: TomographySignal | None = None
     weight_choice: WeightChoice | None = None
     choices: dict[str, float | str] = field(default_factory=dict)
+    likelihood: nn.Module | None = None
+    uncertainty: Uncertainty | None = None
 
     @property
     def weight(self) -> float:

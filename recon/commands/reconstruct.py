@@ -28,6 +28,7 @@ from recon.commands.running import (
     stoppable,
     warnings_as_lines,
 )
+from recon.fields.regularisers._names import DEFAULT, regulariser_names
 from recon.methods._names import method_names
 
 if TYPE_CHECKING:
@@ -62,7 +63,17 @@ def reconstruct(
     thickness: Annotated[
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
     ] = None,
-    weight: Annotated[float | None, typer.Option(help="Weight of the total variation.")] = None,
+    weight: Annotated[float | None, typer.Option(help="Weight of the regulariser.")] = None,
+    regulariser: Annotated[
+        str, typer.Option(help=f"What a fitted volume is expected to look like: {', '.join(regulariser_names())}.")
+    ] = DEFAULT,
+    uncertainty: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Write error bars, VOLUME_std and VOLUME_bias, from so many samples of the posterior; 16 are usual.",
+        ),
+    ] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
     window: Annotated[
         str | None,
@@ -148,12 +159,13 @@ def reconstruct(
     from recon.series.tilt_series import VolumeGrid
 
     output = Output(json)
-    targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite)
+    targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
     require_other(out, tilts, angles, transforms, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
+    options |= {"regulariser": regulariser, "uncertainty": uncertainty}
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
     settings_of(**options)
     if fsc and slices_at_once is not None:
@@ -162,6 +174,8 @@ def reconstruct(
         raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --workers and --scheduler")
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler has workers of its own; leave out --workers")
+    if uncertainty and slices_at_once is not None:
+        raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
@@ -244,6 +258,7 @@ def _solve(
     outcome = reconstruct(tilt_series, grid, **options)
     if not fsc:
         return outcome, None
+    options["uncertainty"] = 0
     halves = zip(("even tilts: ", "odd tilts: "), even_odd(tilt_series), strict=True)
     first, second = (reconstruct(half, grid, **options, prefix=prefix).volume for prefix, half in halves)
     return outcome, (first, second)

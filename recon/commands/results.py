@@ -18,6 +18,7 @@ from recon.commands.inputs import Prepared
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
+from recon.uncertainty.result import error_bar_paths
 from recon.verdict.judge import judge
 from recon.verdict.verdict import Verdict
 
@@ -31,6 +32,7 @@ class Targets:
         report: folder of the HTML report, or None.
         noise_model: file for the learnt noise model, or None.
         overwrite: replace existing files even if this program did not write them.
+        error_bars: whether their files, beside the volume's, are written.
 
     Raises:
         ValueError, OSError: as `noiseflow.io.check_output` and `noiseflow.io.check_folder`.
@@ -40,9 +42,12 @@ class Targets:
     report: Path | None = None
     noise_model: Path | None = None
     overwrite: bool = False
+    error_bars: bool = False
 
     def __post_init__(self) -> None:
         io.check_output(self.volume, overwrite=self.overwrite)
+        for path in error_bar_paths(self.volume).values() if self.error_bars else ():
+            io.check_output(path, overwrite=self.overwrite)
         if self.noise_model is not None:
             io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
         if self.report is not None:
@@ -66,11 +71,14 @@ class Targets:
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
         outcome.volume.write(self.volume)
+        bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
         verdict = judge(tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment)
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])
         output.table(("figure", "value"), list(rows.items()))
         output.line(f"volume: {self.volume}")
+        for path in bars.values():
+            output.line(f"error bars: {path}")
         for line in verdict.lines():
             output.line(line)
         page = None
@@ -94,6 +102,7 @@ class Targets:
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
+            | ({"uncertainty": bars} if bars else {})
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )

@@ -17,6 +17,7 @@ from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
 from recon.fields.fields import Field, MultiresolutionField
 from recon.fields.occupancy import Occupancy
+from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
@@ -53,6 +54,7 @@ class JointReconstructor:
         noise_model: a noise model to use, learning or not; None chooses a mean-preserving one behind the detector's rounding
             and clipping limits.
         make_field: makes the field from shape and scale.
+        regulariser: what is expected of a volume; total variation if None.
         num_steps: signal steps of the whole volume; None as the schedule says.
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
@@ -71,6 +73,7 @@ class JointReconstructor:
     weight: float | None = None
     noise_model: Callable[[], nn.Module] | None = None
     make_field: Callable[..., Field] = MultiresolutionField
+    regulariser: Regulariser | None = None
     num_steps: int | None = None
     estimate_response: bool = True
     skip_vacuum: bool = True
@@ -200,7 +203,13 @@ class JointReconstructor:
             occupancy = Occupancy(rough / made.scale, grid.shape).to(self.device)
             occupancy = occupancy if occupancy.share < _WORTHWHILE else None
         formation = response.to(self.device)
-        return TomographySignal(made, projector, formation, weight=weight, learning_rate=rate, occupancy=occupancy)
+        kept: dict[str, Any] = {
+            "weight": weight,
+            "regulariser": self.regulariser,
+            "learning_rate": rate,
+            "occupancy": occupancy,
+        }
+        return TomographySignal(made, projector, formation, **kept)
 
     def _facts(
         self, tilt_series: TiltSeries, whole: TomographySignal, *, share: float | None = None
@@ -313,7 +322,8 @@ class JointReconstructor:
             volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
             shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
             images = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-        return Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
+        found = Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
+        return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:

@@ -63,6 +63,11 @@ class PlannedRun:
         simple = self.facts.simple_is_final and not self.facts.quiet
         return self.runner.models["simple" if simple else "chosen"]
 
+    @property
+    def likelihood(self) -> nn.Module:
+        """The noise model under which the volume ends."""
+        return self.runner.models[[stage for stage in self.stages if stage.kind == "signal"][-1].noise]
+
     def choose(self) -> None:
         """The stages on the slab; the whole volume starts from the response found there."""
         self.runner.run([stage for stage in self.stages if stage.where == "slab"])

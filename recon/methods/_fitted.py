@@ -13,6 +13,8 @@ from torch import nn
 from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.around import as_noise_model
 from noiseflow.models.at_level import at_level
+from recon.fields.regularisers._names import DEFAULT
+from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, run_fit
@@ -109,6 +111,7 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit that a method makes of what a user settled."""
     names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    shared["regulariser"] = find_regulariser(settings.regulariser)
     return JointReconstructor(**(shared | options(settings)))
 
 
@@ -128,6 +131,7 @@ def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruc
         response.scaled_offset.add_(level / float(response.gain * response.offset_unit))
     if chosen and noise_model is not None:
         noise_model = at_level(as_noise_model(noise_model), level)
+    # the likelihood, where it is another, is least squares: the same at every level
     return replace(result, projections=result.projections + np.float32(level), noise_model=noise_model)
 
 
@@ -141,6 +145,8 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
+    if settings.regulariser != DEFAULT:
+        choices["regulariser"] = settings.regulariser
     return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
 
 

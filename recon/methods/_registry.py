@@ -16,6 +16,8 @@ from torch import nn
 from noiseflow.described import described
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
+from recon.fields.regularisers._names import DEFAULT
+from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
@@ -34,7 +36,9 @@ class Settings:
     """What a user may settle; whatever is None the method chooses by itself.
 
     Attributes:
-        weight: of the total variation, see `recon.joint.signal_model.TomographySignal`.
+        weight: of the regulariser, see `recon.joint.signal_model.TomographySignal`.
+        regulariser: what a fitted volume is expected to look like, one of `recon.fields.regularisers.regulariser_names`.
+        uncertainty: samples that error bars of the volume come from; 0 for none.
         num_steps: steps or iterations.
         noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
         window: of the back-projection, one of `recon.projection.wbp.WINDOWS`.
@@ -50,10 +54,12 @@ class Settings:
             has reached.
 
     Raises:
-        ValueError: a negative weight, no steps, a defocus outside 0 to 1, or an unknown window.
+        ValueError: a negative weight, no steps, a defocus outside 0 to 1, an unknown window or regulariser, or one sample.
     """
 
     weight: float | None = None
+    regulariser: str = DEFAULT
+    uncertainty: int = 0
     num_steps: int | None = None
     noise_model: nn.Module | None = None
     window: str | None = None
@@ -74,6 +80,9 @@ class Settings:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
+        find_regulariser(self.regulariser)
+        if self.uncertainty < 0 or self.uncertainty == 1:
+            raise ValueError(f"--uncertainty {self.uncertainty}: a spread needs at least 2 samples; 16 are usual")
         if self.window is not None and self.window not in WINDOWS:
             raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
 
@@ -139,9 +148,14 @@ def settings_of(method: str, **settings: Any) -> Settings:
     if chosen.noise_model is not None and not found.keeps_noise_model:
         able = [name for name in method_names() if find_method(name).keeps_noise_model]
         raise ValueError(f"--noise-model: method {method} has no use for one; use --method {', '.join(able)}")
-    if chosen.defocus and not found.fitted:
+    wanted = {
+        "defocus": chosen.defocus,
+        "regulariser": chosen.regulariser != DEFAULT,
+        "uncertainty": chosen.uncertainty,
+    }
+    for name in [name for name, value in wanted.items() if value and not found.fitted]:
         able = [name for name in method_names() if find_method(name).fitted]
-        raise ValueError(f"--defocus: method {method} models none; use --method {', '.join(able)}")
+        raise ValueError(f"--{name}: method {method} fits no volume; use --method {', '.join(able)}")
     return chosen
 
 
@@ -190,6 +204,8 @@ def reconstruct(
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
         return _run(found, tilt_series, grid, chosen)
+    if chosen.uncertainty:
+        raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if slices_at_once < 1:
         raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
     if found.blockwise is None:
@@ -213,7 +229,15 @@ def _run(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Se
     """Run a method on a series by rising angle; a fit sees copies once, or their noise would count as signal."""
     first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)
     kept, place = np.unique(first, return_inverse=True)
-    if len(kept) == len(first):
-        return method.run(tilt_series, grid, settings)
-    result = method.run(tilt_series.select(kept), grid, settings)
-    return replace(result, projections=result.projections[place])
+    seen = tilt_series if len(kept) == len(first) else tilt_series.select(kept)
+    result = method.run(seen, grid, settings)
+    if settings.uncertainty:
+        result = _with_error_bars(result, seen, settings)
+    return result if seen is tilt_series else replace(result, projections=result.projections[place])
+
+
+def _with_error_bars(result: Reconstruction, tilt_series: TiltSeries, settings: Settings) -> Reconstruction:
+    from recon.uncertainty.posterior import error_bars
+
+    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
+    return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))

@@ -83,3 +83,6 @@ class _TotalVariation(torch.autograd.Function):
 
 def _inner(array: Tensor, axis: int) -> Tensor:
     return array.narrow(axis, 0, array.shape[axis] - 1)
+
+
+REGULARISER = TotalVariation

@@ -1,0 +1,151 @@
+"""Error bars of a volume: how many voxels their intervals cover, on scenes of known truth, and what they cost.
+
+    python docs/benchmarks/uncertainty.py coverage [--phantom shells] [--noise clipped] [--size 64]     # 25 rows
+    python docs/benchmarks/uncertainty.py left-out [--phantom shells]     # tilts that no fit saw, right and wrong noise model
+    python docs/benchmarks/uncertainty.py page                            # uncertainty.md from the JSON
+
+Each row is saved when it is done, in results/uncertainty.json beside this file, and is not computed again without --again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from joint_accuracy import NOISES, PHANTOMS, true_noise
+
+from noiseflow import Gaussian, io
+from noiseflow.commands.console import Output
+from noiseflow.metrics.evaluation import kolmogorov_smirnov
+from recon.benchmarks.scenes import Results, make_scene
+from recon.methods import reconstruct
+from recon.metrics.metrics import compare
+from recon.uncertainty import error_bars, left_out_ranks, share_within, voxel_coverage
+
+HERE = Path(__file__).parent
+_OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
+_HEAD = """# Error bars: do they hold the truth?
+
+Written by `python docs/benchmarks/uncertainty.py page` from `results/uncertainty.json`; each row is one command. Error bars come
+from Langevin samples of the posterior: the learnt likelihood times the prior that regulariser and weight stand for. The 90 %
+interval is the volume ± 1.645·√(std² + bias²). What the missing wedge hides is known to the regulariser alone, and voxels that
+count as vacuum have no spread. Of tilts left out, the table shows the share of pixels inside the 90 % interval and, in brackets,
+the largest distance of the ranks' distribution from the uniform one."""
+_GAP = 8  # every eighth tilt is left out
+Row = dict[str, Any]
+
+
+def coverage(phantom: str, noise: str, *, size: int, tilts: str, samples: int) -> Row:
+    """One row: the joint fit as a user gets it, its error bars, and the share of voxels whose interval holds the truth."""
+    scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts)
+    started = time.perf_counter()
+    result = reconstruct(scene.noisy, scene.grid, method="joint")
+    fitted = time.perf_counter()
+    bars = error_bars(result, scene.noisy, samples)
+    done = time.perf_counter()
+    volume, truth = result.volume.attenuation, scene.truth
+    occupied = truth > _OCCUPIED * truth.max()
+    covered = voxel_coverage(volume, bars, truth)
+    inside = (truth[occupied] - volume[occupied]) / np.maximum(bars.half_width()[occupied], 1e-12)
+    return {
+        "phantom": phantom,
+        "noise": noise,
+        "size": size,
+        "volume": compare(volume, truth).psnr,
+        "occupied covered": covered[occupied].mean(),
+        "vacuum covered": covered[~occupied].mean(),
+        "too low": (inside > 1).mean(),
+        "too high": (inside < -1).mean(),
+        "seconds, fit": fitted - started,
+        "seconds, error bars": done - fitted,
+    }
+
+
+def left_out(phantom: str, *, noise: str = "clipped", size: int, tilts: str, samples: int) -> Row:
+    """One row: how many pixels of every eighth tilt, left out, the 90 % interval of the predictive distribution holds."""
+    scene, row = make_scene(size, phantom=phantom, noise=noise, tilts=tilts), Row(phantom=phantom, noise=noise)
+    models = {"learnt": None, "true": true_noise(noise), "Gaussian": Gaussian()}
+    for name, model in models.items():
+        method = {"learnt": "joint", "true": "joint", "Gaussian": "l2"}[name]
+        settings = {} if model is None or method == "l2" else {"noise_model": model}
+        ranks = left_out_ranks(scene.noisy, every=_GAP, num_samples=samples, method=method, **settings)
+        row[name] = {"covered": share_within(ranks), "distance": kolmogorov_smirnov(ranks.ravel())}
+    return row
+
+
+def page(cells: dict[str, Row]) -> str:
+    """The page as Markdown."""
+    lines = [_HEAD, "", "## With the truth", ""]
+    lines += [
+        "| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | error bars : fit |"
+    ]
+    lines += ["|---|---|---|---|---|---|---|---|---|"]
+    for row in (row for key, row in cells.items() if key.startswith("coverage/")):
+        shares = [f"{100 * row[name]:.0f} %" for name in ("occupied covered", "too low", "too high", "vacuum covered")]
+        ratio = row["seconds, error bars"] / row["seconds, fit"]
+        lines.append(
+            f"| {row['phantom']} | {row['noise']} | {row['size']}³ | {row['volume']:.2f} | {' | '.join(shares)} | {ratio:.1f} |"
+        )
+    rows = [row for key, row in cells.items() if key.startswith("left-out/")]
+    if rows:
+        lines += [
+            "",
+            "## Tilts left out",
+            "",
+            "| phantom | noise | learnt | true | Gaussian (wrong) |",
+            "|---|---|---|---|---|",
+        ]
+        for row in rows:
+            shares = [
+                f"{100 * row[name]['covered']:.1f} % ({row[name]['distance']:.3f})"
+                for name in ("learnt", "true", "Gaussian")
+            ]
+            lines.append(f"| {row['phantom']} | {row['noise']} | {' | '.join(shares)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run the chosen rows, save each, and draw the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("coverage", "left-out", "page"))
+    parser.add_argument("--phantom", action="append", choices=PHANTOMS)
+    parser.add_argument("--noise", action="append", choices=NOISES)
+    parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--tilts", default="-59.5:57.5:1.5", help="START:STOP:STEP in degrees; 79 tilts by default")
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "uncertainty.json", help="JSON file")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    results, output = Results(options.out, "error bars"), Output(json_mode=False)
+    scene = {"size": options.size, "tilts": options.tilts, "samples": options.samples}
+
+    def cell(key: str, compute: Callable[[], Row]) -> None:
+        if options.again:
+            results.cells.pop(key, None)
+        output.line(f"{key}: {results.cell(key, compute)}")
+
+    where = f"{options.size}/{options.tilts}/{options.samples}"
+    for phantom in options.phantom or PHANTOMS:
+        if options.part == "left-out":
+            cell(f"left-out/{phantom}/{where}", lambda p=phantom: left_out(p, **scene))
+        if options.part == "coverage":
+            for noise in options.noise or NOISES:
+                cell(f"coverage/{phantom}/{noise}/{where}", lambda p=phantom, n=noise: coverage(p, n, **scene))
+    if options.part == "page":
+        with io.atomic_path(HERE / "uncertainty.md") as partial:
+            partial.write_text(page(results.cells), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"uncertainty.py: {error}")

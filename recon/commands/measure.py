@@ -1,0 +1,108 @@
+"""The command `noiseflow measure`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output
+
+if TYPE_CHECKING:
+    from recon.series.tilt_series import Volume
+    from recon.uncertainty.result import Uncertainty
+
+
+def measure(
+    volume: Annotated[Path, typer.Argument(help="Volume (z, y, x): .mrc, .rec, .tif or .npy.")],
+    region: Annotated[str, typer.Option(help="Part to measure, voxels: z0:z1,y0:y1,x0:x1; all by default.")] = ":,:,:",
+    above: Annotated[float | None, typer.Option(help="Count the voxels of the region above this attenuation.")] = None,
+    line: Annotated[str | None, typer.Option(help="Profile from z,y,x to z,y,x, voxels: z0,y0,x0:z1,y1,x1.")] = None,
+    level: Annotated[float, typer.Option(help="Share of the truth that intervals should hold.")] = 0.9,
+    json: JsonOption = False,
+) -> None:
+    """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals where it has error bars.
+
+    Error bars are the files VOLUME_std and VOLUME_bias that `noiseflow reconstruct --uncertainty 16` writes.
+    """
+    from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
+    from recon.uncertainty.result import quantile
+
+    output, found = Output(json), _read(volume)
+    quantile(level)
+    values, bars = found.attenuation, read_error_bars(volume, found)
+    part = parse_region(region, values.shape)
+    mean = mean_of_region(values, part, bars, level=level)
+    rows, result = [("mean attenuation per voxel", mean.in_words())], {"mean": vars(mean)}
+    if above is not None:
+        count = volume_above(values, above, part, bars, level=level)
+        rows.append((f"voxels above {above:g}", count.in_words()))
+        result["voxels above"] = vars(count)
+        size = found.voxel_size
+        if size is not None:
+            ends = (None if end is None else end * (size / 10) ** 3 for end in (count.low, count.high))
+            cubed = type(count)(count.value * (size / 10) ** 3, *ends)
+            result["volume above (nm³)"] = vars(cubed)
+            rows.append((f"volume above {above:g} (nm³)", cubed.in_words()))
+    output.table(("figure", "value" if bars is None else f"value ({100 * level:g} % interval)"), rows)
+    profile = None
+    if line is not None:
+        distance, along, half = line_profile(values, *_ends(line), bars, level=level)
+        columns = [distance, along] if half is None else [distance, along, along - half, along + half]
+        names = ("distance (voxels)", "attenuation", "low", "high")[: len(columns)]
+        output.table(names, [tuple(f"{value:.4g}" for value in row) for row in zip(*columns, strict=True)])
+        profile = dict(zip(names, columns, strict=True))
+    if bars is None:
+        output.line(f"no error bars beside {volume}: noiseflow reconstruct --uncertainty 16 writes them")
+    output.result(
+        {"volume": volume, "region": region, "level": level, **result, "line": profile, "error_bars": bars is not None}
+    )
+
+
+def _read(path: Path) -> Volume:
+    """A volume.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, or is no volume.
+    """
+    from noiseflow import io
+    from recon.series.tilt_series import Volume
+
+    image = io.read(path)
+    if image.data.ndim != 3:
+        raise ValueError(f"{path} has shape {image.data.shape}; a volume (z, y, x) has three axes")
+    return Volume(image.data, None if image.voxel_size is None else image.voxel_size[0])
+
+
+def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
+    """The error bars beside the file of a volume; None where there are none.
+
+    Raises:
+        ValueError: one of the two files is missing, or has another shape.
+    """
+    from recon.uncertainty.result import Uncertainty, error_bar_paths
+
+    paths = error_bar_paths(path)
+    there = [each.exists() for each in paths.values()]
+    if not any(there):
+        return None
+    if not all(there):
+        missing = next(each for each in paths.values() if not each.exists())
+        raise ValueError(f"{missing} is missing: error bars are two files; write them again, or remove the other")
+    std, bias = (_read(each) for each in paths.values())
+    for each, where in zip((std, bias), paths.values(), strict=True):
+        if each.attenuation.shape != volume.attenuation.shape:
+            raise ValueError(
+                f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}: of another volume"
+            )
+    return Uncertainty(std, bias, 0)
+
+
+def _ends(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    try:
+        (a, b, c), (d, e, f) = ((float(number) for number in end.split(",")) for end in text.split(":"))
+    except ValueError:
+        raise ValueError(f"--line {text}: give z0,y0,x0:z1,y1,x1 in voxels, such as 32,32,0:32,32,63") from None
+    return (a, b, c), (d, e, f)

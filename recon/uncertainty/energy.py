@@ -1,0 +1,105 @@
+"""The posterior of a volume as a fit left it: minus its log-density, as a function of voxels, with its gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.picked import needs_image
+from noiseflow.fitting.observation_table import ObservationTable
+from recon.joint.signal_model import TomographySignal
+from recon.projection.base import from_columns
+
+_SOFTENED = 10  # times the smoothing: a tenth as stiff, and still a fifth of a unit, below what is to be told apart
+_POWER_STEPS = 8
+_SAFE = 1.2  # a power iteration of few steps comes out low
+
+
+class Energy:
+    """Minus the log-density of a volume, in units of the field's scale: −log p(observation | volume) + weight · regulariser.
+
+    Args:
+        model: signal model, as fitted.
+        noise_model: what it was fitted under.
+        observation: (tilt, u, y) pixel values.
+        train: of that shape, True at the pixels that were fitted.
+    """
+
+    def __init__(self, model: TomographySignal, noise_model: nn.Module, observation: Tensor, train: Tensor) -> None:
+        self.model, self.noise_model, self.observation = model, noise_model, observation
+        self.scale, self.train = float(model.field.scale), train.reshape(-1)
+        with torch.no_grad():
+            field = model.field
+            self.start = field().clone() / self.scale if model.occupancy is None else field.on(model.tiles).clone()
+            signal = model.signal()
+        self.weight = model.weight * float(train.sum()) / (self.scale * model.num_pixels)
+        self.table: ObservationTable | None = None
+        if not needs_image(noise_model):
+            pixels = observation[train]
+            low = float(torch.minimum(signal.min(), pixels.min()))
+            high = float(torch.maximum(signal.max(), pixels.max()))
+            filled = torch.where(train, observation, pixels.mean())  # pixels that are left out may be NaN
+            self.table = ObservationTable(noise_model, filled.reshape(-1), low, high)
+
+    @property
+    def filled(self) -> Tensor | float:
+        """1 where a voxel may hold anything."""
+        return 1.0 if self.model.occupancy is None else self.model.tiles.filled
+
+    def _rays(self, units: Tensor) -> Tensor:
+        values = units * self.scale
+        return (
+            self.model.projector.project(values) if self.model.occupancy is None else self.model.tiles.project(values)
+        )
+
+    def _misfit(self, units: Tensor) -> Tensor:
+        """Its gradient is that of minus the log-likelihood; its value is not, where a table gives the slope alone."""
+        signal: Tensor = self.model.image_formation(self._rays(units).view(self.observation.shape))
+        if self.table is not None:
+            return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train, signal.reshape(-1))
+        log_prob: Tensor = self.noise_model(signal).log_prob(self.observation).reshape(-1)
+        return -log_prob[self.train].sum()
+
+    def _cost(self, units: Tensor) -> Tensor:
+        values, scale, model = units * self.scale, _SOFTENED * self.scale, self.model
+        if model.occupancy is not None:
+            cost = model.regulariser.of_tiles(values, model.tiles, scale)
+        else:
+            cost = model.regulariser(values.view(model.field.depth, model.field.width, model.field.height), scale)
+        return self.weight * cost
+
+    def gradient(self, units: Tensor) -> Tensor:
+        """Of the energy, nats per unit."""
+        return _slope(lambda values: self._misfit(values) + self._cost(values), units)
+
+    def stiffness(self) -> float:
+        """The largest curvature at the fit, nats per square unit: likelihood and regulariser apart, by power iteration."""
+        generator = torch.Generator(self.start.device).manual_seed(0)
+        rough = torch.randn(self.start.shape, generator=generator, device=self.start.device)
+        even = torch.ones_like(self.start)
+        return _SAFE * (self._largest(self._misfit, even) + self._largest(self._cost, rough))
+
+    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor) -> float:
+        start, found = _slope(part, self.start), 0.0
+        for _ in range(_POWER_STEPS):
+            direction = direction * self.filled
+            step = (
+                0.01 * direction / direction.abs().max().clamp_min(1e-30)
+            )  # units: within what smoothing makes quadratic
+            direction = _slope(part, self.start + step) - start
+            found = float(direction.norm() / step.norm().clamp_min(1e-30))
+        return found
+
+    def volume(self, units: Tensor) -> Tensor:
+        """(z, y, x), attenuation per voxel."""
+        columns = units if self.model.occupancy is None else self.model.tiles.lattice(units)
+        return from_columns(columns * self.scale, self.model.field.depth).contiguous()
+
+
+def _slope(function: Callable[[Tensor], Tensor], units: Tensor) -> Tensor:
+    with torch.enable_grad():
+        leaf = units.detach().requires_grad_()
+        (found,) = torch.autograd.grad(function(leaf), leaf)
+    return found

@@ -1,0 +1,139 @@
+"""Figures of a volume, each with the interval that its error bars allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from recon.uncertainty.result import Uncertainty, quantile
+
+Array = NDArray[np.float64]
+Region = tuple[slice, slice, slice]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A figure and its interval.
+
+    Attributes:
+        value: what the volume says.
+        low, high: ends of the interval; None without error bars.
+    """
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+    def in_words(self) -> str:
+        """The figure, with its interval where it has one."""
+        text = f"{self.value:.4g}"
+        return text if self.low is None else f"{text} ({self.low:.4g} to {self.high:.4g})"
+
+
+def parse_region(text: str, shape: tuple[int, ...]) -> Region:
+    """The slices of ``z0:z1,y0:y1,x0:x1``, voxels; ends may be left out.
+
+    Raises:
+        ValueError: another form, or a region outside the volume.
+    """
+    parts = text.split(",")
+    try:
+        ends = [[int(end) if end.strip() else None for end in part.split(":")] for part in parts]
+    except ValueError:
+        ends = []
+    if len(ends) != 3 or any(len(pair) != 2 for pair in ends):
+        raise ValueError(f"--region {text}: give z0:z1,y0:y1,x0:x1 in voxels, such as 10:20,0:64,30:40")
+    region = []
+    for (start, stop), size in zip(ends, shape, strict=True):
+        first, last = 0 if start is None else start, size if stop is None else stop
+        if not 0 <= first < last <= size:
+            raise ValueError(f"--region {text}: {first}:{last} is not inside the volume's {size} voxels")
+        region.append(slice(first, last))
+    return region[0], region[1], region[2]
+
+
+def mean_of_region(
+    volume: NDArray[np.floating], region: Region, uncertainty: Uncertainty | None = None, *, level: float = 0.9
+) -> Measurement:
+    """Mean attenuation of a region.
+
+    How errors of neighbours correlate is not in the error bars. The interval holds for any correlation, and is too wide where
+    they are independent: the standard deviation of a mean is at most the mean of the standard deviations.
+
+    Args:
+        volume: (z, y, x) attenuation per voxel.
+        region: slices along z, y and x.
+        uncertainty: of the volume.
+        level: of the interval.
+    """
+    value = float(volume[region].mean(dtype=np.float64))
+    if uncertainty is None:
+        return Measurement(value)
+    spread, bias = (
+        float(part.attenuation[region].mean(dtype=np.float64)) for part in (uncertainty.std, uncertainty.bias)
+    )
+    half = quantile(level) * float(np.hypot(spread, bias))
+    return Measurement(value, value - half, value + half)
+
+
+def volume_above(
+    volume: NDArray[np.floating],
+    threshold: float,
+    region: Region,
+    uncertainty: Uncertainty | None = None,
+    *,
+    level: float = 0.9,
+) -> Measurement:
+    """Voxels of a region above a threshold; the interval counts those whose own interval is above it, and reaches above it.
+
+    Args:
+        volume: (z, y, x) attenuation per voxel.
+        threshold: attenuation per voxel.
+        region: slices along z, y and x.
+        uncertainty: of the volume.
+        level: of the intervals of voxels.
+    """
+    part = volume[region]
+    value = float((part > threshold).sum())
+    if uncertainty is None:
+        return Measurement(value)
+    half = uncertainty.half_width(level)[region]
+    return Measurement(value, float((part - half > threshold).sum()), float((part + half > threshold).sum()))
+
+
+def line_profile(
+    volume: NDArray[np.floating],
+    start: tuple[float, float, float],
+    stop: tuple[float, float, float],
+    uncertainty: Uncertainty | None = None,
+    *,
+    level: float = 0.9,
+) -> tuple[Array, Array, Array | None]:
+    """Attenuation along a line, about one point per voxel, linearly interpolated.
+
+    Args:
+        volume: (z, y, x) attenuation per voxel.
+        start, stop: (z, y, x) ends, voxels.
+        uncertainty: of the volume.
+        level: of the interval.
+
+    Returns:
+        Distance from the start in voxels, attenuation, and half the width of its interval (None without error bars).
+
+    Raises:
+        ValueError: an end outside the volume.
+    """
+    ends = np.array([start, stop], dtype=np.float64)
+    if (ends < 0).any() or (ends > np.array(volume.shape) - 1).any():
+        raise ValueError(f"--line from {start} to {stop} leaves the volume of shape {volume.shape} (z, y, x)")
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    distance = np.linspace(0, length, max(2, round(length) + 1))
+    points = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (distance / max(length, 1e-12))
+
+    def along(values: NDArray[np.floating]) -> Array:
+        return np.asarray(map_coordinates(values.astype(np.float64), points, order=1))
+
+    return distance, along(volume), None if uncertainty is None else along(uncertainty.half_width(level))

@@ -1,0 +1,171 @@
+"""Error bars: a posterior that is known is sampled rightly, a wrong noise model is found out, and figures carry intervals."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+import typer
+from typer.testing import CliRunner
+
+from noiseflow import Gaussian, io
+from noiseflow.metrics.evaluation import kolmogorov_smirnov
+from recon.commands.measure import measure
+from recon.fields.fields import VoxelField
+from recon.fields.regularisers import Regulariser
+from recon.joint.signal_model import TomographySignal
+from recon.methods import reconstruct
+from recon.projection.image_formation import Linear
+from recon.projection.projector import SliceProjector
+from recon.reconstruction import Reconstruction
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.simulate.phantoms import particles
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.uncertainty import (
+    Posterior,
+    Uncertainty,
+    error_bars,
+    left_out_ranks,
+    line_profile,
+    mean_of_region,
+    predictive_ranks,
+    share_within,
+    volume_above,
+)
+from recon.uncertainty.measure import parse_region
+from tests.commands import run_command
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    density = particles(16, generator=np.random.default_rng(1), count=10)
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
+    return add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+
+
+def measure_volume(*words):
+    app = typer.Typer()
+    app.command()(measure)
+    result = CliRunner().invoke(app, [*map(str, words), "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+class Nothing(Regulariser):
+    def __call__(self, volume, scale):
+        return 0 * volume.sum()
+
+
+def test_spread_of_a_gaussian_posterior_is_that_of_linear_algebra(monkeypatch):
+    monkeypatch.setattr("recon.uncertainty.posterior._SHARE", 0.0)  # every pixel counts
+    angles, deviation = np.arange(-80, 81, 8.0), 0.05
+    projector = SliceProjector(tilt_angles=angles, depth=4, width=4, detector_width=6)
+    field = VoxelField((4, 24, 4))
+    field.start_from(torch.full((4, 24, 4), 3.0))  # far from zero, where nothing is reflected
+    formation = Linear().requires_grad_(False)
+    model = TomographySignal(field, projector, formation, regulariser=Nothing(), weight=0.0)
+    noise = Gaussian(deviation)
+    images = np.ascontiguousarray(model.signal().detach().view(len(angles), 6, 24).numpy().transpose(0, 2, 1))
+    outcome = Reconstruction(Volume(model.volume().numpy()), images, "joint", noise, signal_model=model)
+    A = projector.project(torch.eye(16)).double()
+    chain = Posterior(outcome, TiltSeries(images, angles, mode="linear"), 150)
+    stiffness, modes = torch.linalg.eigh(A.T @ A / deviation**2)
+    variance = 1 / (stiffness * (1 - chain.step_size * stiffness / 2))  # of a chain of finite steps
+    expected = (modes**2 @ variance).sqrt().view(4, 4)
+    while chain.done < chain.num_steps:
+        chain.step()
+    found = torch.from_numpy(chain.result().std.attenuation).square().mean(1).sqrt()
+    assert (
+        float((found / expected).log().abs().mean()) < 0.15
+    )  # a chain of this length is not done with the slackest mode
+
+
+def test_samples_repeat_themselves_and_go_on_where_they_were(scene):
+    outcome = reconstruct(scene, VolumeGrid.of(scene), weight=0.4, num_steps=10)
+    whole = Posterior(outcome, scene, 2)
+    whole.step()
+    kept = {
+        **whole.state(),
+        "moments": {k: v.clone() if torch.is_tensor(v) else v for k, v in whole.moments.state().items()},
+    }
+    kept["units"] = kept["units"].clone()
+    whole.step()
+    again = Posterior(outcome, scene, 2)
+    again.load_state(kept)
+    again.step()
+    np.testing.assert_array_equal(whole.result().std.attenuation, again.result().std.attenuation)
+    bars = error_bars(outcome, scene, 2)
+    np.testing.assert_array_equal(bars.std.attenuation, whole.result().std.attenuation)
+    assert (bars.std.attenuation >= 0).all()
+
+
+def test_error_bars_that_cannot_be_made_are_refused(scene, tmp_path):
+    grid = VolumeGrid.of(scene)
+    with pytest.raises(ValueError, match="fits no volume"):
+        reconstruct(scene, grid, method="wbp", uncertainty=4)
+    with pytest.raises(ValueError, match="at least 2"):
+        reconstruct(scene, grid, uncertainty=1)
+    with pytest.raises(ValueError, match="whole volume"):
+        reconstruct(scene, grid, uncertainty=4, slices_at_once=8, scratch=tmp_path / "a.npy")
+
+
+def test_wrong_noise_model_is_found_out_on_left_out_pixels(scene):
+    settings = {"weight": 0.4, "num_steps": 40, "method": "joint"}
+    right = left_out_ranks(scene, num_samples=4, noise_model=ACQUISITIONS["clipped"].noise(), **settings)
+    wrong = left_out_ranks(scene, num_samples=4, noise_model=Gaussian(0.12), **settings)
+    assert 0.87 < share_within(right) < 0.93
+    assert kolmogorov_smirnov(right) < 0.05
+    assert not 0.87 < share_within(wrong) < 0.93
+    assert kolmogorov_smirnov(wrong) > 0.1
+
+
+def test_ranks_of_what_a_detector_clips_are_uniform():
+    noise = ACQUISITIONS["clipped"].noise()
+    signal = torch.linspace(0.2, 1.0, 20000)
+    ranks = predictive_ranks(noise, signal[None], noise(signal).sample(generator=torch.Generator().manual_seed(0)))
+    assert share_within(ranks) == pytest.approx(0.9, abs=0.01)
+    assert float(np.abs(np.sort(ranks) - np.linspace(0, 1, ranks.size)).max()) < 1.6 / math.sqrt(ranks.size)
+
+
+def test_figures_of_a_volume_carry_intervals(tmp_path):
+    values = np.zeros((4, 5, 6), np.float32)
+    values[1:3] = 2.0
+    bars = Uncertainty(Volume(np.full_like(values, 0.3)), Volume(np.full_like(values, -0.4)), 16)
+    whole = parse_region(":,:,:", values.shape)
+    mean = mean_of_region(values, parse_region("1:3,:,2:", values.shape), bars)
+    assert (mean.value, mean.high - mean.value) == (2.0, pytest.approx(1.6449 * 0.5, rel=1e-3))
+    count = volume_above(values, 1.5, whole, bars)
+    assert (count.low, count.value, count.high) == (0, 60, 60)
+    distance, along, half = line_profile(values, (0, 2, 2), (3, 2, 2), bars)
+    np.testing.assert_allclose(along, [0, 2, 2, 0])
+    np.testing.assert_allclose(half, 1.6449 * 0.5, rtol=1e-3)
+    assert distance[-1] == 3
+    for bad in ("1:2", "0:9,:,:", "a:b,:,:"):
+        with pytest.raises(ValueError, match="--region"):
+            parse_region(bad, values.shape)
+    io.write(tmp_path / "v.mrc", values, voxel_size=(10.0, 10.0, 10.0))
+    paths = bars.write(tmp_path / "v.mrc")
+    assert sorted(path.name for path in paths.values()) == ["v_bias.mrc", "v_std.mrc"]
+
+
+def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
+    np.save(tmp_path / "tilts.npy", scene.images)
+    np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)
+    options = ["--weight", 0.4, "--steps", 5, "--uncertainty", 2, "--regulariser", "second-order"]
+    result = run_command("reconstruct", tmp_path / "tilts.npy", "-o", tmp_path / "v.mrc", *options)
+    assert set(result["uncertainty"]) == {"std", "bias"}
+    assert result["choices"]["regulariser"] == "second-order"
+    assert io.read(tmp_path / "v_std.mrc").data.shape == (16, 16, 16)
+    measured = measure_volume(
+        tmp_path / "v.mrc", "--region", "4:12,4:12,4:12", "--above", 0.01, "--line", "8,8,0:8,8,15"
+    )
+    assert measured["mean"]["low"] < measured["mean"]["value"] < measured["mean"]["high"]
+    assert measured["voxels above"]["low"] <= measured["voxels above"]["value"] <= measured["voxels above"]["high"]
+    assert len(measured["line"]["high"]) == 16
+    (tmp_path / "v_bias.mrc").unlink()
+    with pytest.raises(ValueError, match="missing"):
+        measure_volume(tmp_path / "v.mrc")
