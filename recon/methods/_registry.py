@@ -155,7 +155,8 @@ def settings_of(method: str, **settings: Any) -> Settings:
     }
     for name in [name for name, value in wanted.items() if value and not found.fitted]:
         able = [name for name in method_names() if find_method(name).fitted]
-        raise ValueError(f"--{name}: method {method} fits no volume; use --method {', '.join(able)}")
+        why = "models none" if name == "defocus" else "fits no volume"
+        raise ValueError(f"--{name}: method {method} {why}; use --method {', '.join(able)}")
     return chosen
 
 
