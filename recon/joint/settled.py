@@ -65,8 +65,9 @@ class PlannedRun:
 
     @property
     def likelihood(self) -> nn.Module:
-        """The noise model under which the volume ends."""
-        return self.runner.models[[stage for stage in self.stages if stage.kind == "signal"][-1].noise]
+        """The noise model under which the volume ends; that of choice where nothing needed a step."""
+        last = [stage for stage in self.stages if stage.kind == "signal"][-1:]
+        return self.runner.models[last[0].noise] if last else self.noise_model
 
     def choose(self) -> None:
         """The stages on the slab; the whole volume starts from the response found there."""

@@ -28,6 +28,7 @@ _STEADY_CHANCE, _STEADY_PART = (
     15.0,
     0.3,
 )  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
+_SIGNALS = 16  # bins of equal counts: finer than any smooth misfit
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -119,14 +120,24 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
 
 def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Smooth structure that stays where it is in all residuals: illumination or a detector that is not flat."""
-    mean = residuals.residual.mean(0, keepdims=True)
-    steady, power = neighbours(mean, 1), float(np.mean(residuals.residual**2))
+    residual = residuals.residual - _by_signal(images - residuals.residual, residuals.residual)
+    mean = residual.mean(0, keepdims=True)
+    steady, power = neighbours(mean, 1), float(np.mean(residual**2))
     share = steady / max(neighbours(images - images.mean(), 1), 1e-30)
     score = steady * len(images) * float(np.sqrt(mean.size)) / max(power, 1e-30)
-    part = steady / max(neighbours(residuals.residual, 1), 1e-30)
+    part = steady / max(neighbours(residual, 1), 1e-30)
     evidence = {"steady structure": {"share": share, "score": score, "part": part}}
     if share < _STEADY or score < _STEADY_CHANCE or part < _STEADY_PART:
         return evidence, []
     sentence = f"all residuals hold the same smooth structure, {share:.1%} of that of the images, whatever the tilt"
     advice = "correct the images with flats and darks, or for uneven illumination"
     return evidence, [Finding("pattern", min(2.9, share / _STEADY), sentence, advice)]
+
+
+def _by_signal(signal: Array, residual: Array) -> Array:
+    """The mean residual at each pixel's signal: clipping that a method does not know leaves one, wherever the pixel lies."""
+    edges = np.quantile(signal, np.linspace(0, 1, _SIGNALS + 1)[1:-1])
+    bins = np.searchsorted(edges, signal)
+    counts = np.bincount(bins.ravel(), minlength=_SIGNALS)
+    sums = np.bincount(bins.ravel(), weights=residual.ravel(), minlength=_SIGNALS)
+    return (sums / np.maximum(counts, 1))[bins]
