@@ -124,10 +124,13 @@ def interval_and_slopes(
     """`log_interval`, several times faster where cells are narrow, and its derivatives with respect to all four arguments.
 
     Args:
-        low, high, rate: (n,) electrons, float64.
+        low, high, rate: (n,) or () electrons, float64.
         read_noise: scalar, electrons, float64.
-        slopes: whether the derivatives are wanted, (n,) each.
+        slopes: whether the derivatives are wanted, shaped like the cells each.
     """
+    if low.ndim == 0:
+        one = interval_and_slopes(*(each.reshape(1) for each in (low, high, rate)), read_noise, slopes=slopes)
+        return one[0][0], tuple(slope[0] for slope in one[1])
     sigma = float(read_noise)
     mode = posterior_mode(low, high, rate, read_noise) if sigma <= MOST_READ_NOISE else rate
     found = [torch.empty_like(low) for _ in range(5 if slopes else 1)]

@@ -14,6 +14,7 @@ from torch.distributions import Distribution, constraints
 from noiseflow.distributions.expectations import panels
 from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.levels import between, log_sum
+from noiseflow.distributions.pixels import is_traced
 
 _PANELS = 128  # of four nodes each, on a scale that is linear within a standard deviation and logarithmic beyond
 _REACH = 12.0  # the scale's ends: sinh(12) = 81 000 standard deviations
@@ -21,8 +22,12 @@ _CELL_PANELS = 2  # of an interval narrower than half a standard deviation
 _FAR, _MOST_LEVELS = 40, 2**16  # standard deviations whose whole numbers are added up, and how many of them at most
 
 
-def as_noise_distribution(distribution: Any) -> NoiseDistribution:
+def as_noise_distribution(distribution: Any, *, like: Tensor | None = None) -> NoiseDistribution:
     """A distribution as it is, or a torch distribution with its CDF, quantiles and interval masses made numerically.
+
+    Args:
+        distribution: of one number per pixel.
+        like: the signal, whose number type a torch distribution's answers take; by default that of its mean.
 
     Raises:
         TypeError: no distribution.
@@ -39,7 +44,7 @@ def as_noise_distribution(distribution: Any) -> NoiseDistribution:
             f"{type(distribution).__name__} has events of shape {tuple(distribution.event_shape)}; a noise model needs one "
             "number per pixel: do not wrap it in Independent"
         )
-    return NumericalDistribution(distribution)
+    return NumericalDistribution(distribution, like=like)
 
 
 def _unchecked(distribution: Distribution) -> Distribution:
@@ -58,13 +63,14 @@ class NumericalDistribution(NoiseDistribution):
 
     Args:
         base: one number per pixel, continuous or of whole numbers.
+        like: the number type and device of the answers; by default those of the mean.
     """
 
     independent = False  # an arbitrary torch distribution cannot be taken apart
 
-    def __init__(self, base: Distribution) -> None:
-        like = base.mean if base.mean.is_floating_point() else None
-        super().__init__(base.batch_shape, like=like)
+    def __init__(self, base: Distribution, *, like: Tensor | None = None) -> None:
+        kind = base.mean if like is None else like
+        super().__init__(base.batch_shape, like=kind if kind.is_floating_point() else None)
         self.base = _unchecked(base)
         self._known_mean, self._known_variance = self._moments(base)
         self._spread = torch.sqrt(self._known_variance.detach()).clamp(min=torch.finfo(self._known_mean.dtype).tiny)
@@ -74,10 +80,12 @@ class NumericalDistribution(NoiseDistribution):
         """Mean and variance; location and scale where these do not exist, as those of a Cauchy distribution."""
         mean, variance = base.mean, base.variance
         known = torch.isfinite(mean) & torch.isfinite(variance)
-        if bool(known.all()):
+        if not is_traced(known) and bool(known.all()):
             return mean, variance
         loc, scale = getattr(base, "loc", None), getattr(base, "scale", None)
         if loc is None or scale is None:
+            if is_traced(known):
+                return mean, variance
             raise ValueError(
                 f"{type(base).__name__} has no finite mean and variance, and no loc and scale to place its quadrature by; give "
                 "it the attributes loc and scale"
@@ -113,7 +121,8 @@ class NumericalDistribution(NoiseDistribution):
         return low, high
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Self:
-        return type(self)(self.base.expand(torch.Size(batch_shape)))
+        kind = torch.empty(0, dtype=self._given_dtype, device=self._given_device)
+        return type(self)(self.base.expand(torch.Size(batch_shape)), like=kind)
 
     def log_prob(self, value: Tensor) -> Tensor:
         low, high = self.limits
@@ -184,7 +193,7 @@ class NumericalDistribution(NoiseDistribution):
         high = torch.minimum(torch.minimum(high, most), ends[1])
         empty = ~(low < high)
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
-        narrow = bool(((high - low).detach() <= spread / 2).all())
+        narrow = not is_traced(low) and bool(((high - low).detach() <= spread / 2).all())
         found = self._straight(low, high) if narrow else self._stretched(low, high, centre, spread)
         found = torch.where(empty, torch.full_like(found, -math.inf), found)
         return torch.where(torch.isfinite(centre), found, torch.full_like(found, math.nan))

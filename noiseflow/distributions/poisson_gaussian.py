@@ -13,7 +13,9 @@ from noiseflow.distributions.pixelwise import pixelwise
 
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    return (value - signal) / gain, ((signal - offset).clamp(min=0) / gain).expand_as(value)
+    """Residual and rate, electrons, of one shape though one of value and signal may be a single number."""
+    residual = (value - signal) / gain
+    return residual, ((signal - offset).clamp(min=0) / gain).expand_as(residual)
 
 
 def _log_density(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution
 from noiseflow.distributions.numerical import as_noise_distribution
 from noiseflow.distributions.picked import Signal, values_of
 from noiseflow.models.base import NoiseModelBase
+
+_HALF = (torch.float16, torch.bfloat16)
 
 
 class ModelAround(NoiseModelBase):
@@ -89,6 +93,9 @@ class ModelAround(NoiseModelBase):
 class ForeignModel(NoiseModelBase):
     """Any module that returns a distribution for signals, with the traits of a noise model at their defaults.
 
+    Signals in half precision reach it in single precision, unless its own parameters are in half precision, and infinite ones
+    as NaN.
+
     Args:
         module: called with signals; returns a distribution of one observation for each.
     """
@@ -98,7 +105,13 @@ class ForeignModel(NoiseModelBase):
         self.module = module
 
     def forward(self, signal: Signal) -> NoiseDistribution:
-        return as_noise_distribution(self.module(values_of(signal)))
+        values = values_of(signal)
+        if not values.is_floating_point():
+            return as_noise_distribution(self.module(values))
+        own = next((p.dtype for p in self.module.parameters() if p.is_floating_point()), torch.float32)
+        working = values.to(torch.promote_types(values.dtype, own if own in _HALF else torch.float32))
+        working = torch.where(torch.isfinite(working), working, torch.full_like(working, math.nan))
+        return as_noise_distribution(self.module(working), like=values)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
         """That of the module, where it has one of its own."""

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import noiseflow
+from noiseflow.models.around import as_noise_model
 from tests.contracts import (
     check_bad_values,
     check_distribution,
@@ -30,9 +31,6 @@ def detector(read_noise: float) -> noiseflow.PoissonGaussian:
     return noiseflow.PoissonGaussian(0.05, -0.02, read_noise)
 
 
-PLAIN = "8-bit plain torch"
-"""Computed by torch in its own number type, not under ``vmap``, and with its own answers to signals that are infinite."""
-
 MODELS = {
     "Gaussian": lambda: noiseflow.Gaussian(),
     "Poisson": lambda: noiseflow.Poisson(0.05, -0.2),
@@ -50,7 +48,9 @@ MODELS = {
     "8-bit counts": lambda: noiseflow.Digitised(noiseflow.Poisson(1 / 16), 1 / 16, 0.0, 1.0),
     "clipped spline": lambda: noiseflow.Digitised(noiseflow.SplineFlow(), 0.0, 0.0, 1.0),
     "clipped detector": lambda: noiseflow.Digitised(detector(0.9), 0.0, 0.0, 1.0),
-    PLAIN: lambda: noiseflow.Digitised(Skewed(), 1 / 128, 0.0, 1.0),
+    "plain torch": lambda: as_noise_model(Skewed()),
+    "8-bit plain torch": lambda: noiseflow.Digitised(Skewed(), 1 / 128, 0.0, 1.0),
+    "clipped plain torch": lambda: noiseflow.Digitised(Skewed(), 0.0, 0.0, 1.0),
 }
 SIGNALS = torch.tensor([0.05, 0.4, 0.97])
 
@@ -60,7 +60,7 @@ def test_distribution_is_complete(name: str) -> None:
     check_distribution(MODELS[name]().double()(SIGNALS.double()))
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name != PLAIN])
+@pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
 @pytest.mark.parametrize("parameters", [False, True], ids=["images", "images and parameters"])
 def test_every_number_type_answers_as_double_precision_within_its_rounding(
@@ -75,7 +75,7 @@ def test_scalars_broadcasting_and_nothing_at_all(name: str) -> None:
     check_shapes(MODELS[name](), SIGNALS)
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name != PLAIN])
+@pytest.mark.parametrize("name", MODELS)
 def test_what_is_no_number_or_impossible_is_said_to_be(name: str) -> None:
     check_bad_values(MODELS[name](), SIGNALS)
 
@@ -85,7 +85,7 @@ def test_draws_follow_signal_and_parameters(name: str) -> None:
     check_draws_with_gradient(MODELS[name]().double(), SIGNALS.double())
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("Poisson", "8-bit counts", PLAIN)])
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("Poisson", "8-bit counts")])
 def test_functional_transforms_agree_with_differences(name: str) -> None:
     check_functional_transforms(MODELS[name]().double(), SIGNALS.double())
 
