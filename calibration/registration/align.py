@@ -41,6 +41,10 @@ reach 5.5 once the search over shifts, rotations and motions has picked their be
 TRUSTED_INLIERS = 10
 """Matches that agree, from which on the correlation need not be asked."""
 
+CONCLUSIVE_INLIERS = 30
+"""Matches that agree with the refined transform, and outnumber the others, from which on they prove it alone: a false match
+agrees within `INLIER_DISTANCE` about once in 5000, while the correlation fades with the overlap."""
+
 LARGEST_ERROR = 0.5
 """Standard error, in pixels, above which a transform is too uncertain to use."""
 
@@ -125,7 +129,8 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
     has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
     sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
-    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift. Few matches may
+    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift, or if
+    `CONCLUSIVE_INLIERS` matches and most of all agree with it. Few matches may
     all be wrong, as where a handful of round particles looks like another: the correlation's guess is then asked too, and
     the clearer of the two counts.
 
@@ -223,13 +228,22 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     checks = [correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0)]
     clear = [abs(peak) for peak, distance in checks if abs(peak) >= CLEAR_PEAK and distance <= SEARCH_MARGIN]
     error = _standard_error(short, long, matrix, motion)
-    if not clear or error > LARGEST_ERROR:
-        return None
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
+    conclusive = inlier.sum() >= max(CONCLUSIVE_INLIERS, guess.matches / 2)
+    if not (clear or conclusive) or error > LARGEST_ERROR:
+        return None
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
     return Registration(
-        matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, max(clear), sign < 0
+        matrix,
+        motion,
+        guess.method,
+        int(inlier.sum()),
+        guess.matches,
+        rms,
+        error,
+        max(abs(p) for p, _ in checks),
+        sign < 0,
     )
 
 

@@ -73,8 +73,9 @@ class AlignedPair:
 
 
 def share_of(part: VarianceLine, total: VarianceLine, signal: Image) -> Image:
-    """Ratio of two variance lines at each signal, within [0, 0.9]."""
-    return np.clip(part(signal) / np.maximum(total(signal), np.finfo(float).tiny), 0.0, 0.9)
+    """Ratio of two variance lines at each signal, within [0, 0.9]; 0.9 where the part is all there is, 0 where there is none."""
+    own, whole = np.maximum(part(signal), 0.0), total(signal)
+    return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
 
 
 def align_pair(pair: ExposurePair) -> AlignedPair:

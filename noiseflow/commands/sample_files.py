@@ -73,8 +73,9 @@ def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
     return image.data, image.voxel_size
 
 
-def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any]) -> NDArray[Any]:
-    """The noisy values in the number type asked for.
+def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_model: NoiseModelBase) -> NDArray[Any]:
+    """The noisy values in the number type asked for; `auto` keeps the clean file's or, where the model rounds to whole numbers,
+    takes the first of uint16, int16 and int32 that holds them.
 
     Raises:
         ValueError: integers that some values are not, or that cannot hold them.
@@ -82,15 +83,14 @@ def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any]) -> NDAr
     if dtype in ("float32", "float64"):
         return noisy.astype(dtype)
     kind = given if dtype == "auto" else np.dtype(dtype)
-    if kind.kind not in "iu":
-        return noisy.astype(np.float64) if kind == np.float64 else noisy
-    limits = np.iinfo(kind)
     whole = bool((noisy == np.round(noisy)).all())
-    fits = whole and limits.min <= noisy.min() and noisy.max() <= limits.max
-    if fits:
-        return noisy.astype(kind)
-    if dtype == "auto":
-        return noisy
+    rounds = noise_model.step > 0 and float(noise_model.step).is_integer()
+    own = [np.dtype(one) for one in (np.uint16, np.int16, np.int32)] if dtype == "auto" and rounds else []
+    for one in (kind, *own) if whole else ():
+        if one.kind in "iu" and np.iinfo(one).min <= noisy.min() and noisy.max() <= np.iinfo(one).max:
+            return noisy.astype(one)
+    if dtype == "auto" or kind.kind not in "iu":
+        return noisy.astype(np.float64) if kind == np.float64 else noisy
     raise ValueError(
         f"--dtype {dtype} cannot hold the noisy values, {noisy.min():g} … {noisy.max():g}"
         f"{'' if whole else ', which are not whole numbers'}; use --dtype float32, or a model that rounds and clips (Digitised)"

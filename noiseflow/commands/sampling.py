@@ -36,8 +36,8 @@ def sample(
     dtype: Annotated[
         str,
         typer.Option(
-            help="Number type to write: auto (the clean file's, where it holds the noisy values exactly; else float32), "
-            "float32, float64, uint8, uint16 or int16."
+            help="Number type to write: auto (the clean file's integers, where they hold the noisy values; else uint16, int16 or "
+            "int32 where the model rounds to whole numbers; else float32), float32, float64, uint8, uint16 or int16."
         ),
     ] = "auto",
     json: JsonOption = False,
@@ -57,7 +57,7 @@ def sample(
     pieces = sample_files.pieces(noise_model, _tensor(data))
     with progress_bar("Sampling", len(pieces), json_mode=json) as progress:
         noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
-    stored = sample_files.stored(noisy.numpy(), dtype, data.dtype)
+    stored = sample_files.stored(noisy.numpy(), dtype, data.dtype, noise_model)
     io.write(output, stored, voxel_size=voxel_size)
     out = Output(json)
     notes = sample_files.notes(noise_model, data)

@@ -14,6 +14,8 @@ MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
+PNG_SUFFIX = ".png"
+"""Read as a single image; apart from `SUFFIXES`, as the PNG files beside data are pictures of them."""
 
 VoxelSize = tuple[float, float, float]
 

@@ -16,6 +16,7 @@ from noiseflow.io.image_file import (
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
+    PNG_SUFFIX,
     SUFFIXES,
     TIFF_SUFFIXES,
     ImageFile,
@@ -36,9 +37,9 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, or a folder of single images; with the
-            extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5. Of a file that holds several images,
-            ``FILE::NAME`` names one.
+        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, one grey ``.png`` image, or a folder
+            of single images of the other formats; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5.
+            Of a file that holds several images, ``FILE::NAME`` names one.
         mapped: leave the pixels of an MRC or ``.npy`` file on the disk until they are used; changes to them stay in memory.
 
     Raises:
@@ -121,7 +122,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
 
 
 def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, tiff
+    from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
 
     suffix = path.suffix.lower()
     if suffix in MICROSCOPE_SUFFIXES:
@@ -132,14 +133,18 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
         return partial(numpy_files.read_npz, member=member)
     if suffix in _NO_IMAGES:
         raise ValueError(f"{path} is no image but {_NO_IMAGES[suffix]}; check the order and the names of what you gave")
-    if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES))}")
+    if suffix not in SUFFIXES | {PNG_SUFFIX}:
+        raise ValueError(
+            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}"
+        )
     if member is not None:
         raise ValueError(f"{path}::{member}: a {suffix} file holds one image; leave ::{member} out")
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
     if suffix in TIFF_SUFFIXES:
         return tiff.read
+    if suffix == PNG_SUFFIX:
+        return png.read
     return ome_zarr.read if suffix == ".zarr" else partial(numpy_files.read_npy, mapped=mapped)
 
 

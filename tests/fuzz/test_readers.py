@@ -18,6 +18,7 @@ import pytest
 import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 import noiseflow
 from noiseflow import io
@@ -71,6 +72,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     np.savez_compressed(folder / "a.npz", images=STACK, tilt_angles=np.arange(3.0))
     tifffile.imwrite(folder / "a.tif", STACK.astype(np.uint16), photometric="minisblack", compression="zlib")
     tifffile.imwrite(folder / "a.tiff", STACK.astype(np.uint16), ome=True, metadata={"axes": "ZYX"})
+    Image.fromarray(STACK[0].astype(np.uint16)).save(folder / "a.png")
     with h5py.File(folder / "a.h5", "w") as file:
         file.create_dataset("exchange/data", data=STACK.astype(np.float32), chunks=(1, 16, 20), compression="gzip")
         file["exchange/theta"] = np.arange(3.0)
@@ -109,7 +111,7 @@ def read_or_refuse(path: Path, content: bytes) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".tif", ".tiff", ".h5", ".emd", ".safetensors"])
+@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".png", ".tif", ".tiff", ".h5", ".emd", ".safetensors"])
 @fuzz
 @given(wounds=st.lists(damage, min_size=1, max_size=4))
 def test_damaged_files_are_read_or_refused(
@@ -127,7 +129,7 @@ def test_damaged_dm3_files_are_read_or_refused(wounds: list[tuple[str, float, in
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("suffix", sorted(io.SUFFIXES - {".zarr"}))
+@pytest.mark.parametrize("suffix", sorted(io.SUFFIXES - {".zarr"} | {".png"}))
 @settings(parent=fuzz, max_examples=max(1, EXAMPLES // 6))
 @given(content=st.binary(min_size=1, max_size=3000))
 def test_any_bytes_are_refused_or_read(suffix: str, content: bytes, tmp_path: Path) -> None:

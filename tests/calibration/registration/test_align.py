@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calibration.registration.align import Registration, register
+from calibration.registration.align import CLEAR_PEAK, Registration, register
 
 from ..conftest import expose, rigid, sparse_scene, textured_scene
+from ..simulators import exposed, random_scene
 
 
 def error_px(found: Registration, matrix, size: int) -> float:
@@ -120,3 +121,13 @@ def test_a_few_matches_that_are_all_wrong_do_not_outweigh_the_correlation():
     short = scene(*moved) + generator.standard_normal(x.shape) / snr
     long = 16 * scene(x, y) + 4 * generator.standard_normal(x.shape) / snr
     assert error_px(register(short, long), matrix, size) < 0.3
+
+
+def test_many_matches_that_agree_register_frames_of_little_overlap():
+    generator = np.random.default_rng(0)
+    scene = random_scene(generator, 512)
+    short, long = (exposed(generator, times * scene[:256, x : x + 256]) for times, x in ((1, 0), (16, 154)))
+    found = register(short, long)
+    assert found.inliers > 100
+    assert found.peak < CLEAR_PEAK  # the correlation alone would not do
+    assert found.shift((256, 256)) == pytest.approx((-154, 0), abs=0.05)

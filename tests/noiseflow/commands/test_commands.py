@@ -92,6 +92,19 @@ def test_sample_keeps_the_number_type_where_it_holds_the_noise(run, tmp_path: Pa
     assert np.load(noisy).dtype == np.float64
 
 
+def test_sample_writes_the_integers_of_a_model_that_rounds(run, tmp_path: Path) -> None:
+    clean, noisy = tmp_path / "clean.npy", tmp_path / "noisy.npy"
+    for level, step, kind in (
+        (300.0, 1.0, np.uint16),
+        (0.0, 2.0, np.int16),
+        (1e5, 1.0, np.int32),
+        (9.0, 0.5, np.float32),
+    ):
+        np.save(clean, np.full((20, 30), level, np.float32))
+        run("sample", saved(noiseflow.Digitised(noiseflow.Gaussian(5.0), step), tmp_path), clean, "-o", noisy)
+        assert np.load(noisy).dtype == kind
+
+
 def test_sample_refuses_a_number_type_that_cannot_hold_the_noise(refused, tmp_path: Path) -> None:
     np.save(tmp_path / "clean.npy", np.full((20, 30), 100, np.uint8))
     words = ("sample", saved(noiseflow.Gaussian(5.0), tmp_path), tmp_path / "clean.npy", "-o", tmp_path / "n.npy")

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import cv2
 import mrcfile
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from noiseflow import io
 
@@ -26,6 +28,32 @@ def test_voxel_size_is_carried(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"image{suffix}"
     io.write(path, IMAGE, voxel_size=(3.0, 2.0, 1.5))
     assert io.read(path).voxel_size == pytest.approx((3.0, 2.0, 1.5), rel=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_png_files_are_read_as_they_are(tmp_path: Path, dtype: type) -> None:
+    image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (20, 30), dtype, endpoint=True)
+    assert cv2.imwrite(str(tmp_path / "image.png"), image)
+    found = io.read_image(tmp_path / "image.png")
+    assert found.dtype == dtype
+    assert np.array_equal(found, image)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "P", "LA", "1"])
+def test_png_files_that_are_not_grey_are_refused(tmp_path: Path, mode: str) -> None:
+    Image.new(mode, (9, 8)).save(tmp_path / "image.png")
+    with pytest.raises(ValueError, match="convert it to one grey channel"):
+        io.read(tmp_path / "image.png")
+
+
+def test_png_files_cut_short_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "image.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (60, 60), np.uint8)).save(path)
+    whole = path.read_bytes()
+    for size in (4, 40, len(whole) // 2, len(whole) - 100):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="cannot be read"):
+            io.read(path)
 
 
 def test_real_files_open(data: Path) -> None:

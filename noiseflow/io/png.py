@@ -1,0 +1,29 @@
+"""PNG files of one grey image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from noiseflow.io.checks import Unsupported, require_room
+from noiseflow.io.image_file import ImageFile
+
+_GREY = {"L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
+"""Number types of Pillow's grey modes; which of them stands for 16 bits depends on its version."""
+
+
+def read(path: Path) -> ImageFile:
+    """Read one grey image of 8 or 16 bits."""
+    from PIL import Image
+
+    with Image.open(path, formats=["PNG"]) as image:
+        if image.mode not in _GREY:
+            raise Unsupported(
+                f"is a PNG file with colour, transparency or 1-bit pixels (mode {image.mode}); "
+                "convert it to one grey channel of 8 or 16 bits first"
+            )
+        if getattr(image, "n_frames", 1) > 1:
+            raise Unsupported("is an animated PNG file; save its images as a TIFF stack")
+        require_room(image.width * image.height, path, compressed=True)
+        return ImageFile(np.asarray(image).astype(_GREY[image.mode]))
