@@ -12,6 +12,7 @@ from noiseflow.io.model_files import kinds, read_metadata
 
 SIGNAL = torch.linspace(0, 1, 7)[None]
 WRAPPERS = {
+    "AtLevel": lambda: noiseflow.AtLevel(noiseflow.SplineFlow(), 100.0),
     "Digitised": lambda: noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0),
     "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow(), 0.3),
     "WithMaps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.full((1, 7), 1.5)),
