@@ -56,8 +56,7 @@ class Schedule:
         trial: signal steps that compare weights, after the first quarter of those of the volume.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
-        whole_rate: learning rate of the volume; 1.4 times as much diverges on sparse objects of 96 voxels.
-        later_rate: learning rate of a slab that is not a rough start: the first steps of Adam are as large where little is left.
+        rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
     """
 
     settle: int = 40
@@ -68,8 +67,7 @@ class Schedule:
     trial: int = 50
     whole: int = 150
     quiet: int = 240
-    whole_rate: float = 0.6
-    later_rate: float = 0.5
+    rate: float = 0.6
 
 
 @described(rate="of a rough start's learning rate")
@@ -148,15 +146,14 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
-    later = schedule.later_rate
     stages.append(
-        FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=later, warm_up=True, hold_offset=hold)
+        FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True, hold_offset=hold)
     )
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
         # trial and final fits share one schedule, because longer fits favour larger weights
-        rate, begin = schedule.whole_rate, schedule.whole // 4
+        rate, begin = schedule.rate, schedule.whole // 4
         again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
         trials = FitStage(
             "choose weight", "weights", "slab", noise, schedule.trial, rate=rate, hold_offset=hold, fits=_TRIALS
@@ -174,7 +171,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     taken_over = facts.quiet and not facts.simple_is_final
 
     def add(name: str, model: Noise, steps: int, *, half: bool = False) -> None:
-        rate, hold = schedule.whole_rate, facts.hold_offset
+        rate, hold = schedule.rate, facts.hold_offset
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, hold_offset=hold))
 
     learning = facts.learn_noise and not facts.settled and noise == "chosen"

@@ -22,7 +22,7 @@ PLANS = {
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        signal      20  chosen, rate 0.5, warm-up
+        slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 5  chosen, rate 0.6
@@ -39,7 +39,7 @@ PLANS = {
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      20  simple, rate 0.5, warm-up
+        slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
         whole  begin                        signal      37  simple, rate 0.6
         whole  fit                          signal      113  simple, rate 0.6
@@ -51,7 +51,7 @@ PLANS = {
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        signal      20  chosen, rate 0.5, warm-up
+        slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 5  chosen, rate 0.6
@@ -85,7 +85,7 @@ PLANS = {
         slab   settle                       signal      40  simple, rate 1, offset held
         slab   measure noise                noise       10  simple
         slab   learn noise                  noise       20  chosen
-        slab   adapt                        signal      20  chosen, rate 0.5, offset held, warm-up
+        slab   adapt                        signal      20  chosen, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  chosen
         whole  begin                        signal      60  simple, rate 0.6, offset held
         whole  go on                        signal      120  simple, rate 0.6, offset held
@@ -99,7 +99,7 @@ PLANS = {
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, offset held
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      20  simple, rate 0.5, offset held, warm-up
+        slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
         slab   begin again                  signal      37  simple, rate 0.6, offset held, afresh
         slab   choose weight                weights     50 x 5  simple, rate 0.6, offset held
