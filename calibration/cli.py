@@ -63,7 +63,7 @@ def calibrate(
     from calibration.camera import MAPS, map_path
     from calibration.detector.models import SIMPLE, require_kind
     from calibration.pipeline import saved_model
-    from calibration.report.page import write_report
+    from calibration.report.page import LABELS, write_report
     from noiseflow.io import check_folder, check_output, require_other
     from noiseflow.io.model_files import MODEL_SUFFIXES
 
@@ -102,7 +102,7 @@ def calibrate(
     noiseflow.save(model, output, units="counts", provenance=provenance)
     out = Output(json)
     _report(out, findings)
-    out.line(f"Noise model ({best.name}): {output}" + (f"\nReport: {page}" if page else ""))
+    out.line(f"Noise model ({LABELS[best.name]}): {output}" + (f"\nReport: {page}" if page else ""))
     out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
 
 

@@ -76,13 +76,31 @@ class DetectorPosterior:
 
     @property
     def offset(self) -> Interval:
-        """Counts without light."""
-        return _interval(self.samples[:, 1])
+        """Counts without light; from the lower quantile of one prior to the higher of the other, as `read_noise`."""
+        return self._by_both_priors(1)
 
     @property
     def read_noise(self) -> Interval:
-        """Electrons rms."""
-        return _interval(self.samples[:, 2])
+        """Electrons rms.
+
+        Exposures without darks hardly tell read noise from offset, so that the prior decides: one that is flat in the logarithm
+        of the read noise favours none at all, one that is flat in its variance (Jeffreys', along the line of constant total
+        variance, whose third moment is linear in it) favours much. The interval reaches from the lower quantile of the one to
+        the higher of the other, and the median is the latter's. Where the exposures tell both, the two are one.
+        """
+        return self._by_both_priors(2)
+
+    def _by_both_priors(self, column: int) -> Interval:
+        gain, offset, read_noise = self.samples.T
+        values, read = self.samples[:, column], (gain * read_noise) ** 2
+        shot = gain * np.maximum(self._reference() - offset, 0.0)
+        flat, by_variance = _interval(values), _interval(values, read / (shot + read))
+        return Interval(by_variance.median, min(flat.q05, by_variance.q05), max(flat.q95, by_variance.q95))
+
+    def _reference(self) -> float:
+        """Mean signal, counts."""
+        signal = np.concatenate([one.signal[one.dark == 0] for one in self.levels])
+        return float(np.average(signal, weights=np.concatenate([one.count[one.dark == 0] for one in self.levels])))
 
 
 def sample_posterior(
@@ -260,6 +278,10 @@ def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback:
     return np.asarray(axes.T @ np.linalg.inv(-curvature) @ axes)
 
 
-def _interval(values: Image) -> Interval:
-    q05, median, q95 = (float(q) for q in np.percentile(values, (5, 50, 95)))
+def _interval(values: Image, weight: Image | None = None) -> Interval:
+    share = (0.05, 0.5, 0.95)
+    if weight is None:
+        q05, median, q95 = (float(q) for q in np.quantile(values, share))
+    else:
+        q05, median, q95 = (float(q) for q in np.quantile(values, share, weights=weight, method="inverted_cdf"))
     return Interval(median, q05, q95)

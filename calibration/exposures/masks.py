@@ -126,5 +126,5 @@ def _deviation(frame: Image) -> Image:
     result = np.empty(frame.size)
     for group in np.array_split(order, max(1, frame.size // 2000)):
         values = difference.flat[group]
-        result[group] = values / max(1.4826 * np.median(np.abs(values)), np.finfo(float).tiny)
+        result[group] = values / max(1.4826 * np.median(np.abs(values)), np.sqrt(np.finfo(float).tiny))
     return result.reshape(frame.shape)

@@ -70,7 +70,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
         raise ValueError(
             f"only {int(trusted.sum())} pixels of {burst.name} can be used; give frames that are not saturated"
         )
-    registrations = [_registered(frames, index) for index in range(len(frames))]
+    registrations = _registrations(frames)
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
     drift, drifting = _drift(shift, registrations)
     references, moving = _compared(frames, np.zeros_like(shift), trusted)
@@ -89,6 +89,15 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     error = np.array([pair.scaling.slope_error for pair in pairs])
     fading = bool(np.any(np.abs(dose - 1) > np.maximum(3 * error, LEAST_DOSE_CHANGE)))
     return pairs, BurstReport(shift, drift, dose, error, drifting, fading)
+
+
+def _registrations(frames: Image) -> list[Registration | None]:
+    """Where each frame lies in the mean of the others; all None where the first, the middle and the last one find nothing to
+    register by, as flats and faint scenes."""
+    probes = {index: _registered(frames, index) for index in (0, len(frames) // 2, len(frames) - 1)}
+    if not any(probes.values()):
+        return [None] * len(frames)
+    return [probes[index] if index in probes else _registered(frames, index) for index in range(len(frames))]
 
 
 def _registered(frames: Image, index: int) -> Registration | None:
