@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from noiseflow.distributions import automatic
-from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.pixels import broadcast_shapes, is_traced
 
 MOST = 2**18
 """Pixels evaluated at once; a hundred float64 arrays of so many, as a flow's graph has, take 200 MB."""
@@ -57,8 +57,8 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     working = torch.promote_types(answer, torch.float32)
     try:
         shapes = [tensor.shape for tensor in tensors]
-        shape = torch.broadcast_shapes(self.batch_shape, *shapes)  # type: ignore[no-untyped-call]
-    except RuntimeError as error:
+        shape = broadcast_shapes(self.batch_shape, *shapes)
+    except (RuntimeError, ValueError) as error:
         given_shapes = " and ".join(str(tuple(shape)) for shape in shapes)
         raise ValueError(
             f"{name}: a value of shape {given_shapes} does not broadcast with the signal's {tuple(self.batch_shape)}; "
@@ -173,7 +173,7 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
 
 def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
     """The method's answer for values (..., *batch), in pieces of bounded memory where there are many."""
-    shape = torch.broadcast_shapes(self.batch_shape, *(value.shape for value in values))  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
     if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]) or not self.splits:
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)

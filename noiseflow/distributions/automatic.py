@@ -68,7 +68,8 @@ def log_prob(
         signal, observation: equal shapes, detector units.
         tolerance: bound of each pixel's interpolation error, nats.
     """
-    s, o = signal.reshape(-1), observation.reshape(-1)
+    kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
+    s, o = signal.reshape(-1).to(kind), observation.reshape(-1).to(kind)
     free, low, high = _without_limits(noise_model)
     clipped = math.isfinite(low) or math.isfinite(high)
     slack = _slack(noise_model, o.dtype)
@@ -147,7 +148,7 @@ def sample(
         generator: source of the random numbers.
         tolerance: bound of the interpolation error of each draw, in standard deviations of the noise.
     """
-    flat = signal.reshape(-1)
+    flat = signal.reshape(-1).to(torch.promote_types(signal.dtype, torch.float32))
     judged = _spread(torch.arange(flat.numel(), device=flat.device))
     tried = torch.randn(judged.shape, generator=torch.Generator().manual_seed(0)).to(flat)
 

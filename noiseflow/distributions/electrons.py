@@ -129,8 +129,8 @@ def interval_and_slopes(
         slopes: whether the derivatives are wanted, shaped like the cells each.
     """
     if low.ndim == 0:
-        one = interval_and_slopes(*(each.reshape(1) for each in (low, high, rate)), read_noise, slopes=slopes)
-        return one[0][0], tuple(slope[0] for slope in one[1])
+        value, parts = interval_and_slopes(low[None], high[None], rate[None], read_noise, slopes=slopes)
+        return value[0], tuple(part[0] for part in parts)
     sigma = float(read_noise)
     mode = posterior_mode(low, high, rate, read_noise) if sigma <= MOST_READ_NOISE else rate
     found = [torch.empty_like(low) for _ in range(5 if slopes else 1)]

@@ -13,7 +13,7 @@ from torch.distributions import Distribution, constraints
 
 from noiseflow.distributions.answers import answering
 from noiseflow.distributions.expectations import mode_of, panels
-from noiseflow.distributions.pixels import Pixels, Taking
+from noiseflow.distributions.pixels import Pixels, Taking, broadcast_shapes
 
 _PANELS, _TAIL = 512, 1e-10  # of the default quadrature: panels of four nodes between the quantiles of this probability
 
@@ -154,7 +154,7 @@ class RescaledDistribution(NoiseDistribution):
     """
 
     def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
-        shape = torch.broadcast_shapes(base.batch_shape, scale.shape, shift.shape)  # type: ignore[no-untyped-call]
+        shape = broadcast_shapes(base.batch_shape, scale.shape, shift.shape)
         super().__init__(shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
         self.base, self.scale, self.shift = base, scale, shift
 

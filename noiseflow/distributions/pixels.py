@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Self, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -107,7 +108,7 @@ class Pixels:
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Self:
         """The same distribution for a larger batch; pixels of a new or stretched axis are independent of each other."""
         shape = torch.Size(batch_shape)
-        torch.broadcast_shapes(self.batch_shape, shape)  # type: ignore[no-untyped-call]
+        broadcast_shapes(self.batch_shape, shape)
         return self.mapped(lambda tensor, rest: tensor.expand(*shape, *rest), shape)
 
     def flat(self) -> Self:
@@ -166,3 +167,14 @@ class Pixels:
 def is_traced(tensor: Tensor) -> bool:
     """Whether values cannot be looked at: inside ``torch.compile`` or a transform of ``torch.func``."""
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """The shape that all broadcast to. NumPy finds it, because the first call of torch's own loads SymPy, which takes a second.
+
+    Raises:
+        ValueError: they do not broadcast; while torch compiles, a RuntimeError.
+    """
+    if torch.compiler.is_compiling():
+        return torch.broadcast_shapes(*shapes)  # type: ignore[no-any-return, no-untyped-call]
+    return torch.Size(np.broadcast_shapes(*map(tuple, shapes)))

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.pixels import broadcast_shapes, is_traced
 from noiseflow.kept_memory import kept_memory
 
 PIECE = 2**14
@@ -36,7 +36,7 @@ def pixelwise(function: Function, *inputs: Tensor, with_slopes: Callable[..., An
         The values, float64; NaN where an input is NaN.
     """
     several = [each for each in inputs if each.ndim]
-    shape = torch.broadcast_shapes(*(each.shape for each in several)) if several else torch.Size()  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(*(each.shape for each in several)) if several else torch.Size()
     full = [each.expand(shape) if each.ndim else each for each in inputs]
     found: Tensor
     if with_slopes is None or any(is_traced(each) for each in inputs):
@@ -295,5 +295,5 @@ def _unbatched(size: int, in_dims: Sequence[int | None], inputs: Sequence[Tensor
 
 
 def _expanded(inputs: Sequence[Tensor]) -> list[Tensor]:
-    shape = torch.broadcast_shapes(*(each.shape for each in inputs if each.ndim))  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(*(each.shape for each in inputs if each.ndim))
     return [each.expand(shape) if each.ndim else each for each in inputs]

@@ -189,3 +189,18 @@ def test_the_finest_size_is_not_tabulated_twice(monkeypatch: pytest.MonkeyPatch)
     observation = torch.randn(5000, generator=torch.Generator().manual_seed(0))
     ObservationTable(noiseflow.SignalDependentGaussian(), observation, -2.0, 2.0, tolerance=0.0)
     assert len(built) == len(set(built)) > 1
+
+
+@pytest.mark.parametrize("name", ["spline", "8-bit"])
+@pytest.mark.parametrize("kinds", [("float32", "float64"), ("bfloat16", "float32"), ("float16", "float16")])
+def test_tables_take_signals_and_observations_of_different_number_types(name: str, kinds: tuple[str, str]) -> None:
+    model = noiseflow.SplineFlow()
+    model = noiseflow.Digitised(model, 1 / 255, 0.0, 1.0) if name == "8-bit" else model
+    given = torch.rand(automatic.LARGE + 1, generator=torch.Generator().manual_seed(0))
+    signal, observation = (each.to(getattr(torch, kind)) for each, kind in zip((given, given), kinds, strict=True))
+    with torch.no_grad():
+        found = model(signal).log_prob(observation)
+        exact = model(signal[:1000]).log_prob(observation[:1000])
+    assert found.dtype == exact.dtype == torch.promote_types(signal.dtype, observation.dtype)
+    rounding = torch.finfo(found.dtype).eps * float(exact.abs().max())
+    assert torch.allclose(found[:1000], exact, rtol=0, atol=2e-3 + rounding)
