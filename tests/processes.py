@@ -51,7 +51,8 @@ def _child(arguments: list[str], log: Path) -> None:
     console._LOG_SECONDS = -1.0
     with log.open("w", buffering=1) as stream:
         sys.stdout = sys.stderr = stream
+        sys.argv = ["noiseflow", *arguments]
         try:
-            main(arguments)
+            main()
         finally:
             signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -153,6 +153,23 @@ except KeyboardInterrupt:
     assert (done.stdout, done.stderr) == ("stopped\n", "")
 
 
+def test_ctrl_c_after_the_work_changes_nothing() -> None:
+    program = """
+import os, signal, sys
+from noiseflow.commands import cli
+
+class Last:
+    def __del__(self, kill=os.kill, process=os.getpid(), number=signal.SIGINT):
+        kill(process, number)
+
+last = Last()  # cleared away when Python has shut down nearly all else
+sys.argv = ["noiseflow", "--version"]
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_ctrl_c_that_became_another_error_is_one_still(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def stopped(*_: object, **__: object) -> None:
         with contextlib.suppress(KeyboardInterrupt):

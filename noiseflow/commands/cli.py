@@ -153,11 +153,12 @@ def _options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
     with steady_streams() as stdout:
-        _run(sys.argv[1:] if arguments is None else arguments, stdout)
+        interrupts = _Interrupts(until_exit=arguments is None)
+        _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
 
 
-def _run(arguments: list[str], stdout: SteadyStream) -> None:
-    debug, interrupts = "--debug" in arguments, _Interrupts()
+def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) -> None:
+    debug = "--debug" in arguments
     if not debug:
         warnings.showwarning = _show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
@@ -171,9 +172,11 @@ def _run(arguments: list[str], stdout: SteadyStream) -> None:
     except KeyboardInterrupt:
         end_stopped(f"stopped; {START_AGAIN}")
     except SystemExit as end:
+        interrupts.done = True
         untold = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # stopped again, before a line was printed
         if end.code == 130 and untold:
             end_stopped(f"stopped; {START_AGAIN}")
+        interrupts.ignore()
         stdout.flush()
         if not end.code and (lost := was_lost(stdout)) is not None:
             print(f"noiseflow: {lost}", file=sys.stderr)
@@ -182,6 +185,7 @@ def _run(arguments: list[str], stdout: SteadyStream) -> None:
     except Exception as error:
         if interrupts.came:
             end_stopped(f"stopped; {START_AGAIN}")
+        interrupts.ignore()
         if debug:
             raise
         print(f"noiseflow: {_in_one_line(error)}", file=sys.stderr)
@@ -189,11 +193,25 @@ def _run(arguments: list[str], stdout: SteadyStream) -> None:
 
 
 class _Interrupts:
-    """Raises `KeyboardInterrupt`, and remembers it: compiled libraries make errors of other kinds of it on its way."""
+    """Raises `KeyboardInterrupt`, and remembers it: compiled libraries make errors of other kinds of it on its way.
 
-    came = False
+    Args:
+        until_exit: the process ends with the command: once the work is `done`, an interrupt changes nothing any more.
+    """
+
+    came = done = False
+
+    def __init__(self, *, until_exit: bool) -> None:
+        self.until_exit = until_exit
+
+    def ignore(self) -> None:
+        """From here on, also where Python takes handlers away as it shuts down."""
+        if self.until_exit and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def __call__(self, number: int, frame: Any) -> None:
+        if self.done and self.until_exit:
+            return
         self.came = True
         raise KeyboardInterrupt
 

@@ -38,6 +38,9 @@ def end_stopped(text: str) -> NoReturn:
     """End a program that was stopped, with one line and exit code 130; Ctrl-C again has no effect any more."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from noiseflow.io.partials import clear_unfinished
+
+    clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
     sys.exit(130)  # not typer.Exit, which a command that runs others would not notice
 

@@ -8,8 +8,8 @@ import functools
 import os
 import platform
 import re
+import secrets
 import shutil
-import tempfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +18,7 @@ _LONGEST = 40
 _ENDING = ".part"
 REPLACED = "replaced"
 """Name, within a temporary folder, of the folder that is being replaced."""
+_IN_USE: dict[Path, Path] = {}
 
 
 def link_target(path: str | Path) -> Path:
@@ -37,17 +38,34 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     """
     path = link_target(path)
     clear_leftovers(path)
+    folder = path.parent / f"{_prefix(path.stem)}{secrets.token_hex(4)}{path.suffix}{_ENDING}"
+    _IN_USE[folder] = path
     try:
-        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=_prefix(path.stem), suffix=path.suffix + _ENDING))
-    except FileNotFoundError as error:
-        raise _gone(path.parent) from error
-    try:
+        folder.mkdir(mode=0o700)
         yield folder
     except FileNotFoundError as error:
         if path.parent.is_dir():
             raise
         raise _gone(path.parent) from error
     finally:
+        _remove(folder, path)
+        _IN_USE.pop(folder, None)
+
+
+def clear_unfinished() -> None:
+    """Remove the temporary folders of this program: an interrupt may come while one is made or removed, at any line."""
+    for folder, path in list(_IN_USE.items()):
+        if f"-{os.getpid()}-" in folder.name:  # not a folder of the process that forked this one
+            _remove(folder, path)
+            _IN_USE.pop(folder, None)
+
+
+def _remove(folder: Path, path: Path | None) -> None:
+    """Remove a temporary folder; what it was replacing is put back first, where nothing has taken its place."""
+    replaced = folder / REPLACED
+    if path is not None and replaced.exists() and not path.exists():
+        replaced.rename(path)
+    if path is not None or not replaced.exists():
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -75,11 +93,7 @@ def _clear(folder: Path, beginning: str, suffix: str, path: Path | None) -> None
             found = name.fullmatch(leftover.name)
             if found is None or leftover.is_symlink() or _runs(int(found[1])):
                 continue
-            replaced = leftover / REPLACED
-            if path is not None and replaced.exists() and not path.exists():
-                replaced.rename(path)
-            if path is not None or not replaced.exists():
-                shutil.rmtree(leftover, ignore_errors=True)
+            _remove(leftover, path)
 
 
 def _prefix(stem: str) -> str:

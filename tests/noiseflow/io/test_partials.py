@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pathlib
+import shutil
 import signal
 import time
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
+from noiseflow.commands.console import end_stopped
 from noiseflow.io.partials import REPLACED, _prefix, clear_all_leftovers
 from tests.processes import FORK
 
@@ -124,3 +127,45 @@ def test_a_link_stays_a_link_and_its_target_is_written(tmp_path):
         assert (io.read(link).data == 1).all()
     assert len(list(tmp_path.iterdir())) == 4
     assert len(list((tmp_path / "disk").iterdir())) == 3
+
+
+@pytest.mark.parametrize("function", ["mkdir", "rmtree"])
+def test_ctrl_c_while_a_temporary_folder_comes_or_goes_leaves_none(tmp_path, monkeypatch, function):
+    def interrupted(*words, **more):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, function, original)
+            original(*words, **more) if function == "mkdir" else None
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    owner = {"mkdir": pathlib.Path, "rmtree": shutil}[function]
+    original = getattr(owner, function)
+    monkeypatch.setattr(owner, function, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        io.write(tmp_path / "volume.npy", np.zeros((3, 4), np.float32))
+    monkeypatch.undo()
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit):
+            end_stopped("stopped")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert {file.name for file in tmp_path.iterdir()} <= {"volume.npy"}
+
+
+def test_ctrl_c_while_a_folder_is_replaced_keeps_the_old_one(tmp_path, monkeypatch):
+    path, rename = tmp_path / "volume.zarr", pathlib.Path.rename
+    path.mkdir()
+    (path / "whole").touch()
+
+    def interrupted(source, target):
+        rename(source, target)
+        if target.name == REPLACED:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(pathlib.Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt), io.files.atomic_folder(path):
+        pass
+    assert (path / "whole").exists()
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
