@@ -98,14 +98,13 @@ def _shared(z: Image, mask: Mask, axis: int) -> tuple[float, float]:
     The covariance of the means of even and odd runs of 16 pixels along the row, which correlated neighbours hardly touch.
     """
     run = np.indices(z.shape)[axis] // 16 % 2
-    means = []
-    for part in (0, 1):
-        chosen = mask & (run == part)
-        means.append((np.where(chosen, z, 0.0).sum(axis) / np.maximum(chosen.sum(axis), 1))[chosen.sum(axis) > 8])
-    number = min(map(len, means))
+    parts = [mask & (run == part) for part in (0, 1)]
+    full = np.all([part.sum(axis) > 8 for part in parts], axis=0)  # a mask may leave one of the two without pixels
+    number = int(full.sum())
     if number < 16:
         return 0.0, 1.0
-    first, second = (one[:number] - one[:number].mean() for one in means)
+    means = [np.where(part, z, 0.0).sum(axis)[full] / part.sum(axis)[full] for part in parts]
+    first, second = (one - one.mean() for one in means)
     smooth = np.convolve(
         np.mean(means, axis=0), np.ones(9) / 9, mode="same"
     )  # a slow change is of the scene, not of rows
