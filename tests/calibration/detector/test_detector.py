@@ -1,5 +1,7 @@
 """The detector's likelihood is exact, its posterior honest, and what cannot be measured is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage, stats
@@ -11,6 +13,7 @@ from calibration.detector.measure import dark_offset, measure_detector
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import (
     NUM_WALKERS,
+    DetectorPosterior,
     _local_moves,
     _sampler,
     potential_scale_reduction,
@@ -99,6 +102,22 @@ def test_posterior_covers_the_truth_and_the_fit_is_good():
     assert found.num_steps >= 50 * found.autocorrelation_time
     assert found.rhat < 1.05
     assert misfit([levels], found.most_likely) == pytest.approx(1, abs=0.25)
+
+
+def test_intervals_of_what_the_exposures_hardly_tell_hold_under_both_priors():
+    generator, gain, variance = np.random.default_rng(0), 2.0, 400.0
+    read_noise = np.exp(
+        generator.uniform(np.log(0.1), np.log(8.0), 4000)
+    )  # flat in the logarithm along a line of equal variance
+    offset = 200.0 - (variance - (gain * read_noise) ** 2) / gain
+    levels = collect_levels([readings(np.random.default_rng(6), np.full(2000, 50.0))], num_levels=1)
+    levels = replace(levels, signal=np.array([200.0]))
+    samples = np.column_stack([np.full(4000, gain), offset, read_noise])
+    found = DetectorPosterior(samples, samples[0], 1.0, 1.0, 4000, (levels,))
+    assert found.read_noise.q05 == pytest.approx(0.1 * 80**0.05, rel=0.1)  # of a prior flat in the logarithm
+    assert found.read_noise.median == pytest.approx(8 * 0.5**0.5, rel=0.1)  # flat in the variance
+    assert found.read_noise.q95 == pytest.approx(8 * 0.95**0.5, rel=0.03)
+    assert found.offset.q95 == pytest.approx(200 - (400 - 4 * 0.95 * 64) / 2, rel=0.03)
 
 
 def test_unconverged_chain_is_an_error_that_says_how_many_more_steps():

@@ -72,6 +72,15 @@ def blinking(generator, number, size=SIZE):
     return Burst(np.stack(frames).astype(float))
 
 
+def test_many_flat_frames_are_not_all_searched_for_features(monkeypatch):
+    searched = []
+    monkeypatch.setattr("calibration.registration.bursts._registered", lambda frames, index: searched.append(index))
+    frames = np.random.default_rng(0).poisson(200.0, (20, 40, 40)).astype(float)
+    _, report = align_burst(Burst(frames))
+    assert searched == [0, 10, 19]
+    assert np.isnan(report.drift)
+
+
 def test_a_scene_that_blinks_is_refused():
     with pytest.raises(ValueError, match="changes between frames at"):
         align_burst(blinking(np.random.default_rng(0), 6))

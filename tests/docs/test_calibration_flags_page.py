@@ -1,0 +1,25 @@
+"""The page of flagged exposures says what its JSON says, nothing in it is wrong in silence, clean exposures raise no alarm."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
+
+
+def test_page_is_written_from_its_json() -> None:
+    rows = json.loads((BENCHMARKS / "results" / "calibration_flags.json").read_text(encoding="utf-8"))
+    script = runpy.run_path(str(BENCHMARKS / "calibration_flags.py"))
+    assert (BENCHMARKS / "calibration_flags.md").read_text(encoding="utf-8") == script["page"](rows)
+    assert len(rows) > 30
+    assert not script["silent"](rows)
+    assert not script["false_alarms"](rows)
+
+
+def test_page_of_coverage_is_written_from_its_trials() -> None:
+    script = runpy.run_path(str(BENCHMARKS / "calibration_coverage.py"))
+    trials = {kind: script["rows_of"](kind) for kind in script["KINDS"]}
+    assert (BENCHMARKS / "calibration_coverage.md").read_text(encoding="utf-8") == script["page"](trials)
+    assert all(len({row["seed"] for row in rows}) == len(rows) for rows in trials.values())
