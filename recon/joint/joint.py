@@ -181,6 +181,7 @@ class JointReconstructor:
             torch.manual_seed(self.seed)
             made = self.make_field(grid.shape, scale=scale).to(self.device)
         made.start_from(rough)
+        made.check_axes(rough)
         rate = learning_rate(rough, made)
         occupancy = None
         if self.skip_vacuum and projector is in_focus:
