@@ -163,8 +163,8 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
-    """From a table where there is an accurate one, else computed."""
-    if value.numel() >= automatic.LARGE and self.source is not None:
+    """From a table where there is an accurate one, else computed; what is light is computed faster than a table is made."""
+    if value.numel() >= automatic.LARGE and self.source is not None and not self.light:
         found = automatic.automatic_log_prob(self.source[0], self.source[1], value)
         if found is not None:
             return found

@@ -224,12 +224,3 @@ class DigitisedDistribution(NoiseDistribution):
         nodes = torch.minimum(first + steps * self.step, last)
         once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
         return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
-
-    @property
-    def mean(self) -> Tensor:
-        return self.expectation(lambda observation: observation)
-
-    @property
-    def variance(self) -> Tensor:
-        mean = self.mean
-        return self.expectation(lambda observation: (observation - mean) ** 2)

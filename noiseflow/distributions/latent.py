@@ -70,15 +70,6 @@ class LatentDistribution(NoiseDistribution):
     def _like(self) -> Tensor:
         return self.anything()
 
-    @property
-    def mean(self) -> Tensor:
-        return self.expectation(lambda observation: observation)
-
-    @property
-    def variance(self) -> Tensor:
-        mean = self.mean
-        return self.expectation(lambda observation: (observation - mean) ** 2)
-
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature over the latent, shape of the batch."""
         like = self._like()

@@ -21,10 +21,10 @@ _PANELS, _TAIL = 512, 1e-10  # of the default quadrature: panels of four nodes b
 class NoiseDistribution(Pixels, Distribution):
     """p(observation | signal), one observation per pixel: ``batch_shape`` is the signal's, ``event_shape`` is ().
 
-    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf`, `sample`, `mean` and `variance`. What it
-    writes answers like every other noise distribution: numbers and tensors of any real type are taken, half precision is
-    computed in single precision, the answer has the type that signal and observation promote to, NaN gives NaN, an infinite
-    observation has log-density −inf, large inputs are evaluated in pieces of bounded memory.
+    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf` and `sample`, and `mean`, `variance` where
+    they have a closed form. What it writes answers like every other noise distribution: numbers and tensors of any real type are
+    taken, half precision is computed in single precision, the answer has the type that signal and observation promote to, NaN
+    gives NaN, an infinite observation has log-density −inf, large inputs are evaluated in pieces of bounded memory.
 
     Args:
         shape: batch shape, that of the signal.
@@ -116,6 +116,17 @@ class NoiseDistribution(Pixels, Distribution):
         nodes, weights = self.quadrature()
         values = function(nodes)  # infinite at impossible ones
         return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean of each pixel's observations; by quadrature where a subclass knows no better."""
+        return self.cast(self.expectation(lambda observation: observation))
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance of each pixel's observations; by quadrature where a subclass knows no better."""
+        mean = self.expectation(lambda observation: observation)
+        return self.cast(self.expectation(lambda observation: (observation - mean) ** 2))
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(Q, *batch)`` of expectations: Gauss–Legendre's rule on panels between far quantiles."""

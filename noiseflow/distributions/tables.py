@@ -39,7 +39,7 @@ class Table:
         start, stop = scale.ends
         self.step = (stop - start) / (num_rows - 1)
         self.first, self._first_count = start, num_rows
-        self.rows: Tensor | None = None  # exact values, (rows, C)
+        self.rows = columns.new_empty(0, columns.numel())  # exact values, (rows, C)
         self._beside: dict[Any, Table] = {}
 
     def cover(self, low: float, high: float, values: Values, unit: Values | None = None) -> bool:
@@ -52,14 +52,13 @@ class Table:
         """
         ends = self.scale.observation(torch.tensor([low, high], dtype=torch.float64))
         wanted = (float(ends[0]) - self.first) / self.step, (float(ends[1]) - self.first) / self.step
-        count = 0 if self.rows is None else self.rows.shape[0]
+        count = self.rows.shape[0]
         before = max(0, _MARGIN - math.floor(wanted[0])) if count == 0 or wanted[0] < _MARGIN - 1 else 0
         after = max(0, math.ceil(wanted[1]) + 1 + _MARGIN - count) if wanted[1] > count - _MARGIN else 0
         if count + before + after > _MOST_GROWTH * self._first_count:
             return False
         if before or after:
-            present = [] if self.rows is None else [self.rows]
-            parts = [self._made(-before, 0, values), *present, self._made(count, count + after, values)]
+            parts = [self._made(-before, 0, values), self.rows, self._made(count, count + after, values)]
             self.first -= before * self.step
             self.rows = torch.cat(parts)
             self._checked = self._check(unit)
@@ -74,7 +73,6 @@ class Table:
     def _check(self, unit: Values | None) -> Tensor:
         """The table with NaN where interpolation would err too much, (1, 1, rows, C)."""
         rows = self.rows
-        assert rows is not None
         allowed = torch.full_like(rows[:, :1], 2 * self._tolerance)
         if unit is not None:
             places = self.first + self.step * torch.arange(rows.shape[0], dtype=torch.float64, device=rows.device)
@@ -87,12 +85,17 @@ class Table:
         return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
 
     def beside(self, key: Any, values: Values) -> Table:
-        """A table of one column with the same rows."""
+        """A table of one column with the same rows.
+
+        Raises:
+            ValueError: this table covers no signals yet.
+        """
+        if not self.rows.shape[0]:
+            raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
         if key not in self._beside:
             count = self._first_count
             self._beside[key] = Table(self.scale, count, self.columns[:1], self._tolerance)
         table = self._beside[key]
-        assert self.rows is not None
         ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
         at = self.scale.inverse(ends)
         table.cover(float(at[0]), float(at[1]), values)

@@ -7,20 +7,19 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from noiseflow.described import described
 from noiseflow.distributions.picked import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixels import FitPixels, thinned
+from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.digitisation import Digitisation
 
 Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
@@ -33,32 +32,6 @@ _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, besides a straight line to nothing
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
-
-
-@described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
-@dataclass
-class FitResult:
-    """What a fit reached.
-
-    Attributes:
-        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or rails were found.
-        digitisation: the rounding and rails it was put behind; none where it was left as it is.
-        held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
-        num_steps: steps taken.
-        seconds: wall time.
-        recoveries: how often a non-finite step was undone with half the learning rate.
-        history: step → held-out NLL, in the order measured.
-        table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
-    """
-
-    noise_model: nn.Module
-    digitisation: Digitisation = field(default_factory=Digitisation)
-    held_out_nll: float = math.nan
-    num_steps: int = 0
-    seconds: float = 0.0
-    recoveries: int = 0
-    history: dict[int, float] = field(default_factory=dict)
-    table_error: float | None = None
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
+from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
 from noiseflow.distributions.numerical import as_noise_distribution
+from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
+from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
+from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
+from noiseflow.metrics.judged import judged_pixels
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -99,31 +103,17 @@ def evaluate(
 
     Args:
         noise_model: the model.
-        signal, observation: tensors or arrays of any shape, equal; detector units. Masked pixels are left out.
+        signal, observation: tensors or arrays of any shape, equal; detector units. Masked pixels are left out. Dask arrays are
+            computed block by block, and of more than 10⁷ pixels an even random share of that size is judged.
         num_bins: bins of the residual histograms.
         num_signal_bins: bins of equal population along the signal.
         skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
-        seed: of the bootstrap and of the randomised PIT.
+        seed: of the bootstrap, of the randomised PIT and of the pixels taken from large Dask arrays.
 
     Raises:
         ValueError: shapes differ, pixels are not finite, or there are none.
     """
-    (signal, observation), kept = unmasked(signal, observation)
-    signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)
-    if kept is not None and signal.shape == observation.shape:
-        signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
-    if signal.shape != observation.shape or not signal.numel():
-        raise ValueError(
-            f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
-        )
-    finite = torch.isfinite(signal) & torch.isfinite(observation)
-    if not bool(finite.all()):
-        if not (skip_non_finite and bool(finite.any())):
-            raise ValueError(
-                f"{int((~finite).sum())} of {finite.numel()} pixels of signal or observation are NaN or infinite; "
-                "mend them, or leave them out with skip_non_finite=True"
-            )
-        signal, observation = signal[finite], observation[finite]
+    signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
     random = np.random.default_rng(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
@@ -229,23 +219,6 @@ def compare_histogram(
     )
 
 
-def jensen_shannon(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jensen–Shannon divergence in nats between probability vectors along the last axis (Lin 1991, doi:10.1109/18.61115)."""
-    middle = (p + q) / 2
-    return np.asarray((_relative_entropy(p, middle) + _relative_entropy(q, middle)) / 2)
-
-
-def bhattacharyya(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bhattacharyya coefficient Σ√(pq) along the last axis; the distance is −log of it."""
-    return np.asarray(np.sqrt(p * q).sum(-1))
-
-
-def _relative_entropy(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    p, q = np.broadcast_arrays(p, q)
-    ratio = np.divide(p, q, out=np.ones_like(p), where=p > 0)
-    return np.asarray((p * np.log(ratio)).sum(-1))
-
-
 @torch.no_grad()
 def probability_integral_transform(
     noise_model: nn.Module,
@@ -261,13 +234,6 @@ def probability_integral_transform(
         values.append(torch.stack([distribution.cdf_below(o), distribution.cdf(o)]).double().cpu().numpy())
     below, at = np.concatenate(values, axis=1)
     return np.asarray(below + random.random(below.shape) * np.maximum(at - below, 0))
-
-
-def kolmogorov_smirnov(u: NDArray[np.float64]) -> float:
-    """Largest distance between the empirical CDF of `u` and the uniform one."""
-    ordered = np.sort(u)
-    steps = np.arange(u.size + 1) / u.size
-    return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
 
 
 TABLE_HEADER = (

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.physical import ElectronCounter
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
@@ -20,7 +21,7 @@ _LEAST = 1e-14  # density, per standard deviation, under which the transform's r
 _FITTED, _ITERATIONS = 16384, 60
 
 
-class ExcessNoise(NoiseModelBase):
+class ExcessNoise(ElectronCounter):
     """Shot noise whose electrons are multiplied at random, plus read noise.
 
     observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with
@@ -56,35 +57,20 @@ class ExcessNoise(NoiseModelBase):
         self.change = nn.Parameter(torch.zeros(4))
         self.register_buffer("origin", torch.tensor([start[0], offset, *start[1:]], dtype=torch.float64))
 
-    def _now(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _parameters_now(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         change = self.change.double()
         gain, read_noise = torch.exp(self.origin[0] + change[0]), torch.exp(self.origin[2] + change[2])
         offset = self.origin[1] + torch.exp(self.origin[0] + self.origin[2]) * change[1]
         return gain, offset, read_noise, torch.exp(self.origin[3] + change[3])
 
     @property
-    def gain(self) -> Tensor:
-        """Counts per electron, the mean of a pulse."""
-        return self._now()[0]
-
-    @property
-    def offset(self) -> Tensor:
-        """Counts without electrons."""
-        return self._now()[1]
-
-    @property
-    def read_noise(self) -> Tensor:
-        """Electrons rms before multiplication."""
-        return self._now()[2]
-
-    @property
     def excess_factor(self) -> Tensor:
         """F², variance with multiplication over that without."""
-        return 1 + self._now()[3]
+        return 1 + self._parameters_now()[3]
 
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
-        return ExcessNoiseDistribution(signal, *self._now())
+        return ExcessNoiseDistribution(signal, *self._parameters_now())
 
     @property
     def starts_most_likely(self) -> bool:
@@ -142,7 +128,7 @@ class ExcessNoise(NoiseModelBase):
             self.change.copy_(kept)
 
     def extra_repr(self) -> str:
-        gain, offset, read_noise, more = (float(each.detach()) for each in self._now())
+        gain, offset, read_noise, more = (float(each.detach()) for each in self._parameters_now())
         return f"gain={gain:.5g}, offset={offset:.5g}, read_noise={read_noise:.4g}, excess_factor={1 + more:.4g}"
 
 

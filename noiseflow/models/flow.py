@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,75 +10,19 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.base import LatentDistribution, normal_quadrature
 from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
+from noiseflow.distributions.transforms import Transform
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.layers import Layer as Layer
+from noiseflow.models.layers import affine_layer as affine_layer
+from noiseflow.models.layers import bounded
+from noiseflow.models.layers import radial_layer as radial_layer
+from noiseflow.models.layers import scale_layer as scale_layer
+from noiseflow.models.layers import spline_layer as spline_layer
+from noiseflow.models.layers import tail_layer as tail_layer
 from noiseflow.models.standardisation import Standardisation, interpolate_cubic
 
 _NUM_NODES = 257
 _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
-
-
-@dataclass(frozen=True)
-class Layer:
-    """One map of a flow: how many raw parameters it takes, where they start, and how they become a transform.
-
-    Args:
-        initial: starting values of the raw parameters.
-        build: raw parameters (..., P) to a transform; any real parameters must give a valid one. A function of a module, for
-            models are pickled.
-        conditional: whether the parameters depend on the signal.
-    """
-
-    initial: tuple[float, ...]
-    build: Callable[[Tensor], Transform]
-    conditional: bool = True
-
-
-def affine_layer(*, conditional: bool = True) -> Layer:
-    """Location and scale of the standardised residual."""
-    return Layer((0.0, 0.0), _affine, conditional)
-
-
-def _affine(raw: Tensor) -> Transform:
-    return Affine(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5))
-
-
-def scale_layer(*, conditional: bool = True) -> Layer:
-    """Scale of the standardised residual alone."""
-    return Layer((0.0,), _scale, conditional)
-
-
-def _scale(raw: Tensor) -> Transform:
-    return Affine(torch.zeros_like(raw[..., 0]), _bounded(raw[..., 0], 5))
-
-
-def radial_layer(centre: float = 0.0, *, conditional: bool = True) -> Layer:
-    """One radial map; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
-    return Layer((centre, 0.0, 0.0), _radial, conditional)
-
-
-def _radial(raw: Tensor) -> Transform:
-    return Radial(_bounded(raw[..., 0], 10), _bounded(raw[..., 1], 3), _bounded(raw[..., 2], 3))
-
-
-def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = True) -> Layer:
-    """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
-    return Layer((0.0,) * (3 * num_bins + 1), partial(_spline, num_bins=num_bins, reach=reach), conditional)
-
-
-def _spline(raw: Tensor, *, num_bins: int, reach: float) -> Transform:
-    widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
-    return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(_bounded(slopes, 5)))
-
-
-def tail_layer(*, conditional: bool = False) -> Layer:
-    """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
-    return Layer((-4.0, -4.0), _tail, conditional)
-
-
-def _tail(raw: Tensor) -> Transform:
-    weight = 0.4 * torch.sigmoid(_bounded(raw, 10))
-    return StudentTail(weight[..., 0], weight[..., 1])
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
@@ -111,18 +53,6 @@ def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tenso
     position = coordinate * (_NUM_NODES - 1)
     row = torch.nan_to_num(position.detach()).floor().clamp(0, _NUM_NODES - 2).long()
     return row, (position - row).to(dtype)
-
-
-def _bounded(raw: Tensor, limit: float) -> Tensor:
-    return limit * torch.tanh(raw / limit)
-
-
-def _knots(raw: Tensor, reach: float) -> Tensor:
-    least = 0.02 / raw.shape[-1]
-    steps = least + (1 - least * raw.shape[-1]) * torch.softmax(raw, -1)
-    inner = 2 * reach * torch.cumsum(steps, -1)[..., :-1] - reach
-    end = torch.full_like(raw[..., :1], reach)
-    return torch.cat([-end, inner, end], -1)
 
 
 class ConditionalFlow(NoiseModelBase):
@@ -204,7 +134,7 @@ class ConditionalFlow(NoiseModelBase):
         middle = self.neighbourhood**2 // 2
         others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
         raw = self.surroundings(4 * others.to(self.bias.dtype))
-        return _bounded(raw[..., 0], 10), _bounded(raw[..., 1], 5)
+        return bounded(raw[..., 0], 10), bounded(raw[..., 1], 5)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
         """The maps at each signal coordinate: exact at 257 nodes, their parameters linear in between.

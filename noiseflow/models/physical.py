@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 
 import torch
@@ -14,7 +15,30 @@ from noiseflow.models.base import NoiseModelBase
 _LEAST_READ_NOISE = 1e-3
 
 
-class PoissonGaussian(NoiseModelBase):
+class ElectronCounter(NoiseModelBase):
+    """A detector of electrons, whose first three parameters are gain, offset and read noise."""
+
+    @abstractmethod
+    def _parameters_now(self) -> tuple[Tensor, ...]:
+        """Gain, offset, read noise and what else there is, float64 numbers."""
+
+    @property
+    def gain(self) -> Tensor:
+        """Mean counts per electron."""
+        return self._parameters_now()[0]
+
+    @property
+    def offset(self) -> Tensor:
+        """Counts without electrons."""
+        return self._parameters_now()[1]
+
+    @property
+    def read_noise(self) -> Tensor:
+        """Electrons rms; before multiplication, where there is any."""
+        return self._parameters_now()[2]
+
+
+class PoissonGaussian(ElectronCounter):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
     The rate of k is (signal − offset)/gain. Below the offset it is 0, and read noise is spread about the signal: no clean image
@@ -50,21 +74,6 @@ class PoissonGaussian(NoiseModelBase):
     def _parameters_now(self) -> tuple[Tensor, Tensor, Tensor]:
         now = self.origin.double() + self.axes.double() @ self.change.double()
         return torch.exp(now[0]), now[1], torch.exp(now[2].clamp(min=math.log(_LEAST_READ_NOISE)))
-
-    @property
-    def gain(self) -> Tensor:
-        """Counts per electron."""
-        return self._parameters_now()[0]
-
-    @property
-    def offset(self) -> Tensor:
-        """Counts at zero dose."""
-        return self._parameters_now()[1]
-
-    @property
-    def read_noise(self) -> Tensor:
-        """Electrons rms."""
-        return self._parameters_now()[2]
 
     def forward(self, signal: Tensor) -> PoissonGaussianDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""

@@ -15,6 +15,8 @@ from recon.fields.upsampling import upsample
 from recon.projection.projector import from_columns
 from recon.projection.tiles import Tiles
 
+_COARSE = 16  # voxels along each axis, at which a field and the volume that it started from are compared
+_MUCH_NEARER = 0.25  # of the squared distance; detail that a smooth field loses counts alike in both orientations
 _LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
 
 
@@ -59,6 +61,26 @@ class Field(Described, ABC):
     def start_from(self, volume: Tensor) -> None:
         """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
 
+    @torch.no_grad()
+    def check_axes(self, volume: Tensor) -> None:
+        """Compare with the volume (z, y, x) that the field has just started from, coarsely, for mistaken axes.
+
+        Raises:
+            ValueError: the field holds the volume with y and x swapped, which no shape betrays where slices are square.
+        """
+        held = self.volume()
+        if self.height != self.width:
+            return
+        depth, height, width = (min(_COARSE, *pair) for pair in zip(held.shape, volume.shape, strict=True))
+        size = (depth, height, width)
+        held, given = (functional.adaptive_avg_pool3d(each[None, None].float(), size) for each in (held, volume))
+        straight, swapped = (float((held - each).square().sum()) for each in (given, given.transpose(-1, -2)))
+        if swapped < _MUCH_NEARER * straight:
+            raise ValueError(
+                f"{type(self).__name__} started from a volume and holds it with y and x swapped; units() has the axes "
+                "(z, x, y), volumes have (z, y, x): transpose in start_from() or in units()"
+            )
+
     @property
     def has_coarser(self) -> bool:
         """Whether `coarser` gives a field."""
@@ -78,6 +100,11 @@ class Field(Described, ABC):
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""
         values = self.units() * self.scale
+        expected = (self.depth, self.width, self.height)
+        if values.shape != expected:
+            raise ValueError(
+                f"{type(self).__name__}.units() has shape {tuple(values.shape)}; give (depth, width, height) = {expected}"
+            )
         return values.reshape(self.depth * self.width, self.height)
 
     def extra_repr(self) -> str:

@@ -12,7 +12,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "train_denoiser.py"
 
 @pytest.mark.slow
 def test_likelihood_beats_squared_differences_on_clipped_values() -> None:
-    found = runpy.run_path(str(EXAMPLE))["compare"](num_steps=250, seed=1)
+    found = runpy.run_path(str(EXAMPLE))["compare"](num_steps=100, seed=1)
     assert found["squared differences"] > found["noisy"] + 3
     assert found["likelihood, true noise model"] > found["squared differences"] + 0.2
     assert found["likelihood, noise model learnt along"] > found["squared differences"] + 0.2

@@ -93,6 +93,35 @@ def test_field_contract(name):
     assert (field.coarser() is not None) == field.has_coarser
 
 
+class Swapped(VoxelField):
+    """Its author took the lattice for (z, y, x)."""
+
+    def units(self):
+        return super().units().transpose(1, 2)
+
+
+def test_field_with_swapped_axes_is_refused():
+    with pytest.raises(ValueError, match=r"Swapped.units\(\) has shape .*\(depth, width, height\)"):
+        Swapped((6, 8, 10))()
+    rough = torch.zeros(3, 4, 4)
+    rough[1:, 1:3, 2:4] = 0.3
+    field = Swapped((6, 8, 8), scale=0.3)
+    field.start_from(rough)
+    with pytest.raises(ValueError, match="y and x swapped"):
+        field.check_axes(rough)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_field_with_right_axes_passes_the_check(name, symmetric):
+    rough = torch.zeros(3, 4, 4)
+    rough[1:, 1:3, 1:3] = 0.3
+    rough[0, 0, 3] = 0.0 if symmetric else 0.3
+    field = FIELDS[name]((6, 8, 8), scale=0.3)
+    field.start_from(rough)
+    field.check_axes(rough)
+
+
 def some_tiles():
     projector = SliceProjector(tilt_angles=_ANGLES, depth=6, width=10)
     rough = torch.zeros(6, 8, 10)

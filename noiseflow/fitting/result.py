@@ -1,0 +1,37 @@
+"""What a fit reached."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from torch import nn
+
+from noiseflow.described import described
+from noiseflow.models.digitisation import Digitisation
+
+
+@described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
+@dataclass
+class FitResult:
+    """What a fit reached.
+
+    Attributes:
+        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or rails were found.
+        digitisation: the rounding and rails it was put behind; none where it was left as it is.
+        held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
+        num_steps: steps taken.
+        seconds: wall time.
+        recoveries: how often a non-finite step was undone with half the learning rate.
+        history: step → held-out NLL, in the order measured.
+        table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
+    """
+
+    noise_model: nn.Module
+    digitisation: Digitisation = field(default_factory=Digitisation)
+    held_out_nll: float = math.nan
+    num_steps: int = 0
+    seconds: float = 0.0
+    recoveries: int = 0
+    history: dict[int, float] = field(default_factory=dict)
+    table_error: float | None = None
