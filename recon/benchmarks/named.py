@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from noiseflow import io
 from noiseflow.commands.console import Output
+from noiseflow.io.ownership import require_own, signature
 from recon.benchmarks import ablations as benchmark_ablations
 from recon.benchmarks import needle as benchmark_needle
 from recon.benchmarks import paper as benchmark_paper
@@ -32,6 +33,7 @@ class Options:
         again: cells whose name contains this are computed anew; none if empty.
         out: folder of results and figures.
         output: tells people what is going on.
+        overwrite: replace figures whoever made them; otherwise only those that this program made.
     """
 
     size: int
@@ -40,6 +42,7 @@ class Options:
     again: str
     out: Path
     output: Output
+    overwrite: bool = False
 
     def results(self, name: str) -> Results:
         """The kept results of a benchmark on this scene; another scene or effort has another file."""
@@ -66,6 +69,20 @@ class Options:
         return self._kept(name, str(self.scene["seed"]))
 
 
+def check_figures(names: Sequence[str], options: Options) -> None:
+    """Refuse now, before long work, figures of these benchmarks that would replace files of others.
+
+    Raises:
+        FileExistsError: one would.
+    """
+    for name in sorted({"rivals", "slow-rivals"} & set(names)):
+        require_own(_figure(options.results(name)), overwrite=options.overwrite)
+
+
+def _figure(results: Results) -> Path:
+    return results.path.with_suffix(".png")
+
+
 def rivals(options: Options) -> dict[str, Any]:
     """Run time against error of every method that takes seconds or minutes."""
     results = options.results("rivals")
@@ -83,9 +100,11 @@ def slow_rivals(options: Options) -> dict[str, Any]:
 def _shown(options: Options, results: Results) -> dict[str, Any]:
     found = benchmark_rivals.summary(results, options.size)
     options.output.table(*benchmark_rivals.table(found))
-    picture = results.path.with_suffix(".png")
+    picture = _figure(results)
     with io.atomic_path(picture) as partial:
-        benchmark_rivals.draw(found, make_scene(options.size, **options.scene).name).savefig(partial, dpi=120)
+        benchmark_rivals.draw(found, make_scene(options.size, **options.scene).name).savefig(
+            partial, dpi=120, metadata={"Software": signature()}
+        )
     options.output.line(f"results: {results.path}\nfigure: {picture}")
     return {"results": results.path, "figure": picture, "machines": results.content["machines"], "curves": found}
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, SeedOption
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
 
 
 def benchmark(
@@ -29,13 +29,14 @@ def benchmark(
     out: Annotated[
         Path, typer.Option("--out", help="Folder for results and figures; a stopped run goes on there.")
     ] = Path("noiseflow-benchmark"),
+    overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
     """Measure run time against error of every method, on this machine. Stopped, it goes on where it was."""
     from dataclasses import replace
 
-    from recon.benchmarks.named import BENCHMARKS, Options
+    from recon.benchmarks.named import BENCHMARKS, Options, check_figures
     from recon.benchmarks.rivals import QUICK, Effort
 
     output = Output(json)
@@ -53,7 +54,8 @@ def benchmark(
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, again, out, output)
+    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite)
+    check_figures(names, options)
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})
     except KeyboardInterrupt:

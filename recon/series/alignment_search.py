@@ -108,7 +108,7 @@ class _Search:
     def run(self) -> tuple[Match, list[Evidence]]:
         """The alignment, and the evidence for its axis and for its rivals."""
         candidates: list[_Candidate] = []
-        chosen, match = None, None
+        decided = False
         for done, binning in enumerate(self.binnings):
             matcher = Matcher(self.images, self.angles, binning, self.used)
             if not candidates:
@@ -116,16 +116,12 @@ class _Search:
             elif matcher.size <= _SEARCHED:
                 candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
-                chosen = chosen or self._decided(candidates)
-                match = match or chosen.match
-                match = matcher.match(match.axis, match.shifts, rounds=_ROUNDS, free_axis=True)
+                chosen, *others = candidates if decided else self._ranked(candidates)
+                match = matcher.match(chosen.match.axis, chosen.match.shifts, rounds=_ROUNDS, free_axis=True)
+                candidates, decided = [replace(chosen, match=match), *others], True
             if self.progress is not None:
-                axis = (match or candidates[0].match).degrees
-                self.progress("aligning", done + 1, len(self.binnings), f"axis {axis:.2f}°")
-        assert chosen is not None
-        assert match is not None
-        ranked = [chosen, *(each for each in candidates if each is not chosen)]
-        return matcher.centred(match), [self._evidence(each) for each in ranked]
+                self.progress("aligning", done + 1, len(self.binnings), f"axis {candidates[0].match.degrees:.2f}°")
+        return matcher.centred(candidates[0].match), [self._evidence(each) for each in candidates]
 
     def stated(self, degrees: float) -> float:
         """Of the two directions of a line, which differ in the handedness of the volume: the known one, or within 90° of y."""
@@ -178,6 +174,11 @@ class _Search:
             return None
         return math.radians(self.known)
 
+    def _ranked(self, candidates: list[_Candidate]) -> list[_Candidate]:
+        """The candidates, the one that is decided for before the others. Raises as `_decided`."""
+        chosen = self._decided(candidates)
+        return [chosen, *(each for each in candidates if each is not chosen)]
+
     def _decided(self, candidates: list[_Candidate]) -> _Candidate:
         """The candidate that stands clear of all others, or that is known beforehand.
 
@@ -192,7 +193,7 @@ class _Search:
             warnings.warn(
                 f"the tilt axis is stated to be at {self.known:.0f}°, but {_words(self._evidence(best))} and "
                 f"{_words(self._evidence(known))}; {advice}",
-                stacklevel=4,
+                stacklevel=5,
             )
             return known if self.given is not None else best
         if known is None and equal:

@@ -70,14 +70,14 @@ class Matcher:
 
     def match(self, axis: float, shifts: Tensor, *, rounds: int, free_axis: bool = False) -> Match:
         """Iterations of SIRT take turns with a Gauss-Newton step of all shifts, and of the axis, towards its projections."""
-        shifts, volume = self.in_own_pixels(shifts), None
+        shifts = self.in_own_pixels(shifts)
+        volume = torch.zeros(self.size, self.size, self.size, device=self.images.device)
         for _ in range(rounds):
             images, seen = self.aligned(axis, shifts)
             volume = self.sirt(images, seen, volume, ITERATIONS)
             move, turn = _gauss_newton(images, self.projector(volume), seen, free_axis=free_axis)
             shifts = shifts + move.clamp(-_FARTHEST, _FARTHEST) @ frame(axis, shifts)
             axis += min(max(turn, -_MOST_TURN), _MOST_TURN)
-        assert volume is not None
         return Match(axis, shifts * self.binning - self._middle, volume)
 
     def in_own_pixels(self, shifts: Tensor) -> Tensor:

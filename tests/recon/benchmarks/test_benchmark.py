@@ -7,10 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import typer
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from noiseflow import Gaussian
+from noiseflow.io.ownership import is_own
 from recon.benchmarks import ablations as benchmark_ablations
+from recon.benchmarks import named
 from recon.benchmarks import needle as benchmark_needle
 from recon.benchmarks import paper as benchmark_paper
 from recon.benchmarks import rivals as benchmark_rivals
@@ -282,3 +285,25 @@ def test_padded_images_are_square_and_cut_out_again(shape, side):
     if shape[1] == shape[2]:
         cube = np.broadcast_to(padded[0], (side, side, side))
         np.testing.assert_array_equal(_cut(cube, shape[1])[0], images[0])
+
+
+def test_figures_of_others_are_refused_before_the_work(tmp_path, monkeypatch):
+    other, calls = tmp_path / "rivals-48-clipped-shells-0--60_60_4-quick.png", []
+    monkeypatch.setitem(named.BENCHMARKS, "rivals", lambda options: calls.append(options) or {})
+    other.write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        benchmark(["rivals"], quick=True, out=tmp_path)
+    assert not calls
+    benchmark(["rivals"], quick=True, out=tmp_path, overwrite=True)
+    assert calls[0].overwrite
+    assert other.read_bytes() == b"mine"
+
+
+def test_figures_made_here_are_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark_rivals, "summary", lambda *_: {})
+    monkeypatch.setattr(benchmark_rivals, "table", lambda *_: ((), []))
+    monkeypatch.setattr(benchmark_rivals, "draw", lambda *_: Figure())
+    output = SimpleNamespace(table=lambda *_: None, line=lambda *_: None)
+    options = named.Options(16, TINY, benchmark_rivals.QUICK, "", tmp_path, output)
+    results = SimpleNamespace(path=tmp_path / "rivals.json", content={"machines": []})
+    assert is_own(named._shown(options, results)["figure"])

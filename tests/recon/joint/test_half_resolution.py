@@ -18,6 +18,7 @@ from recon.joint.checkpoint import Journal
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
+from recon.joint.task import Task
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.image_formation import Transmission
@@ -161,3 +162,14 @@ def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
     assert stopped
     resumed = replace(fit, run_fit=Journal(tmp_path, {}, resume=True).fit)(noisy).volume.attenuation
     np.testing.assert_allclose(resumed, fit(noisy).volume.attenuation, rtol=1e-5, atol=1e-5 * resumed.max())
+
+
+def test_what_is_masked_at_full_resolution_is_masked_at_half():
+    model = smooth_model(_SHAPES[0])
+    images = images_of(model)
+    use = torch.rand(images.shape, generator=torch.Generator().manual_seed(0)) < 0.7
+    task = Task(model, torch.where(use, images, torch.nan), use, torch.zeros_like(use))
+    with task.halved() as half:
+        assert half.use is not None
+        assert torch.equal(half.use, torch.isfinite(half.observation))
+        assert 0 < int(half.use.sum()) < half.use.numel()

@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from recon.joint.coarse_start import coarse_start
 from recon.methods import reconstruct
+from recon.projection.image_formation import Transmission
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -33,3 +36,13 @@ def test_values_under_the_mask_do_not_change_the_volume(method: str) -> None:
         for series in (low, high)
     ]
     np.testing.assert_array_equal(*volumes)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_values_under_the_mask_do_not_change_the_coarse_start() -> None:
+    found = []
+    for series in (masked(2.0), masked(3.0)):
+        response, generator = Transmission(1.5), torch.Generator().manual_seed(0)
+        volume = coarse_start(series, response, VolumeGrid.of(series), num_steps=8, generator=generator)
+        found.append((volume, response(torch.zeros(1)).detach()))
+    torch.testing.assert_close(*found, rtol=0, atol=0)
