@@ -109,7 +109,8 @@ def page(trials: dict[str, list[Row]]) -> str:
         f"{RATIO:g} times the short ones. A cell says how many of the printed 90 % intervals hold the truth, and their median "
         "half-width (relative; of the offset in electrons). Of 100 perfect intervals 85 to 95 hold the truth in nine of ten "
         "repetitions. Exposures without darks or a known ratio hardly tell offset from read noise: their intervals are made "
-        "wide enough for two priors and hold the truth more often than nine in ten.\n",
+        "wide enough for two priors and hold the truth more often than nine in ten. Rows of fewer than 100 "
+        "trials are not finished: the command resumes them.\n",
         "| exposures | trials | refused | verdict good | gain | offset | read noise |\n|---|---|---|---|---|---|---|",
     ]
     for kind, rows in trials.items():
