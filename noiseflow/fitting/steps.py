@@ -10,20 +10,29 @@ import torch
 from torch import Tensor
 
 
-class _Adam(torch.optim.Adam):
-    """Adam without the guards that keep torch's compiler out of its methods: the first call of one loads the whole compiler,
-    which takes seconds."""
+def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
+    """An optimiser without the guards that keep torch's compiler out of its methods: the first call of one loads the whole
+    compiler, which takes seconds."""
+    names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
+    methods = {name: inspect.unwrap(getattr(kind, name)) for name in names}
+    return type(kind.__name__, (kind,), methods | {"step": torch.no_grad()(inspect.unwrap(kind.step))})
 
-    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
-    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
-    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
-    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
-    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+
+_Adam, _LBFGS = _without_compiler(torch.optim.Adam), _without_compiler(torch.optim.LBFGS)
 
 
 def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     """Adam, with a short memory of the gradients' sizes."""
-    return _Adam(list(groups), betas=(0.9, 0.99), fused=True)
+    optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=(0.9, 0.99), fused=True)
+    return optimiser
+
+
+def lbfgs(parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 100) -> torch.optim.LBFGS:
+    """L-BFGS with a line search by the strong Wolfe conditions."""
+    optimiser: torch.optim.LBFGS = _LBFGS(
+        list(parameters), max_iter=max_iter, history_size=history_size, line_search_fn="strong_wolfe"
+    )
+    return optimiser
 
 
 def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> bool:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.electrons import log_density
+from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
@@ -177,7 +178,7 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float
     with torch.no_grad():
         change.copy_(start)
         first = float(loss())
-    optimiser = torch.optim.LBFGS([change], max_iter=_SETTLING_STEPS, line_search_fn="strong_wolfe")
+    optimiser = lbfgs([change], max_iter=_SETTLING_STEPS)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -223,7 +224,7 @@ def _score(detector: Detector, signal: Tensor, observation: Tensor) -> float:
 def _climb(start: Detector, signal: Tensor, observation: Tensor) -> Detector:
     """Maximum likelihood by a quasi-Newton method from one start."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([change], max_iter=40, history_size=10, line_search_fn="strong_wolfe")
+    optimiser = lbfgs([change], max_iter=40, history_size=10)
 
     def loss() -> Tensor:
         optimiser.zero_grad()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
+from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
@@ -108,9 +109,7 @@ class ExcessNoise(ElectronCounter):
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
         model = self if behind is None else behind(self)
-        climber = torch.optim.LBFGS(
-            [self.change], max_iter=_ITERATIONS, line_search_fn="strong_wolfe", tolerance_change=1e-9
-        )
+        climber = lbfgs([self.change], max_iter=_ITERATIONS)
         best, kept = math.inf, self.change.detach().clone()
 
         def loss() -> Tensor:
