@@ -52,7 +52,7 @@ class Schedule:
             tolerance of the choice.
         adapt: signal steps on the slab under the chosen noise model.
         refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
-        learn: noise-model steps on the volume, which has more pixels and a better signal, half of its steps done.
+        learn: noise-model steps on the whole volume of a quiet series.
         trial: signal steps that compare weights, after the first quarter of those of the volume.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
@@ -174,16 +174,15 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         rate, hold = schedule.rate, facts.hold_offset
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, half=half, hold_offset=hold))
 
-    learning = facts.learn_noise and not facts.settled and noise == "chosen"
     if quarter:  # the simple noise pulls at a rough signal steadily
         add("begin", "simple", quarter, half=facts.can_halve)
         if taken_over:
             add("go on", "simple", 2 * quarter)
-        elif facts.can_halve or learning:
-            add("go on", noise, quarter, half=facts.can_halve)
-        if learning:
-            learn = FitStage("learn noise on the volume", "noise", "whole", noise, schedule.learn)
-            stages.append(replace(learn, standardise=taken_over))
+            if not facts.settled:  # blocks of one volume share the noise model that the slab has taught
+                learn = FitStage("learn noise on the volume", "noise", "whole", noise, schedule.learn)
+                stages.append(replace(learn, standardise=True))
+        elif facts.can_halve:
+            add("go on", noise, quarter, half=True)
     add("fit", noise, num_steps - sum(stage.num_steps for stage in stages if stage.kind == "signal"))
     return stages
 
