@@ -110,7 +110,8 @@ def page(content: dict[str, Any]) -> str:
         "`recon.joint.plan.Schedule` holds its numbers of steps and learning rates. Each row changes one of them. Gains are in "
         f"the PSNR of the volume, over up to 25 scenes of {SIZE}³ voxels (five phantoms, five noises, one seed; two fits of a "
         "scene differ by 0.1 to 0.3 dB, so only the mean and its standard error decide), and in that of the tilts left out of "
-        "the real needle. Time is the median ratio to the plan as it is; the machine had other work.\n\n"
+        "the real needle. Time is the median ratio to the plan as it is; the machine had other work. The plan of these rows "
+        "also taught the noise model on the whole volume, which was given up since ({doc}`../architecture`).\n\n"
         "```sh\npython docs/benchmarks/schedule.py run\n```"
     )
     return "\n\n".join([head, measured_on([content]), table(header, rows)]) + "\n"

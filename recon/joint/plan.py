@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from noiseflow.described import described
@@ -179,8 +179,8 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         if taken_over:
             add("go on", "simple", 2 * quarter)
             if not facts.settled:  # blocks of one volume share the noise model that the slab has taught
-                learn = FitStage("learn noise on the volume", "noise", "whole", noise, schedule.learn)
-                stages.append(replace(learn, standardise=True))
+                name = "learn noise on the volume"
+                stages.append(FitStage(name, "noise", "whole", noise, schedule.learn, standardise=True))
         elif facts.can_halve:
             add("go on", noise, quarter, half=True)
     add("fit", noise, num_steps - sum(stage.num_steps for stage in stages if stage.kind == "signal"))

@@ -28,9 +28,7 @@ PLANS = {
         slab   choose weight                weights     50 x 5  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6
-        whole  go on                        signal      37  chosen, rate 0.6
-        whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
@@ -58,7 +56,6 @@ PLANS = {
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6, half resolution
         whole  go on                        signal      37  chosen, rate 0.6, half resolution
-        whole  learn noise on the volume    noise       60  chosen
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
