@@ -147,6 +147,11 @@ def interval_and_slopes(
             for out, part in zip(found, (value, *parts), strict=True):
                 out[left[here]] = part
             left, cells = left[~here], tuple(each[~here] for each in cells)  # type: ignore[assignment]
+    empty = ~torch.isfinite(found[0])
+    if bool(empty.any()):  # a fast way underflows far from any electron, where the general one does not
+        value, parts = _slowly(low[empty], high[empty], rate[empty], read_noise, slopes=slopes)
+        for out, part in zip(found, (value, *parts), strict=True):
+            out[empty] = part
     return found[0], tuple(found[1:])
 
 

@@ -198,7 +198,8 @@ class JointReconstructor:
         rate = learning_rate(rough, made)
         rough = rough if rows is None else start.rows(rows).to(self.device)
         made.start_from(rough)
-        made.check_axes(rough)
+        if rough.shape == grid.shape:
+            made.check_axes(rough)
         occupancy = None
         if self.skip_vacuum and projector.has_parts:
             occupancy = Occupancy(rough / made.scale, grid.shape).to(self.device)
