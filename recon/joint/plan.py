@@ -108,7 +108,7 @@ class FitStage:
 _START = (
     10  # steps of a noise model that is measured rather than fitted: of one parameter, or one width at every signal
 )
-_TRIALS, _CANDIDATES = 5, 2  # fits that these stages usually make, for the progress bar
+_TRIALS, _CANDIDATES = 4, 2  # fits that these stages usually make, for the progress bar
 
 
 def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | None = None) -> list[FitStage]:

@@ -26,7 +26,8 @@ class WeightChoice:
 def choose_weight(
     held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8
 ) -> WeightChoice:
-    """Find the weight of the lowest held-out NLL: a geometric ladder brackets it, then half rungs, then the vertex of a parabola.
+    """Find the weight of the lowest held-out NLL: a geometric ladder brackets it, then half a rung to
+    the side of the lower neighbour, then the vertex of a parabola.
 
     Args:
         held_out_nll: fits with a weight and returns its held-out NLL.
@@ -49,18 +50,21 @@ def choose_weight(
         missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
         if not missing:
             # the NLL rises faster above than below: a parabola through whole rungs would lean to weights too low
-            for side in (-0.5, 0.5):
-                visit(middle + side)
+            visit(middle + math.copysign(0.5, tried[middle - 1] - tried[middle + 1]))
             break
         visit(missing[0])
-    best = lowest()
-    weight = first * factor ** (best + 0.5 * _vertex(*(tried.get(best + side, math.inf) for side in (-0.5, 0.0, 0.5))))
-    return WeightChoice(weight, {first * factor**rung: nll for rung, nll in tried.items()})
+    return WeightChoice(first * factor ** _vertex(tried), {first * factor**rung: nll for rung, nll in tried.items()})
 
 
-def _vertex(left: float, middle: float, right: float) -> float:
-    """Where the parabola through three equally spaced values is lowest, in steps from the middle one."""
-    if not all(math.isfinite(value) for value in (left, middle, right)):
-        return 0.0
-    curvature = left - 2 * middle + right
-    return 0.5 * (left - right) / curvature if curvature > 0 else 0.0
+def _vertex(tried: dict[float, float]) -> float:
+    """Where the parabola through the lowest of the rungs and its neighbours on either side is lowest."""
+    best = min(tried, key=lambda rung: tried[rung])
+    below = max((rung for rung in tried if rung < best), default=None)
+    above = min((rung for rung in tried if rung > best), default=None)
+    if below is None or above is None or not all(math.isfinite(tried[rung]) for rung in (below, above)):
+        return best
+    left, right = (tried[best] - tried[below]) / (best - below), (tried[above] - tried[best]) / (above - best)
+    if not right > left:
+        return best
+    # where the slope, left and right half-way to the neighbours, is zero
+    return 0.5 * (below + best) - left * 0.5 * (above - below) / (right - left)

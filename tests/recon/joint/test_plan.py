@@ -25,7 +25,7 @@ PLANS = {
         slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
-        slab   choose weight                weights     50 x 5  chosen, rate 0.6
+        slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6
         whole  fit                          signal      113  chosen, rate 0.6
@@ -52,7 +52,7 @@ PLANS = {
         slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   begin again                  signal      37  simple, rate 0.6, afresh
-        slab   choose weight                weights     50 x 5  chosen, rate 0.6
+        slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  begin                        signal      37  simple, rate 0.6, half resolution
         whole  go on                        signal      37  chosen, rate 0.6, half resolution
@@ -99,7 +99,7 @@ PLANS = {
         slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
         slab   begin again                  signal      37  simple, rate 0.6, offset held, afresh
-        slab   choose weight                weights     50 x 5  simple, rate 0.6, offset held
+        slab   choose weight                weights     50 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
         whole  go on                        signal      60  simple, rate 0.6, offset held, half resolution
