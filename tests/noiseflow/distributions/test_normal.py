@@ -45,7 +45,8 @@ def numbers(*values: float) -> list[Tensor]:
 
 
 def exact_interval(low: float, high: float) -> mpmath.mpf:
-    """Φ(high) − Φ(low)."""
+    """Φ(high) − Φ(low), taken left of zero, where nothing cancels."""
+    low, high = (-high, -low) if low > 0 else (low, high)
     root = mpmath.sqrt(2)
     return (mpmath.erfc(-mpmath.mpf(high) / root) - mpmath.erfc(-mpmath.mpf(low) / root)) / 2
 
