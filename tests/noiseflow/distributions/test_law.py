@@ -158,9 +158,7 @@ def test_a_rescaled_law_is_that_of_the_scaled_observation_in_every_respect() -> 
         lambda one: one.expand((4, 3, 2)).log_prob(value),
     ):
         assert_close(each(found), each(expected), rtol=1e-7, atol=1e-9)
-    drawn, plain = (
-        one.sample((7,), generator=torch.Generator().manual_seed(1)) for one in (found, law.expand((3, 2)))
-    )
+    drawn, plain = (one.sample((7,), generator=torch.Generator().manual_seed(1)) for one in (found, law.expand((3, 2))))
     assert_close(drawn, plain * scale + shift)
     assert found.has_rsample
     assert not found.discrete

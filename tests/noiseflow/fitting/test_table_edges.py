@@ -181,7 +181,9 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     found = ObservationTable(model, observation, 0.0, 1.0)
     value, slope = exact(model, torch.full_like(observation, 0.42), observation)
     assert float((found.log_prob(torch.full_like(observation, 0.42)) - value).abs().max()) < 2e-3
-    assert float((found.slope(torch.full_like(observation, 0.42)) - slope).abs().max()) < 0.02 * float(slope.abs().max())
+    assert float((found.slope(torch.full_like(observation, 0.42)) - slope).abs().max()) < 0.02 * float(
+        slope.abs().max()
+    )
     narrow = ObservationTable(model, observation, 0.5, 0.5)
     assert narrow.high > narrow.low
     assert narrow.high - narrow.low < 1e-5

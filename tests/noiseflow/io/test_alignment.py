@@ -160,5 +160,7 @@ def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
 
 
 def test_an_mdoc_tells_nothing_before_its_first_section(tmp_path: Path) -> None:
-    (tmp_path / "a.mdoc").write_text("TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n")
+    (tmp_path / "a.mdoc").write_text(
+        "TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n"
+    )
     assert io.read_angles(tmp_path / "a.mdoc").tolist() == [1.5, -2.0]
