@@ -97,7 +97,7 @@ def test_digitising_is_rounding_and_then_clipping(name: str) -> None:
 @pytest.mark.parametrize("name", CONVERTERS)
 def test_edges_are_where_the_limits_begin(name: str) -> None:
     law = made(*CONVERTERS[name])
-    step, low, high = CONVERTERS[name]
+    _, low, high = CONVERTERS[name]
     below, above = law.edges
     for edge, limit, side in ((below, low, -1), (above, high, 1)):
         if math.isfinite(limit):

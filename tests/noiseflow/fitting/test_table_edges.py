@@ -168,7 +168,7 @@ def test_few_levels_are_columns_so_that_nothing_is_interpolated_along_them() -> 
     model = noiseflow.Digitised(noiseflow.Gaussian(0.02), step=0.25)
     observation = (4 * spread()).round() / 4
     found = ObservationTable(model, observation, 0.0, 1.0)
-    value, slope = exact(model, torch.full_like(observation, 0.5), observation)
+    value, _ = exact(model, torch.full_like(observation, 0.5), observation)
     possible = value > -30
     assert 0 < int(possible.sum()) < observation.numel()
     assert float((found.log_prob(torch.full_like(observation, 0.5)) - value)[possible].abs().max()) < 0.02
