@@ -26,11 +26,16 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
-import numpy  # noqa: F401  what takes long to import, once for all mutants
+import hypothesis.strategies  # noqa: F401  what takes long to import, once for all mutants
+import mpmath  # noqa: F401
+import numpy  # noqa: F401
 import pytest
+import safetensors.torch  # noqa: F401
 import scipy.optimize
 import scipy.stats  # noqa: F401
+import skimage.metrics  # noqa: F401
 import torch
+import typer.testing  # noqa: F401
 
 ROOT = Path(__file__).parents[1]
 TARGETS = {
@@ -212,6 +217,7 @@ def survives(tests: list[str], mutant: Mutant | None, seconds: float) -> bool:
             if mutant is not None:
                 sys.meta_path.insert(0, _Finder(mutant))  # type: ignore[arg-type]
             torch.set_num_threads(1)
+            os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # loading the plugins takes longer than most of the tests
             code = int(
                 pytest.main(["-x", "-q", "-p", "no:cacheprovider", *(str(ROOT / "tests" / test) for test in tests)])
             )
