@@ -202,3 +202,14 @@ def test_a_rescaled_converter_digitises_what_is_rescaled() -> None:
     )
     levels = (torch.arange(5, dtype=torch.float64) / 4)[:, None].expand(-1, 4)
     assert_close(found.log_prob(levels), expected.log_prob(levels))
+
+
+def test_only_a_module_and_its_signal_may_be_looked_up_in_tables() -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(WIDTH).double(), 0.25, 0.0, 1.0)
+    assert model(SIGNALS).source == (model, SIGNALS)
+    assert DigitisedDistribution(model, model(SIGNALS).base).source is None
+
+    class Plain:
+        step, low, high = 0.25, 0.0, 1.0
+
+    assert DigitisedDistribution(Plain(), model(SIGNALS).base, SIGNALS).source is None
