@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,11 @@ from typing import Any
 import pytest
 
 from noiseflow.commands.cli import main
+from tests.shares import shares
 
 DATA = Path(__file__).parent.parent / "noiseflow" / "data"
+SLOW_SECONDS = Path(__file__).parent / "slow_seconds.json"
+"""Of each slow test, all run one after another; other work was done beside them, so only their proportions count."""
 
 # a shell's background jobs ignore Ctrl-C, and the programs under test would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -27,9 +29,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if wanted is None:
         return
     share, count = map(int, wanted.split("/"))
-    left_out = {
-        item for item in items if item.get_closest_marker("slow") and zlib.crc32(item.nodeid.encode()) % count != share
-    }
+    slow = {item.nodeid: item for item in items if item.get_closest_marker("slow")}
+    kept = shares(list(slow), json.loads(SLOW_SECONDS.read_text(encoding="utf-8")), count)[share]
+    left_out = {item for name, item in slow.items() if name not in kept}
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]
 

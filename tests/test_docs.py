@@ -61,6 +61,7 @@ def test_python_blocks_run_page_by_page(page: Path, folder: Path) -> None:
     namespace: dict[str, object] = {"__name__": page.stem}
     for number, block in enumerate(blocks(page, "python"), 1):
         exec(compile(block, f"{page.name}, block {number}", "exec"), namespace)
+    assert ("```python" not in page.read_text(encoding="utf-8")) or set(namespace) - {"__name__", "__builtins__"}
 
 
 @pytest.mark.parametrize(("page", "line"), commands(), ids=lambda value: value.replace(" ", "_")[:60])
@@ -135,5 +136,7 @@ def test_gallery_draws_its_pictures(name: str, tmp_path: Path, monkeypatch: pyte
 def test_settings_of_the_pages_name_installed_extensions_only() -> None:
     pytest.importorskip("sphinx", reason="needs the extra [docs]")
     settings = runpy.run_path(str(ROOT / "docs" / "conf.py"))
-    for extension in settings["extensions"]:
-        importlib.import_module(extension)
+    assert settings["extensions"]
+    assert [importlib.import_module(extension).__name__ for extension in settings["extensions"]] == settings[
+        "extensions"
+    ]

@@ -20,6 +20,7 @@ import recon.commands.results
 import recon.scale.blocks  # noqa: F401
 from noiseflow import io
 from noiseflow.commands.cli import main
+from noiseflow.io.ownership import require_own
 from noiseflow.io.partials import _prefix
 from recon.joint.state_files import discard_states, write_state
 from tests.processes import finish, start, wait_for
@@ -113,6 +114,28 @@ def test_foreign_files_among_the_states_stay(tmp_path: Path) -> None:
     left = {file.name for file in tmp_path.iterdir()}
     assert left >= {"mine.safetensors", "current.safetensors"}
     assert not left & {"fit-001.safetensors", dead.name}
+
+
+@pytest.mark.parametrize("looks", range(1, 4))
+def test_a_state_that_is_deleted_while_it_is_looked_at_is_not_taken_for_a_foreign_file(
+    looks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = tmp_path / "current.safetensors"
+    write_state(state, {"a": 1})
+    stat, seen = Path.stat, []
+
+    def deleted_after(path: Path, **options: bool) -> os.stat_result:
+        answer = stat(path, **options)
+        if path == state:
+            seen.append(answer)
+            if len(seen) == looks:
+                path.unlink()
+        return answer
+
+    monkeypatch.setattr(Path, "stat", deleted_after)
+    require_own(state, overwrite=False)
+    monkeypatch.undo()
+    assert len(seen) < looks or not state.exists()
 
 
 def reconstruct(files: Path, out: Path, *more: object) -> list[object]:

@@ -35,7 +35,8 @@ def require_own(path: Path, *, overwrite: bool) -> None:
     Raises:
         FileExistsError: the file is not ours.
     """
-    if not overwrite and path.exists() and not is_own(path):
+    # Whether it exists is asked last: a file that is deleted while it is looked at is gone, and not another's.
+    if not overwrite and not is_own(path) and path.exists():
         raise FileExistsError(
             f"{path} exists and was not written by noiseflow; name another output, or replace it with --overwrite"
         )

@@ -44,7 +44,7 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
             squares; ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, or the reference is flat.
+        ValueError: shapes differ, pixels are not finite, the reference is flat, or images have fewer than 3 x 3 pixels.
     """
     found, truth = _checked(result, reference)
     matched = match(found, truth, scaling=scaling)
@@ -152,6 +152,10 @@ def _dssim(result: Array, reference: Array, span: float) -> float:
     if reference.ndim == 2:
         result, reference = result[None], reference[None]
     window = min(7, (min(reference.shape[1:]) - 1) // 2 * 2 + 1)
+    if window < 3:
+        raise ValueError(
+            f"the images have {reference.shape[1]} x {reference.shape[2]} pixels; at least 3 x 3 pixels are needed"
+        )
     values = [
         structural_similarity(a, b, data_range=span, win_size=window)  # type: ignore[no-untyped-call]
         for a, b in zip(result, reference, strict=True)

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -97,17 +98,33 @@ def _give_up(*_: object) -> None:
 
 
 def read_or_refuse(path: Path, content: bytes) -> None:
+    """What is read makes sense, or one line says which file does not."""
     path.write_bytes(content)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    message = f"{path}"
+    refused = None
     try:
-        noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
+        found = noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
     except ValueError as error:
-        message = str(error)
+        refused = str(error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
-    assert str(path) in message
-    assert "\n" not in message
+    if refused is None:
+        require_sense(found)
+    else:
+        assert str(path) in refused
+        assert "\n" not in refused
+
+
+def require_sense(found: torch.nn.Module | io.ImageFile) -> None:
+    """A noise model with a distribution, or an image of numbers with as many angles as it has sections."""
+    if isinstance(found, torch.nn.Module):
+        assert found(torch.ones(2)).batch_shape == (2,)
+        return
+    assert found.data.dtype.kind in "iuf"
+    assert found.data.ndim in (2, 3)
+    assert found.data.size > 0
+    assert found.tilt_angles is None or len(found.tilt_angles) == (len(found.data) if found.data.ndim == 3 else 1)
+    assert found.voxel_size is None or all(0 < edge < np.inf for edge in found.voxel_size)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -142,9 +159,14 @@ def test_any_text_is_an_angle_file_or_refused(text: str, tmp_path: Path) -> None
     for name, reader in (("a.tlt", io.read_angles), ("a.mdoc", io.read_angles), ("a.xf", io.read_transforms)):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8", errors="replace")
-        message = name
+        refused = None
         try:
-            reader(path)
+            found = reader(path)
         except ValueError as error:
-            message = str(error)
-        assert name in message
+            refused = str(error)
+        if refused is None:
+            assert np.isfinite(found).all()
+            assert found.shape[1:] == ((2, 3) if name == "a.xf" else ())
+            assert len(found) > 0
+        else:
+            assert name in refused

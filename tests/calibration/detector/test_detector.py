@@ -16,7 +16,6 @@ from calibration.detector.posterior import (
     DetectorPosterior,
     _local_moves,
     _sampler,
-    potential_scale_reduction,
     sample_posterior,
 )
 from calibration.detector.shape import misfit
@@ -125,13 +124,6 @@ def test_unconverged_chain_is_an_error_that_says_how_many_more_steps():
     levels = collect_levels([readings(np.random.default_rng(6), electrons)])
     with pytest.raises(ValueError, match=r"needs about \d+ more"):
         sample_posterior([levels], num_steps=60, largest_num_steps=60)
-
-
-def test_scale_reduction_tells_chains_that_disagree():
-    chain = np.random.default_rng(0).standard_normal((400, 8, 3))
-    assert potential_scale_reduction(chain) < 1.01
-    chain[:, :4, 1] += 1.0
-    assert potential_scale_reduction(chain) > 1.1
 
 
 def test_dark_frames_fix_offset_and_read_noise():

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from calibration.detector.levels import collect_levels
-from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior
+from calibration.detector.cells import collect_cells
+from calibration.detector.levels import Levels, collect_levels
+from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, _start, maximum_likelihood
 from calibration.detector.posterior import potential_scale_reduction
 
-from .test_detector import readings
+from .test_detector import cells, readings
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +72,102 @@ def test_scale_reduction_is_that_of_its_formula_on_chains_that_agree_and_that_do
         found = potential_scale_reduction(one)
         assert found == pytest.approx(max(values), rel=1e-9)
         assert found > 1.05
+
+
+def dim_pair(rate: float = 40.0, offset: float = 100.0) -> list[Levels]:
+    """Short exposures beside signals that a longer one of the same setting gave, so that they share their offset."""
+    electrons = np.random.default_rng(0).gamma(4.0, rate / 4, 20_000)
+    one = cells(np.random.default_rng(1), electrons, read_noise=2.0, offset=offset)
+    return [collect_cells([one], guess=(2.0, offset, 2.0))]
+
+
+def with_dark() -> list[Levels]:
+    generator = np.random.default_rng(4)
+    electrons = generator.gamma(2.0, 20.0, 20_000)
+    lit = readings(generator, electrons, step=1.0)
+    dark = replace(readings(generator, np.zeros(4000), step=1.0), dark=True)
+    return [collect_levels([lit, dark])]
+
+
+def test_signals_that_refer_are_those_of_light():
+    levels = with_dark()
+    posterior, lit = LogPosterior(levels), levels[0].dark == 0
+    assert 0 < lit.sum() < lit.size
+    signal, count = levels[0].signal[lit], levels[0].count[lit]
+    assert posterior.reference == pytest.approx((signal * count).sum() / count.sum())
+    assert posterior.reference > 1.01 * np.average(levels[0].signal, weights=levels[0].count)
+    assert posterior.brightest == signal.max()
+
+
+@pytest.mark.parametrize("offset", [None, (99.0, 0.7)])
+@pytest.mark.parametrize("make", [with_dark, dim_pair])
+def test_coordinates_are_the_logarithms_and_come_back(make, offset):
+    posterior = LogPosterior(make(), offset)
+    assert posterior.by_offset == (offset is not None or make is dim_pair)
+    coordinates = posterior.coordinates(*SETS.T)
+    np.testing.assert_allclose(np.stack(posterior.parameters(coordinates), -1), SETS, rtol=1e-9)
+    gain, level, read_noise = SETS.T
+    variance = gain * (posterior.reference - level) + (gain * read_noise) ** 2
+    second = level if posterior.by_offset else np.log(variance)
+    np.testing.assert_allclose(coordinates, np.stack([np.log(gain), second, np.log(read_noise)], -1), rtol=1e-12)
+
+
+def test_rows_outside_the_priors_do_not_change_the_others():
+    posterior = LogPosterior(with_dark())
+    inside = posterior.coordinates(*SETS.T)
+    outside = np.array([[51.0, inside[0, 1], 0.3], [-51.0, inside[0, 1], 0.3], [0.7, inside[0, 1], 1e3]])
+    found = posterior(np.concatenate([outside, inside]))
+    assert np.isneginf(found[:3]).all()
+    np.testing.assert_allclose(found[3:], posterior(inside), rtol=1e-12)
+    low, high = READ_NOISE_RANGE
+    for edge, step in ((low, 1e-3), (high, -1e-3)):
+        sets = posterior.coordinates(*np.array([[2.0, 100.0, edge * np.exp(by)] for by in (step, -step)]).T)
+        np.testing.assert_array_equal(np.isfinite(posterior(sets)), [True, False], err_msg=str(edge))
+    too_bright = np.array([[np.log(2.0), np.log(10.0), np.log(20.0)]])
+    assert posterior.parameters(too_bright)[1][0] > posterior.brightest
+    assert np.isneginf(posterior(too_bright)).all()
+
+
+CASES = {
+    "lit": (lambda: [collect_levels([readings(np.random.default_rng(3), ELECTRONS, step=1.0)])], None),
+    "lit and dark": (with_dark, None),
+    "offset measured": (with_dark, (100.0, 0.5)),
+    "offset in common": (dim_pair, None),
+    "dim": (lambda: dim_pair(3.0, 300.0), None),
+}
+ELECTRONS = np.random.default_rng(2).gamma(2.0, 20.0, 20_000)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_maximum_found_is_the_maximum_and_the_search_begins_near_it(name):
+    make, offset = CASES[name]
+    posterior = LogPosterior(make(), offset)
+    final, best = maximum_likelihood(posterior)
+    highest = float(final(best)[0])
+    generator = np.random.default_rng(0)
+    size = np.array([0.02, 1.0 if final.by_offset else 0.02, 0.1])
+    around = best + generator.standard_normal((300, 3)) * size * generator.choice([0.03, 0.3, 1.0], (300, 1))
+    # the search ends where a step gains less than a hundredth of a nat
+    assert float(final(around).max()) < highest + 0.02
+    assert final.rescaled(best) is None
+    if make is not with_dark:  # dark frames tell the read noise so well that every guess is far from it
+        assert highest - float(posterior(_start(posterior))[0]) < 5
+    gain, offset_found, read_noise = (float(each[0]) for each in final.parameters(best))
+    assert gain == pytest.approx(2.0, rel=0.04)
+    assert offset_found == pytest.approx(300.0 if name == "dim" else 100.0, abs=2.5)
+    assert read_noise == pytest.approx(2.0 if make is not with_dark and name != "lit" else 1.5, rel=0.15)
+    again, same = maximum_likelihood(posterior, start=(2.1, offset_found + 0.5, 1.7))
+    assert float(again(same)[0]) == pytest.approx(highest, abs=0.02)
+
+
+@pytest.mark.parametrize(("factor", "change"), [(1.03, 0.0), (1.0, 3.0)])
+def test_signals_of_a_wrong_scale_are_brought_to_the_likely_one(factor, change):
+    (true,) = dim_pair()
+    posterior = LogPosterior([true.rescaled({0: (factor, change)})])
+    middle = float(np.median(true.signal))
+    final, best = maximum_likelihood(posterior)
+    assert final is not posterior
+    assert final.rescaled(best) is None
+    assert final.offset is None
+    assert float(np.median(final.levels[0].signal)) == pytest.approx(middle, rel=4e-3)
+    assert posterior.rescaled(posterior.coordinates(2.0, 100.0, 2.0)) is not None

@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import noiseflow
-from noiseflow.distributions.law import NoiseDistribution
+from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
 
 SCALE, SHIFT = 2.5, -0.75
 
@@ -61,3 +61,129 @@ def test_draws_of_a_rescaled_law_are_scaled_draws(count: int) -> None:
     drawn = rescaled().sample((count,), generator=torch.Generator().manual_seed(0))
     plain = gaussian().sample((count,), generator=torch.Generator().manual_seed(0))
     assert_close(drawn, plain * SCALE + SHIFT)
+
+
+class Gumbel(NoiseDistribution):
+    """A skewed law whose moments, entropy and mode are all different, and known; it writes only what it must."""
+
+    def __init__(self, place: torch.Tensor, width: torch.Tensor) -> None:
+        super().__init__(place.shape, like=place)
+        self.place, self.width = place, width
+
+    def _standard(self, value: torch.Tensor) -> torch.Tensor:
+        return (value - self.place) / self.width
+
+    def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+        z = self._standard(value)
+        return -z - torch.exp(-z) - torch.log(self.width)
+
+    def cdf(self, value: torch.Tensor) -> torch.Tensor:
+        return torch.exp(-torch.exp(-self._standard(value)))
+
+    def log_interval_prob(self, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
+        return torch.log(self.cdf(high) - self.cdf(low))
+
+    def icdf(self, value: torch.Tensor) -> torch.Tensor:
+        return self.place - self.width * torch.log(-torch.log(value))
+
+    def sample(self, sample_shape=(), generator=None) -> torch.Tensor:
+        return self.icdf(torch.rand(*sample_shape, *self.batch_shape, generator=generator, dtype=self.dtype))
+
+
+PLACE, WIDTH = torch.tensor([0.3, -40.0], dtype=torch.float64), torch.tensor([0.7, 11.0], dtype=torch.float64)
+EULER = 0.57721566490153286
+
+
+def test_what_a_law_does_not_write_itself_follows_from_density_and_quantiles() -> None:
+    law = Gumbel(PLACE, WIDTH)
+    # the quadrature leaves out tails of probability 1e-10, and with them about 1e-8 widths of the mean
+    for found, expected, power in (
+        (law.mean, PLACE + EULER * WIDTH, 1),
+        (law.variance, math.pi**2 / 6 * WIDTH**2, 2),
+        (law.entropy(), torch.log(WIDTH) + EULER + 1, 0),
+    ):
+        assert float(((found - expected) / WIDTH**power).abs().max()) < 1e-6
+    assert float(((law.mode - PLACE) / WIDTH).abs().max()) < 1e-3
+    assert_close(law.cdf_below(PLACE), torch.full((2,), math.exp(-1), dtype=torch.float64))
+    assert all(torch.isinf(end) and (end > 0) == high for end, high in zip(law.limits, (False, True), strict=True))
+
+
+def test_weights_between_two_bounds_are_those_of_what_lies_between_them() -> None:
+    law = Gumbel(PLACE, WIDTH)
+    low, high = PLACE - WIDTH, PLACE + WIDTH
+    nodes, weights = law.panels(low, high, 40)
+    assert nodes.shape == weights.shape == (160, 2)
+    assert bool(((nodes > low) & (nodes < high)).all())
+    assert_close(weights.sum(0), torch.ones_like(low))
+    share = (weights * (nodes < PLACE)).sum(0)
+    expected = (law.cdf(PLACE) - law.cdf(low)) / (law.cdf(high) - law.cdf(low))
+    assert_close(share, expected)
+
+
+def test_draws_move_with_place_and_width_as_their_quantile_does() -> None:
+    place, width = PLACE.clone().requires_grad_(), WIDTH.clone().requires_grad_()
+    law = Gumbel(place, width)
+    drawn = law.rsample((5,), generator=torch.Generator().manual_seed(0))
+    assert_close(drawn.detach(), law.sample((5,), generator=torch.Generator().manual_seed(0)).detach())
+    by_place, by_width = torch.autograd.grad(drawn.sum(), (place, width))
+    assert_close(by_place, torch.full_like(PLACE, 5.0))
+    assert_close(by_width, ((drawn - PLACE) / WIDTH).sum(0).detach())
+    law.has_rsample = False
+    with pytest.raises(NotImplementedError, match="Gumbel: observations are discrete"):
+        law.rsample()
+
+
+def test_bisection_finds_the_quantile() -> None:
+    law, share = Gumbel(PLACE, WIDTH), torch.tensor([0.02, 0.9], dtype=torch.float64)
+    found = bisect_quantile(law, share, PLACE - 30 * WIDTH, PLACE + 30 * WIDTH)
+    assert_close(found, law.icdf(share), rtol=1e-12, atol=1e-12)
+
+
+def test_a_rescaled_law_is_that_of_the_scaled_observation_in_every_respect() -> None:
+    law = Gumbel(PLACE, WIDTH)
+    scale = torch.tensor([[2.0, 0.5], [3.0, 0.1], [1.0, 7.0]], dtype=torch.float64)
+    shift = torch.tensor([[5.0], [-3.0], [0.0]], dtype=torch.float64)
+    found, expected = law.rescaled(scale, shift), Gumbel(scale * PLACE + shift, scale * WIDTH)
+    assert found.batch_shape == (3, 2)
+    value = expected.place + 0.4 * expected.width
+    for each in (
+        lambda one: one.log_prob(value),
+        lambda one: one.cdf(value),
+        lambda one: one.cdf_below(value),
+        lambda one: one.icdf(torch.tensor([0.2, 0.6], dtype=torch.float64)),
+        lambda one: one.log_interval_prob(value - 1, value + 2),
+        lambda one: one.mean,
+        lambda one: one.variance,
+        lambda one: one.entropy(),
+        lambda one: one.expand((4, 3, 2)).log_prob(value),
+    ):
+        assert_close(each(found), each(expected), rtol=1e-7, atol=1e-9)
+    drawn, plain = (one.sample((7,), generator=torch.Generator().manual_seed(1)) for one in (found, law.expand((3, 2))))
+    assert_close(drawn, plain * scale + shift)
+    assert found.has_rsample
+    assert not found.discrete
+    assert found.independent
+
+
+def test_an_infinite_bound_of_a_rescaled_law_leaves_the_gradients_of_the_other_finite() -> None:
+    scale, shift = (torch.full((2,), value, dtype=torch.float64, requires_grad=True) for value in (2.0, 1.0))
+    found = Gumbel(PLACE, WIDTH).rescaled(scale, shift)
+    value = found.log_interval_prob(torch.full_like(PLACE, -math.inf), found.icdf(torch.full_like(PLACE, 0.3)).detach())
+    assert_close(value.exp().detach(), torch.full_like(PLACE, 0.3))
+    value.sum().backward()
+    z = Gumbel(PLACE, WIDTH).icdf(torch.full_like(PLACE, 0.3))
+    density = Gumbel(PLACE, WIDTH).log_prob(z).exp() / 0.3
+    assert_close(shift.grad, -density / 2)
+    assert_close(scale.grad, -density * z / 2)
+
+
+def test_a_rescaled_converter_is_limited_where_its_limits_go() -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.3), 0.125, 0.0, 1.0).double()
+    inner = model(PLACE.clamp(0, 1))
+    found = inner.base.rescaled(torch.tensor(2.0).double(), torch.tensor(-1.0).double())
+    assert all(torch.isinf(end) for end in found.limits)
+    clipped = super(type(inner), inner).rescaled(torch.tensor([2.0, 4.0]).double(), torch.tensor([-1.0, 3.0]).double())
+    assert_close(clipped.limits[0], torch.tensor([-1.0, 3.0], dtype=torch.float64))
+    assert_close(clipped.limits[1], torch.tensor([1.0, 7.0], dtype=torch.float64))
+    assert clipped.discrete
+    assert not clipped.has_rsample

@@ -1,14 +1,16 @@
 """Laws of the scalar maps: inverse, log-derivative, monotone, over extremes of their parameters."""
 
+import math
 from dataclasses import fields
 
+import mpmath
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from noiseflow.distributions.transforms import Affine, Radial, StudentTail
+from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, _expm1_ratio, _log1p_ratio
 from noiseflow.models.flow import Layer, affine_layer, radial_layer, spline_layer, tail_layer
 from tests.contracts import check_transform
 
@@ -96,3 +98,63 @@ def test_maps_between_rows_have_parameters_in_between(layer: Layer) -> None:
             y_expected, ladj_expected = getattr(expected, direction)(x[i])
             assert torch.allclose(y[i], y_expected, rtol=1e-12, atol=1e-12)
             assert torch.allclose(ladj[i], ladj_expected, rtol=1e-10, atol=1e-10)
+
+
+def test_a_spline_is_durkans_between_its_knots_and_straight_beyond_them() -> None:
+    x = torch.tensor([-1.0, 0.0, 0.5, 2.0], dtype=torch.float64)
+    y = torch.tensor([-3.0, -1.0, 0.0, 0.7], dtype=torch.float64)
+    slope = torch.tensor([0.4, 3.0, 1.0, 2.5], dtype=torch.float64)
+    spline = Spline(x, y, slope)
+    for k in range(3):
+        secant = (y[k + 1] - y[k]) / (x[k + 1] - x[k])
+        for share in (0.0, 0.2, 0.7, 0.999):
+            rest = share * (1 - share)
+            below = secant + (slope[k + 1] + slope[k] - 2 * secant) * rest
+            expected = y[k] + (y[k + 1] - y[k]) * (secant * share**2 + slope[k] * rest) / below
+            derivative = (
+                secant**2 * (slope[k + 1] * share**2 + 2 * secant * rest + slope[k] * (1 - share) ** 2) / below**2
+            )
+            at = x[k] + share * (x[k + 1] - x[k])
+            found, ladj = spline.forward(at)
+            assert torch.allclose(found, expected, rtol=1e-12)
+            assert torch.allclose(ladj, derivative.log(), rtol=1e-10, atol=1e-12)
+            back, ladj = spline.inverse(expected)
+            assert torch.allclose(back, at, rtol=1e-10, atol=1e-10)
+            assert torch.allclose(ladj, -derivative.log(), rtol=1e-8, atol=1e-8)
+    for end, side in ((0, -1.0), (3, 1.0)):
+        found, ladj = spline.forward(x[end] + side * 5)
+        assert torch.allclose(found, y[end] + side * 5 * slope[end])
+        assert torch.allclose(ladj, slope[end].log())
+        back, ladj = spline.inverse(y[end] + side * 5)
+        assert torch.allclose(back, x[end] + side * 5 / slope[end])
+        assert torch.allclose(ladj, -slope[end].log())
+
+
+@pytest.mark.parametrize(("left", "right"), [(0.3, 0.05), (0.0, 0.2), (1e-9, 0.0)])
+def test_each_tail_is_that_of_its_formula_and_its_own_weight(left: float, right: float) -> None:
+    tail = StudentTail(torch.tensor(left).double(), torch.tensor(right).double())
+    for at in (-200.0, -2.0, -0.05, 0.0, 0.05, 2.0, 200.0):
+        weight, x = (left if at < 0 else right), torch.tensor(at, dtype=torch.float64)
+        y, ladj = tail.forward(x)
+        expected = at if weight == 0 else math.copysign(math.sqrt(math.log1p(weight * at * at) / weight), at)
+        assert float(y) == pytest.approx(expected, rel=1e-7)
+        derivative = 1.0 if expected == 0 or weight == 0 else at / expected / (1 + weight * at * at)
+        assert float(ladj) == pytest.approx(math.log(derivative), rel=1e-7, abs=1e-7)
+        back, ladj_back = tail.inverse(y)
+        assert float(back) == pytest.approx(at, rel=1e-10)
+        assert float(ladj_back) == pytest.approx(-float(ladj), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("t", [1e-6, 9e-4, 1.1e-3, 0.5])
+def test_ratios_near_zero_keep_all_their_digits(t: float) -> None:
+    """Where the series ends and the quotient begins, both are exact to the last digits but three."""
+    at = torch.tensor(t, dtype=torch.float64)
+    assert float(_log1p_ratio(at)) == pytest.approx(float(mpmath.log1p(t) / t), rel=1e-12)
+    assert float(_expm1_ratio(at)) == pytest.approx(float(mpmath.expm1(t) / t), rel=1e-12)
+
+
+def test_far_tails_of_the_inverse_stay_finite() -> None:
+    tail = StudentTail(torch.tensor(1.0).double(), torch.tensor(1.0).double())
+    back, ladj = tail.inverse(torch.tensor([8.0, 100.0], dtype=torch.float64))
+    assert float(back[0]) == pytest.approx(math.sqrt(math.expm1(64.0)), rel=1e-12)
+    assert bool(torch.isfinite(back).all() & torch.isfinite(ladj).all())

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noiseflow
-from noiseflow.fitting.pixels import FitPixels
+from noiseflow.fitting.pixels import FitPixels, thinned
 
 
 def drawn(seed: int, shape: tuple[int, ...], share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Generator]:
@@ -120,3 +120,79 @@ def test_too_few_pixels_to_train_or_to_judge_are_refused(held_out: list[bool]) -
     observation, use, generator = drawn(0, (12,), 2.0)
     with pytest.raises(ValueError, match="too few"):
         FitPixels.choose(observation, use, torch.tensor(held_out), generator)
+
+
+def test_two_pixels_to_train_and_one_to_judge_are_enough() -> None:
+    observation, use, generator = drawn(0, (3,), 2.0)
+    pixels = FitPixels.choose(observation, use, torch.tensor([False, True, False]), generator)
+    assert (pixels.train.tolist(), pixels.judge.tolist()) == ([0, 2], [1])
+    assert pixels.weight.tolist() == [0.5, 0.0, 0.5]
+    for held_out in ([True, True, False], [False, False, False]):
+        with pytest.raises(ValueError, match="3 usable pixels are too few"):
+            FitPixels.choose(observation, use, torch.tensor(held_out), generator)
+
+
+@pytest.mark.parametrize("count", [(3, 1), (2, 1), (2, 2)])
+def test_two_lines_to_train_and_one_to_judge_are_enough(count: tuple[int, int]) -> None:
+    train, judge = count
+    observation, use, generator = drawn(0, (1, train + judge, 4), 2.0)
+    held_out = torch.zeros(observation.shape, dtype=torch.bool)
+    held_out[0, train:] = True
+    pixels = FitPixels.choose_lines(observation, use, held_out, generator, axis=-1)
+    assert (len(pixels.train), len(pixels.judge)) == count
+    for rows in (slice(1, None), slice(0, 0)):
+        held_out[:] = False
+        held_out[0, rows] = True
+        with pytest.raises(ValueError, match="usable rows or columns are too few"):
+            FitPixels.choose_lines(observation, use, held_out, generator, axis=-1)
+
+
+def test_lines_without_a_usable_pixel_are_left_out_and_others_stay_whole() -> None:
+    observation, use, generator = drawn(0, (2, 5, 4), 2.0)
+    use = use.view(2, 5, 4).clone()
+    use[0, 2] = False
+    use[1, 3, 1:] = False
+    held_out = torch.zeros(2, 5, 4, dtype=torch.bool)
+    held_out[1, 3] = True
+    pixels = FitPixels.choose_lines(observation, use.reshape(-1), held_out, generator, axis=-1)
+    assert pixels.judge.tolist() == [[32, 33, 34, 35]]
+    assert len(pixels.train) == 8
+    assert not set(range(8, 12)) & set(pixels.train.reshape(-1).tolist())
+    assert pixels.image == (5, 4)
+    assert not pixels.weight.any()
+
+
+def test_unusable_pixels_get_the_mean_of_the_usable() -> None:
+    observation = torch.tensor([1.0, math.nan, 5.0, 3.0, 100.0, math.inf])
+    use = torch.tensor([True, False, True, True, False, False])
+    held_out = torch.tensor([False, False, False, True, False, False])
+    pixels = FitPixels.choose(observation, use, held_out, torch.Generator())
+    assert pixels.observation.tolist() == [1.0, 3.0, 5.0, 3.0, 100.0, 3.0]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6])
+def test_as_many_pixels_judge_as_are_asked_for(share: float) -> None:
+    use = torch.ones(20_000, dtype=torch.bool)
+    pixels = FitPixels.choose(torch.zeros(20_000), use, share, torch.Generator().manual_seed(0))
+    assert pixels.judge.numel() / 20_000 == pytest.approx(share, abs=0.015)
+
+
+def test_batches_hold_every_training_pixel_alike_and_are_never_empty() -> None:
+    observation, use, generator = drawn(0, (40,), 2.0)
+    pixels = FitPixels.choose(observation, use, 0.3, generator)
+    batch = torch.cat([pixels.batch(20) for _ in range(400)])
+    counts = torch.bincount(batch, minlength=40)[pixels.train]
+    assert float(counts.min()) > 0.7 * float(counts.float().mean())
+    assert pixels.batch(10**6).numel() == pixels.train.numel()
+    lines = FitPixels.choose_lines(observation.reshape(1, 8, 5), use, torch.arange(40) < 10, generator, axis=-1)
+    assert lines.batch(3).shape == (1, 5)
+    assert lines.batch(10**6).shape == (len(lines.train), 5)
+
+
+@pytest.mark.parametrize(("most", "expected"), [(10, 10), (11, 10), (9, 5), (4, 4), (3, 3), (1, 1)])
+def test_thinning_keeps_at_most_so_many_evenly(most: int, expected: int) -> None:
+    found = thinned(torch.arange(10), most)
+    assert len(found) == expected <= most
+    assert len(set(found.diff().tolist())) <= 1
+    assert found[0] == 0
+    assert thinned(torch.arange(40).view(10, 4), 20).shape == (5, 4)

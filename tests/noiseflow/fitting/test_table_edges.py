@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 import noiseflow
-from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +46,173 @@ def test_within_its_rows_value_and_slope_are_those_of_the_model(table) -> None:
     assert found.error <= 1e-3
     assert float((found.log_prob(signal) - value).abs().mean()) < 2e-3
     assert float((found.slope(signal) - slope).abs().mean()) < 0.02 * float(slope.abs().mean())
+
+
+class Wavy(torch.nn.Module):
+    """Normal noise whose log-density ripples along the residual; finer ripples need finer tables."""
+
+    def __init__(self, waves: float) -> None:
+        super().__init__()
+        self.waves = torch.nn.Parameter(torch.tensor(waves))
+
+    def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
+        waves = self.waves
+
+        class Law(torch.distributions.Normal):
+            def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+                return super().log_prob(value) + 0.2 * torch.sin(waves * (value - self.loc))
+
+        return Law(signal, torch.full_like(signal, 0.1), validate_args=False)
+
+
+def spread(count: int = 4000) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(count, generator=generator) + 0.1 * torch.randn(count, generator=generator)
+
+
+def error_of(found: ObservationTable, model: torch.nn.Module, observation: torch.Tensor) -> float:
+    """Mean absolute error at signals that the observations make likely, far more of them than the table judges itself by."""
+    errors = []
+    for seed in range(20):
+        noise = 0.1 * torch.randn(observation.shape, generator=torch.Generator().manual_seed(seed))
+        signal = (observation - noise).clamp(found.low, found.high)
+        errors.append((found.log_prob(signal) - model(signal).log_prob(observation)).abs().mean())
+    return float(torch.stack(errors).mean().detach())
+
+
+@pytest.mark.parametrize("waves", [0.0, 150.0, 1000.0])
+def test_the_error_told_is_the_error_made(waves: float) -> None:
+    model, observation = Wavy(waves), spread()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    assert error_of(found, model, observation) == pytest.approx(found.error, rel=0.25, abs=1e-5)
+    assert found.measure_error(model) == found.error
+
+
+def test_finer_columns_are_taken_where_they_are_needed_and_help() -> None:
+    observation = spread()
+    tables = {waves: ObservationTable(Wavy(waves), observation, 0.0, 1.0) for waves in (0.0, 150.0, 600.0)}
+    sizes = [table.state()["size"] for table in tables.values()]
+    assert sizes[0] < sizes[1] < sizes[2]
+    assert all(table.error <= 1e-3 for table in tables.values())
+    # what no size resolves gets the size with the least error, and says so
+    hopeless = ObservationTable(Wavy(3e4), observation, 0.0, 1.0)
+    assert hopeless.error > 0.02
+    assert error_of(hopeless, Wavy(3e4), observation) == pytest.approx(hopeless.error, rel=0.25)
+
+
+def test_a_model_that_outgrows_its_table_gets_a_finer_one_when_checked() -> None:
+    model, observation = Wavy(0.0), spread()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    before = found.state()["size"]
+    found.check(model)
+    assert found.state()["size"] == before
+    with torch.no_grad():
+        model.waves.fill_(400.0)
+    found.rebuild(model)
+    assert found.check(model) <= 1e-3
+    assert found.state()["size"] > before
+    assert error_of(found, model, observation) < 1.5e-3
+
+
+def test_rows_grow_where_signals_leave_them_and_not_for_a_few_strays() -> None:
+    model, observation = noiseflow.Gaussian(0.1), spread()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    strays = torch.cat([torch.linspace(0.1, 0.9, 4000), torch.tensor([5.0, -5.0, 6.0])])
+    found.cover(model, strays)
+    assert (found.low, found.high) == (0.0, 1.0)
+    found.cover(model, torch.full((100,), math.nan))
+    assert (found.low, found.high) == (0.0, 1.0)
+    found.cover(model, torch.linspace(0.0, 1.5, 1000))
+    assert found.low == 0.0
+    assert found.high == pytest.approx(1.5 + 0.2 * 1.5, rel=2e-3)  # a fifth beyond, so that it need not grow again soon
+    high = found.high
+    found.cover(model, torch.linspace(-0.4, 1.0, 1000))
+    # as far again below as the signals went, and a hundredth: weak signals need the resolution
+    assert found.low == pytest.approx(-0.8 - 0.01 * 1.8, rel=4e-3)
+    assert found.high == high
+    assert error_of(found, model, observation) <= 1e-3
+    below = torch.full_like(observation, -0.6)
+    value, slope = exact(model, below, observation)
+    near = observation < -0.05
+    assert float((found.log_prob(below) - value)[near].abs().mean()) < 5e-3
+    assert float((found.slope(below) - slope)[near].abs().mean()) < 0.02 * float(slope[near].abs().mean())
+
+
+@pytest.mark.parametrize("kind", ["counts", "continuous"])
+def test_a_resumed_table_is_the_same_to_the_last_bit(kind: str) -> None:
+    model: torch.nn.Module
+    if kind == "counts":
+        model, observation = noiseflow.Poisson(0.25, 0.0), (4 * spread().abs()).round() / 4
+    else:
+        model, observation = Wavy(150.0), spread()
+    first = ObservationTable(model, observation, 0.05, 1.0)
+    first.cover(model, torch.linspace(0.05, 1.4, 1000))
+    state = first.state()
+    if kind == "continuous":
+        with torch.no_grad():
+            model.waves.fill_(140.0)
+    first.rebuild(model)
+    again = ObservationTable(model, observation, 7.0, 8.0, resume=state)
+    signal = torch.linspace(-0.1, 1.5, observation.numel())
+    assert torch.equal(again.log_prob(signal), first.log_prob(signal))
+    assert torch.equal(again.slope(signal), first.slope(signal))
+    assert again.state().keys() == state.keys()
+    assert (again.state()["low"], again.state()["high"], again.state()["size"]) == tuple(
+        state[name] for name in ("low", "high", "size")
+    )
+    assert again.error == first.measure_error(model)
+
+
+def test_few_levels_are_columns_so_that_nothing_is_interpolated_along_them() -> None:
+    """Masses of single counts: between two of them there is nothing to interpolate to."""
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.02), step=0.25)
+    observation = (4 * spread()).round() / 4
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    value, _ = exact(model, torch.full_like(observation, 0.5), observation)
+    possible = value > -30
+    assert 0 < int(possible.sum()) < observation.numel()
+    assert float((found.log_prob(torch.full_like(observation, 0.5)) - value)[possible].abs().max()) < 0.02
+    assert found.error <= 1e-3
+
+
+def test_a_single_level_and_a_single_signal_have_a_table() -> None:
+    model = noiseflow.Gaussian(0.1)
+    observation = torch.full((500,), 0.3)
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    value, slope = exact(model, torch.full_like(observation, 0.42), observation)
+    assert float((found.log_prob(torch.full_like(observation, 0.42)) - value).abs().max()) < 2e-3
+    assert float((found.slope(torch.full_like(observation, 0.42)) - slope).abs().max()) < 0.02 * float(
+        slope.abs().max()
+    )
+    narrow = ObservationTable(model, observation, 0.5, 0.5)
+    assert narrow.high > narrow.low
+    assert narrow.high - narrow.low < 1e-5
+
+
+def test_some_pixels_are_looked_up_as_all_of_them() -> None:
+    model, observation = Wavy(150.0), spread()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    signal = torch.rand(observation.shape, generator=torch.Generator().manual_seed(5))
+    whole, some = found.log_prob(signal), torch.tensor([3, 77, 3000])
+    assert torch.equal(found.log_prob(signal[some], some), whole[some])
+    assert torch.equal(found.log_prob(signal[100:200], slice(100, 200)), whole[100:200])
+
+
+def test_a_keeper_makes_its_table_once_and_again_from_its_state() -> None:
+    model, observation, made = noiseflow.Gaussian(0.1), spread(), []
+
+    def make(resume: dict[str, object] | None) -> ObservationTable:
+        made.append(resume)
+        return ObservationTable(model, observation, 0.0, 1.0, resume=resume)
+
+    keeper = TableKeeper()
+    assert keeper.state() is None
+    assert keeper.get(make) is keeper.get(make)
+    state = keeper.state()
+    assert state is not None
+    other = TableKeeper()
+    other.resume = state
+    assert other.state() is state
+    other.get(make)
+    assert made == [None, state]
+    assert other.resume is None

@@ -1,5 +1,6 @@
 """IMOD's alignments and angle files."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +116,51 @@ def test_angles_inside_the_file_serve_where_none_lie_beside_it(tmp_path: Path) -
         np.testing.assert_array_equal(io.tilt_angles_of(tmp_path / "a.st", image), -inside)
     with pytest.raises(FileNotFoundError, match="--angles"):
         io.tilt_angles_of(tmp_path / "b.st", io.ImageFile(IMAGES))
+
+
+@pytest.mark.parametrize(("off", "warns"), [(1.9, False), (2.0, False), (-2.1, True)])
+def test_angle_files_that_differ_by_more_than_two_degrees_are_pointed_out(
+    tmp_path: Path, off: float, warns: bool
+) -> None:
+    inside = np.array([-10.0, 0.0, 10.0])
+    (tmp_path / "a.tlt").write_text(f"-9.5\n{off}\n10.5\n")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = io.tilt_angles_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=inside))
+    np.testing.assert_allclose(found, [-9.5, off, 10.5])
+    assert [f"{off:g}° for section 1" in str(each.message) for each in caught] == [True] * warns
+    with warnings.catch_warnings():  # another number of angles says nothing of the sections
+        warnings.simplefilter("error")
+        io.tilt_angles_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=np.array([50.0, 0.0])))
+
+
+@pytest.mark.parametrize("text", ["720\n", "-720\n", "0\n"])
+def test_angles_of_two_full_turns_are_the_largest(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.tlt").write_text(text)
+    assert io.read_angles(tmp_path / "a.tlt").tolist() == [float(text)]
+    for beyond in ("721", "-720.5", "1e30"):
+        (tmp_path / "a.tlt").write_text(f"\n0\n{beyond}\n")
+        with pytest.raises(ValueError, match=f"line 3: {beyond} is no tilt angle"):
+            io.read_angles(tmp_path / "a.tlt")
+
+
+def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
+    folder = tmp_path / "tilts"
+    folder.mkdir()
+    image = io.ImageFile(IMAGES)
+    (folder / "any.rawtlt").write_text("1\n")
+    assert io.tilt_angles_of(folder, image).tolist() == [1.0]
+    (folder / "other.mdoc").write_text("[ZValue = 0]\nTiltAngle = 2\n")
+    with pytest.raises(FileNotFoundError, match=r"no tilts\.rawtlt, tilts\.tlt or \.mdoc"):  # which of the two?
+        io.tilt_angles_of(folder, image)
+    (tmp_path / "tilts.tlt").write_text("3\n")
+    assert io.tilt_angles_of(folder, image).tolist() == [3.0]
+    (tmp_path / "a.rawtlt").write_text("4\n")
+    assert io.tilt_angles_of(f"{tmp_path / 'a.h5'}::group/data", image).tolist() == [4.0]
+
+
+def test_an_mdoc_tells_nothing_before_its_first_section(tmp_path: Path) -> None:
+    (tmp_path / "a.mdoc").write_text(
+        "TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n"
+    )
+    assert io.read_angles(tmp_path / "a.mdoc").tolist() == [1.5, -2.0]

@@ -1,6 +1,7 @@
 """MRC of every maker: modes, byte orders, signed bytes, extended headers; written byte by byte from the formats' texts."""
 
 import warnings
+from itertools import permutations
 from pathlib import Path
 
 import mrcfile
@@ -9,6 +10,7 @@ import pytest
 from mrcfile.dtypes import HEADER_DTYPE
 
 from noiseflow import io
+from noiseflow.io import mrc
 
 STACK = np.arange(60).reshape(3, 4, 5)
 ANGLES = [-60.0, 0.25, 59.5]
@@ -29,7 +31,7 @@ def write(path: Path, data: np.ndarray, mode: int, *, order: str = "<", extended
     return path
 
 
-def imod(order: str = "<", *, num_bytes: int = 0, flags: int = 0, signed: bool = False) -> bytes:
+def imod(order: str = "<", *, num_bytes: int = 0, flags: int = 0, signed: int = 0) -> bytes:
     """The part of the header that IMOD and SerialEM use."""
     extra = np.zeros(84, "u1")
     extra[16:20] = np.array([num_bytes, flags], f"{order}i2").view("u1")
@@ -149,3 +151,182 @@ def test_header_statistics_are_those_of_the_pixels(kind, shape, tmp_path):
         header = file.header
         found = [float(header[name]) for name in ("dmin", "dmax", "dmean", "rms")]
     np.testing.assert_allclose(found, [data.min(), data.max(), data.mean(), data.std()], rtol=1e-5)
+
+
+def test_headers_and_pixels_must_be_there_to_the_last_byte(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mrc", STACK.astype("i2"), 1, extended=bytes(80))
+    whole = path.read_bytes()
+    np.testing.assert_array_equal(io.read(path).data, STACK)
+    for size, words in ((len(whole) - 1, "header claims"), (1024, "header claims"), (1023, "has 1024 bytes")):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=words):
+            io.read(path)
+    path.write_bytes(whole + b"more")
+    np.testing.assert_array_equal(io.read(path).data, STACK)
+    with pytest.raises(ValueError, match="header claims"):
+        io.read(write(tmp_path / "b.mrc", np.zeros((1, 1, 1), "i2"), 1, nx=0))
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_mapped_file_has_the_same_pixels_and_is_not_changed(tmp_path: Path, order: str, mapped: bool) -> None:
+    path = write(tmp_path / "a.mrc", STACK.astype(f"{order}f4"), 2, order=order, extended=bytes(80))
+    before = path.read_bytes()
+    image = mrc.read(path, mapped=mapped)
+    np.testing.assert_array_equal(image.data, STACK)
+    assert mapped or not isinstance(image.data, np.memmap)
+    image.data[:] = 7
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(("space_group", "shape"), [(0, (4, 5)), (1, (1, 4, 5)), (401, (1, 4, 5))])
+def test_one_section_of_a_stack_is_an_image(tmp_path: Path, space_group: int, shape: tuple[int, ...]) -> None:
+    path = write(tmp_path / "a.mrc", STACK[:1].astype("i2"), 1, ispg=space_group)
+    assert io.read(path).data.shape == shape
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"dmax": 127.0}, "i1"),
+        ({"dmax": 127.5}, "u1"),
+        ({"dmax": float("nan")}, "i1"),
+        ({"extra2": imod(signed=2)}, "u1"),  # another flag of IMOD's
+        ({"extra2": imod(signed=3)}, "i1"),
+        ({"extra2": imod(signed=True), "dmax": 255.0}, "i1"),
+    ],
+)
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_flags_of_imod_count_before_statistics(tmp_path: Path, order: str, fields: dict, expected: str) -> None:
+    if "extra2" in fields:
+        fields = fields | {"extra2": imod(order, signed=int(np.frombuffer(fields["extra2"][44:48], "<i4")[0]))}
+    data = np.arange(250, 256, dtype="u1").reshape(1, 2, 3)
+    image = io.read(write(tmp_path / "a.mrc", data, 0, order=order, **fields))
+    np.testing.assert_array_equal(image.data, data.view(expected)[0])
+
+
+@pytest.mark.parametrize("axes", list(permutations((1, 2, 3))))
+def test_every_order_of_axes_comes_out_as_z_y_x(tmp_path: Path, axes: tuple[int, int, int]) -> None:
+    volume = np.arange(24).reshape(2, 3, 4).astype("f4")  # (z, y, x), axes 3, 2 and 1
+    stored = volume.transpose([3 - axis for axis in axes])  # sections, rows, columns
+    path = write(tmp_path / "a.map", stored, 2, maps=axes[0], mapr=axes[1], mapc=axes[2])
+    np.testing.assert_array_equal(io.read(path).data, volume)
+
+
+def test_axes_that_make_no_sense_are_left_as_they_are(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.map", STACK.astype("f4"), 2, maps=1, mapr=1, mapc=1)
+    np.testing.assert_array_equal(io.read(path).data, STACK)
+
+
+@pytest.mark.parametrize(
+    ("edges", "cells", "expected"),
+    [
+        ((10.0, 40.0, 90.0), (5, 10, 15), (6.0, 4.0, 2.0)),
+        ((10.0, 40.0, 90.0), (0, 10, 15), (6.0, 4.0, 10.0)),  # no number of cells: one
+        ((0.0, 40.0, 90.0), (5, 10, 15), None),
+        ((10.0, 40.0, float("inf")), (5, 10, 15), None),
+    ],
+)
+def test_voxels_are_edges_over_cells(tmp_path: Path, edges, cells, expected) -> None:
+    cella = np.zeros((), HEADER_DTYPE["cella"])
+    cella["x"], cella["y"], cella["z"] = edges
+    fields = dict(zip(("mx", "my", "mz"), cells, strict=True))
+    found = io.read(write(tmp_path / "a.mrc", STACK.astype("i2"), 1, cella=cella, **fields)).voxel_size
+    assert found == (None if expected is None else pytest.approx(expected))
+
+
+def angles_of(path: Path, data: bytes, extra: bytes, kind: bytes = b"", sections: int = 3, order: str = "<"):
+    stack = np.zeros((sections, 2, 2), f"{order}i2")
+    return io.read(write(path, stack, 1, order=order, extended=data, extra2=extra, exttyp=kind)).tilt_angles
+
+
+@pytest.mark.parametrize("flags", range(1, 64, 2))
+def test_serialem_records_of_every_kind_are_as_long_as_their_flags_say(tmp_path: Path, flags: int) -> None:
+    lengths = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
+    size = sum(length for bit, length in lengths.items() if flags & bit)
+    record = np.full((3, size // 2), 999, "<i2")
+    record[:, 0] = [-6000, 25, 5950]
+    found = angles_of(tmp_path / "a.st", record.tobytes(), imod(num_bytes=size, flags=flags), b"SERI")
+    np.testing.assert_allclose(found, ANGLES)
+    wrong = angles_of(tmp_path / "b.st", bytes(300), imod(num_bytes=size + 2, flags=flags), b"SERI")
+    assert wrong is None
+    without = imod(num_bytes=size - 2, flags=flags - 1)
+    assert angles_of(tmp_path / "c.st", record.tobytes(), without, b"SERI") is None
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", [b"AGAR", b"", b"\0\0\0\0"])
+def test_agards_records_have_integers_before_the_angle(tmp_path: Path, kind: bytes, order: str) -> None:
+    record = np.full((3, 6), 55.0, f"{order}f4")
+    record[:, 2] = ANGLES
+    extra = imod(order, num_bytes=2, flags=4)[:40] + bytes(44)  # 2 integers and 4 reals
+    np.testing.assert_allclose(angles_of(tmp_path / "a.mrc", record.tobytes(), extra, kind, order=order), ANGLES)
+    short = record.tobytes()[: 2 * 24 + 12]
+    np.testing.assert_allclose(angles_of(tmp_path / "b.mrc", short, extra, kind, order=order), ANGLES)
+    assert angles_of(tmp_path / "c.mrc", short[:-1], extra, kind, order=order) is None
+    assert angles_of(tmp_path / "d.mrc", record.tobytes(), extra, b"CCP4", order=order) is None
+    none = imod(order, num_bytes=2, flags=0)[:40] + bytes(44)
+    assert angles_of(tmp_path / "e.mrc", record.tobytes(), none, kind, order=order) is None
+
+
+@pytest.mark.parametrize(
+    ("angles", "told"),
+    [
+        ([-180.0, 0.0, 180.0], True),
+        ([-180.0, 0.0, 180.5], False),
+        ([5.0, 5.0, 5.0], False),  # a stage that never moved wrote no angles
+        ([0.0, float("nan"), 2.0], False),
+        ([0.0, 0.0, 0.5], True),
+        ([7.0], True),
+    ],
+)
+def test_numbers_that_can_be_no_angles_are_none(tmp_path: Path, angles: list[float], told: bool) -> None:
+    record = np.zeros((len(angles), 32), "<f4")
+    record[:, 0] = angles
+    extra = imod(flags=32)[:40] + bytes(44)
+    found = angles_of(tmp_path / "a.mrc", record.tobytes(), extra, sections=len(angles))
+    assert (found is not None) == told
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", [b"FEI1", b"FEI2"])
+def test_fei_records_are_as_long_as_the_first_says_and_hold_the_axis(tmp_path: Path, kind: bytes, order: str) -> None:
+    record = np.zeros(3, mrcfile.dtypes.get_ext_header_dtype(kind, order))
+    longer = record.itemsize + 24
+    record["Metadata size"], record["Alpha tilt"], record["Tilt axis angle"] = longer, ANGLES, 85.5
+    raw = b"".join(one.tobytes() + bytes(24) for one in record)
+    stack = np.zeros((3, 2, 2), f"{order}i2")
+    image = io.read(write(tmp_path / "a.mrc", stack, 1, order=order, extended=raw, exttyp=kind))
+    np.testing.assert_allclose(image.tilt_angles, ANGLES)
+    assert image.tilt_axis == pytest.approx(85.5)
+    for stated, expected in ((0.0, None), (360.0, 360.0), (360.5, None), (-400.0, None), (-5.0, -5.0)):
+        record["Tilt axis angle"] = stated
+        raw = b"".join(one.tobytes() + bytes(24) for one in record)
+        image = io.read(write(tmp_path / "b.mrc", stack, 1, order=order, extended=raw, exttyp=kind))
+        assert image.tilt_axis == expected
+    empty = io.read(write(tmp_path / "c.mrc", stack, 1, order=order, extended=b"", exttyp=kind))
+    assert (empty.tilt_angles, empty.tilt_axis) == (None, None)
+
+
+def test_the_axis_of_old_headers_needs_all_their_reals(tmp_path: Path) -> None:
+    record = np.zeros((3, 31), "<f4")
+    record[:, 0], record[:, 10] = ANGLES, 85.0
+    extra = imod(flags=31)[:40] + bytes(44)
+    path = write(tmp_path / "a.mrc", STACK.astype("i2"), 1, extended=record.tobytes(), extra2=extra)
+    assert io.read(path).tilt_axis is None
+
+
+@pytest.mark.parametrize(("values", "stored"), [([-5, 300], "i2"), ([0, 60_000], "u2"), ([0, 2**24], "f4")])
+def test_wide_integers_are_written_in_the_narrowest_type_that_holds_them(tmp_path: Path, values, stored: str) -> None:
+    io.write(tmp_path / "a.mrc", np.array([values], np.int64))
+    found = io.read(tmp_path / "a.mrc").data
+    assert found.dtype == np.dtype(stored)
+    np.testing.assert_array_equal(found, [values])
+
+
+def test_written_voxel_sizes_and_labels(tmp_path: Path) -> None:
+    io.write(tmp_path / "a.mrc", STACK.astype("f4"), voxel_size=(3.0, 2.0, 1.0))
+    with mrcfile.open(tmp_path / "a.mrc") as file:
+        assert (float(file.voxel_size.x), float(file.voxel_size.z)) == pytest.approx((1.0, 3.0))
+        assert bytes(file.header.label[int(file.header.nlabl) - 1]).startswith(b"noiseflow")
+    assert io.read(tmp_path / "a.mrc").voxel_size == pytest.approx((3.0, 2.0, 1.0))

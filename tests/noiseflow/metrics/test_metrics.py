@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import noiseflow
 from noiseflow import metrics
+from noiseflow.metrics.evaluation import TABLE_HEADER, kl_divergence, pixel_log_prob, table_row
 
 
 def test_divergences_of_known_vectors() -> None:
@@ -142,3 +143,164 @@ def test_bins_beyond_the_rails_have_no_mass():
         masses = metrics.residual_masses(railed, torch.full((5,), 0.4), edges)
         assert masses[[0, 1, 4, 5]] == pytest.approx(0.0, abs=1e-12)
         assert masses.sum() == pytest.approx(1.0)
+
+
+def normal_cdf(value: np.ndarray) -> np.ndarray:
+    return np.asarray(torch.special.ndtr(torch.as_tensor(value)))
+
+
+class Wide(torch.nn.Module):
+    """Normal noise whose width grows with the signal."""
+
+    def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
+        return torch.distributions.Normal(signal, 0.05 + 0.1 * signal, validate_args=False)
+
+
+def test_an_evaluation_is_made_of_its_definitions() -> None:
+    signal, observation = noisy(3)
+    signal, observation = signal[:3000].double(), observation[:3000].double()
+    found = metrics.evaluate(Wide(), signal, observation, num_bins=16, num_signal_bins=5)
+    width = 0.05 + 0.1 * signal.numpy()
+    z = (observation - signal).numpy() / width
+    nll = 0.5 * z**2 + np.log(width) + 0.5 * math.log(2 * math.pi)
+    assert found.nll == pytest.approx(nll.mean(), rel=1e-9)
+    assert found.nll_error == pytest.approx(nll.std() / math.sqrt(3000), rel=1e-9)
+    u = np.sort(normal_cdf(z))
+    ranks = np.arange(1, 3001) / 3000
+    assert found.ks == pytest.approx(max((ranks - u).max(), (u - ranks + 1 / 3000).max()), rel=1e-6)
+    assert found.ks_floor == pytest.approx(1.358 / math.sqrt(3000))
+    np.testing.assert_allclose(found.pit, 20 * np.histogram(u, np.linspace(0, 1, 21))[0] / 3000, rtol=1e-9)
+    assert found.num_pixels == 3000
+    assert len(found.per_signal) == 5
+    order = np.argsort(signal.numpy())
+    for each, group in zip(found.per_signal, np.array_split(order, 5), strict=True):
+        alone = metrics.divergence(Wide(), signal[group], observation[group], num_bins=16)
+        assert each.jsd == pytest.approx(alone.jsd, rel=1e-9)
+    assert found.mean_jsd == pytest.approx(np.mean([each.jsd for each in found.per_signal]))
+    assert found.mean_jsd_floor == pytest.approx(np.mean([each.jsd_floor for each in found.per_signal]))
+    assert len(metrics.evaluate(Wide(), signal[:3], observation[:3]).per_signal) == 3
+
+
+@pytest.mark.parametrize("num_bins", [4, 64])
+def test_bins_are_even_between_far_quantiles_and_their_masses_exact(num_bins: int) -> None:
+    signal, observation = (each[:5000].double() for each in noisy(1))
+    found = metrics.divergence(Wide(), signal, observation, num_bins=num_bins)
+    residual, width = (observation - signal).numpy(), 0.05 + 0.1 * signal.numpy()
+    low, high = np.quantile(residual, (0.001, 0.999))
+    edges = np.r_[-np.inf, np.linspace(low, high, num_bins - 1), np.inf]
+    counts = np.histogram(residual, edges)[0]
+    masses = np.diff(normal_cdf(edges / width[:, None]), axis=1).mean(0)
+    expected = metrics.jensen_shannon(counts / 5000, masses)
+    assert counts[0] == counts[-1] == 5
+    # masses are those of 256 groups of like signal
+    assert found.jsd == pytest.approx(float(expected), rel=1e-3)
+    assert found.bc == pytest.approx(float(metrics.bhattacharyya(counts / 5000, masses)), rel=1e-4)
+    assert found.bd == pytest.approx(-math.log(found.bc))
+    assert found.bd_floor == pytest.approx(-math.log(found.bc_floor))
+    np.testing.assert_allclose(metrics.residual_masses(Wide(), signal, edges), masses, rtol=3e-3)
+
+
+@torch.no_grad()
+def test_masses_of_many_signals_are_those_of_each() -> None:
+    """More groups of signals than are evaluated at once, of a model whose single readings have mass."""
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.3), step=0.01, low=-1.0, high=9.0).double()
+    signal = torch.linspace(0.0, 5.0, 3000, dtype=torch.float64)
+    edges = torch.tensor([-math.inf, -0.5, 0.004, 0.011, 0.5, math.inf], dtype=torch.float64)
+    bounds = signal[:, None] + edges
+    exact = model(signal[:, None]).log_interval_prob(bounds[:, :-1], bounds[:, 1:]).exp().mean(0)
+    # readings a step apart move across an edge by no more than a sixteenth of a step within a group
+    np.testing.assert_allclose(metrics.residual_masses(model, signal, edges), exact, rtol=0.02, atol=1e-9)
+
+
+def test_residuals_that_are_all_equal_have_a_divergence() -> None:
+    signal = torch.zeros(500, dtype=torch.float64)
+    found = metrics.divergence(noiseflow.Gaussian(1.0).double(), signal, signal, num_bins=8)
+    assert math.isfinite(found.jsd)
+    assert found.jsd > 0.1
+
+
+def test_the_bootstrap_interval_is_as_wide_as_chance_makes_the_divergence() -> None:
+    random = np.random.default_rng(0)
+    truth, model = random.dirichlet(np.full(16, 5.0)), random.dirichlet(np.full(16, 5.0))
+    draws = random.multinomial(5000, truth, size=(100, 64)) / 5000  # 64 resamples of the histogram make an interval
+    found = metrics.jensen_shannon(draws, model)
+    intervals = [
+        metrics.compare_histogram(random.multinomial(5000, truth), model, random).jsd_interval for _ in range(400)
+    ]
+    low, high = np.array(intervals).T
+    expected = np.quantile(found, (0.05, 0.95), axis=1).mean(1)
+    assert (high - low).mean() == pytest.approx(expected[1] - expected[0], rel=0.03)
+    exact = float(metrics.jensen_shannon(truth, model))
+    assert ((low <= exact) & (exact <= high)).mean() == pytest.approx(0.9, abs=0.045)
+
+
+def test_the_interval_takes_off_what_resampling_adds() -> None:
+    """Under the truth the divergence is all chance, and a resample of the counts has twice of it."""
+    random, masses = np.random.default_rng(1), np.full(32, 1 / 32)
+    found = [metrics.compare_histogram(random.multinomial(20_000, masses), masses, random) for _ in range(200)]
+    middle = np.mean([np.mean(each.jsd_interval) for each in found])
+    assert middle == pytest.approx(np.mean([each.jsd for each in found]), rel=0.05)
+    assert min(each.jsd_interval[0] for each in found) >= 0
+
+
+def test_counts_where_the_model_has_nothing_are_infinitely_far() -> None:
+    found = metrics.compare_histogram(np.array([7, 0]), np.array([0.0, 1.0]), np.random.default_rng(0))
+    assert (found.bc, found.bd) == (0.0, math.inf)
+    assert found.jsd == pytest.approx(math.log(2))
+
+
+def test_pieces_of_many_pixels_are_joined_in_order() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(70_000, generator=generator, dtype=torch.float64)
+    observation = signal + 0.1 * torch.randn(70_000, generator=generator, dtype=torch.float64)
+    assert torch.equal(pixel_log_prob(Wide(), signal, observation), Wide()(signal).log_prob(observation))
+    u = metrics.probability_integral_transform(Wide(), signal, observation, np.random.default_rng(0))
+    np.testing.assert_allclose(u, Wide()(signal).cdf(observation), atol=1e-12)
+
+
+def test_the_place_of_a_reading_with_mass_is_anywhere_within_its_jump() -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.5), step=1.0).double()
+    signal = torch.zeros(20_000, dtype=torch.float64)
+    u = metrics.probability_integral_transform(model, signal, signal + 1, np.random.default_rng(0))
+    below, at = normal_cdf(np.array([1.0, 3.0]))
+    assert u.min() == pytest.approx(below, abs=1e-4)
+    assert u.max() == pytest.approx(at, abs=1e-4)
+    assert metrics.kolmogorov_smirnov((u - below) / (at - below)) < 2 / math.sqrt(20_000)
+
+
+def test_relative_entropy_from_a_known_truth() -> None:
+    signal = torch.linspace(0, 1, 40_000, dtype=torch.float64)
+    truth, model = noiseflow.Gaussian(0.1).double(), noiseflow.Gaussian(0.13).double()
+    found, error = kl_divergence(truth, model, signal)
+    ratio = (0.1 / 0.13) ** 2
+    # of (z²/2)(1 − ratio) the standard deviation is (1 − ratio)/√2
+    assert error == pytest.approx((1 - ratio) / math.sqrt(2) / 200, rel=0.05)
+    assert abs(found - 0.5 * (ratio - 1 - math.log(ratio))) < 4 * error
+    assert kl_divergence(truth, truth, signal) == (0.0, 0.0)
+
+
+def test_a_row_of_the_table_holds_its_evaluation_in_percent() -> None:
+    found = metrics.evaluate(noiseflow.Gaussian(0.12), *noisy(0))
+    name, *cells = table_row("mine", found)
+    assert name == "mine"
+    assert len(cells) + 1 == len(TABLE_HEADER)
+    overall = found.overall
+    for cell, value, places in zip(
+        cells,
+        [
+            found.nll,
+            found.nll_error,
+            100 * overall.jsd,
+            100 * overall.jsd_floor,
+            100 * found.mean_jsd,
+            100 * found.mean_jsd_floor,
+            100 - 100 * overall.bc,
+            100 - 100 * overall.bc_floor,
+            100 * overall.bd,
+            100 * overall.bd_floor,
+            found.ks,
+        ],
+        [4, 4, *(8 * [3]), 4],
+        strict=True,
+    ):
+        assert float(cell) == pytest.approx(value, abs=0.51 * 10**-places)

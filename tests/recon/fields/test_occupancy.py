@@ -114,6 +114,60 @@ def test_rows_of_an_occupancy():
     assert 0 < occupancy.share < 1
 
 
+def test_coarser_occupancy_holds_whatever_the_finer_one_held():
+    rough = torch.zeros(8, 10, 12)
+    rough[5, 3, 9] = rough[0, 9, 0] = 1.0
+    occupancy = Occupancy(rough, (8, 10, 12), margin=0, block=3)
+    half = occupancy.coarser((4, 5, 6))
+    expected = torch.zeros(4, 5, 6, dtype=torch.bool)
+    expected[2, 1, 4] = expected[0, 4, 0] = True
+    assert torch.equal(half.mask.transpose(1, 2), expected)
+    assert half.block == occupancy.rows(slice(1, 3)).block == 3
+
+
+def test_rows_of_an_occupancy_can_be_tested_again():
+    """Blocks of the part are as large as its own lattice needs, and what is wanted of it stays its own."""
+    projector = SliceProjector(tilt_angles=[0.0], depth=8, width=12)
+    part = Occupancy(torch.zeros(8, 10, 12), (8, 10, 12), block=3).rows(slice(2, 7))
+    assert part.mask.shape == (8, 12, 5)
+    assert part.wanted.shape == (3, 4, 2)
+    for _ in range(20):
+        part.retest(-torch.ones(12, 5), projector, 1e-6)
+    assert part.share == 1
+
+
+def test_what_counts_as_something_is_a_fifth_of_the_scale():
+    rough = torch.zeros(6, 6, 6)
+    rough[1, 1, 1], rough[4, 4, 4] = 0.19, 0.21
+    assert Occupancy(rough, (6, 6, 6), margin=0).mask.nonzero().tolist() == [[4, 4, 4]]
+
+
+@pytest.mark.parametrize("block", [2, 3, 5])
+def test_gain_of_a_block_is_summed_over_its_voxels_and_compared_with_its_faces(block):
+    """On a lattice that no block divides, in every place: the last blocks are cut off, and have fewer voxels."""
+    shape, cost = (7, 6, 11), 0.01  # (z, y, x)
+    projector = SliceProjector(tilt_angles=[-40.0, 10.0, 55.0], depth=7, width=11)
+    gradient = torch.randn(33, 6, generator=torch.Generator().manual_seed(0))
+    found = Occupancy(torch.zeros(shape), shape, block=block).wants(gradient, projector, cost)
+    voxels = projector.backproject(gradient).view(7, 11, 6)  # (z, x, y)
+    for place in np.ndindex(*found.shape):
+        part = voxels[tuple(slice(k * block, (k + 1) * block) for k in place)]
+        assert bool(found[place]) == (float(-part.sum()) > 6 * block**2 * cost)
+    assert 0 < int(found.sum()) < found.numel()
+
+
+def test_vacuum_is_tested_in_every_tenth_step():
+    projector, occupancy = (
+        SliceProjector(tilt_angles=[0.0], depth=8, width=8),
+        Occupancy(torch.zeros(8, 8, 8), (8, 8, 8)),
+    )
+    shares = []
+    for _ in range(30):
+        occupancy.retest(-torch.ones(8, 8), projector, 1e-6)
+        shares.append(occupancy.share)
+    assert shares == [0.0] * 19 + [1.0] * 11  # wanted in the tenth, and again in the twentieth
+
+
 def test_what_the_data_wants_becomes_occupied_and_nothing_else():
     """Images of a ball that the rough volume does not show: the likelihood's gradient finds it."""
     truth = torch.zeros(16, 16, 16)

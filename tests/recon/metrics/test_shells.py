@@ -1,12 +1,13 @@
 """Fourier shells against a slow sum, frequency by frequency; structural dissimilarity slice by slice."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from recon.metrics.metrics import compare, fourier_shell_correlation
+from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, match, reach_in_words, resolution
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 8), (7, 9, 7), (11, 6)])
@@ -35,3 +36,70 @@ def test_dissimilarity_is_the_mean_over_slices_and_an_image_is_one_slice():
     slices = [structural_similarity(a, b, data_range=span, win_size=7) for a, b in zip(volume, other, strict=True)]
     assert compare(volume, other).dssim == pytest.approx((1 - np.mean(slices)) / 2)
     assert compare(volume[0], other[0]).dssim == pytest.approx(compare(volume[:1], other[:1]).dssim)
+
+
+def test_errors_are_those_of_their_definitions_in_ranges_of_the_reference():
+    reference = np.linspace(10.0, 50.0, 48).reshape(3, 4, 4)
+    found = compare(reference + 4.0, reference)
+    assert found.mse == pytest.approx(16 / 40**2)
+    assert found.psnr == pytest.approx(10 * math.log10(40**2 / 16))
+    assert compare(reference, reference).psnr == math.inf
+    assert compare(reference, reference).dssim == pytest.approx(0.0, abs=1e-12)
+    images = np.stack([reference[0], 3 * reference[0]])
+    two = compare_images(images + np.array([0.0, 4.0])[:, None, None], images, scaling="raw")
+    assert two.mse == pytest.approx(8 / np.ptp(images[1]) ** 2)
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (4, 5, 2), (1, 1)])
+def test_images_too_small_for_a_window_of_similarity_are_refused(shape):
+    image = np.arange(np.prod(shape)).reshape(shape) + 0.0 if np.prod(shape) > 1 else np.zeros(shape)
+    with pytest.raises(ValueError, match=r"at least 3 x 3 pixels|flat"):
+        compare(image, image)
+
+
+@pytest.mark.parametrize("shift", [-7.0, 100.0])
+def test_scalings_bring_a_result_to_its_reference(shift):
+    generator = np.random.default_rng(0)
+    truth, noise = generator.normal(shift, 3.0, (4, 9, 8)), generator.normal(0.0, 1.0, (4, 9, 8))
+    result = 0.2 * (truth + noise) - 5.0
+    design = np.stack([result.ravel(), np.ones(result.size)], 1)
+    fitted = design @ np.linalg.lstsq(design, truth.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(match(result, truth, scaling="affine").ravel(), fitted, rtol=1e-9)
+    ranged = match(result, truth, scaling="min-max")
+    assert (ranged.min(), ranged.max()) == pytest.approx((truth.min(), truth.max()))
+    np.testing.assert_allclose(np.diff(ranged.ravel()) / np.diff(result.ravel()), np.ptp(truth) / np.ptp(result))
+    assert match(result, truth, scaling="raw") is result
+    flat = np.full_like(truth, 3.0)
+    np.testing.assert_allclose(match(flat, truth, scaling="affine"), truth.mean())
+    np.testing.assert_allclose(match(flat, truth, scaling="min-max"), truth.min())
+
+
+@pytest.mark.parametrize(("size", "window"), [(3, 3), (4, 3), (5, 5), (6, 5), (7, 7), (30, 7)])
+def test_small_images_have_a_smaller_window_of_similarity(size, window):
+    image, other = np.random.default_rng(0).random((2, size, size))
+    span = np.ptp(other)
+    similarity = structural_similarity(image, other, data_range=span, win_size=window)
+    assert compare(image, other).dssim == pytest.approx((1 - similarity) / 2)
+
+
+def test_shells_of_equal_empty_and_opposite_arrays():
+    volume = np.random.default_rng(0).normal(size=(6, 6, 6))
+    frequency, correlation = fourier_shell_correlation(volume, -2 * volume)
+    np.testing.assert_allclose(correlation, -1.0)
+    assert frequency[-1] == 0.5
+    np.testing.assert_array_equal(fourier_shell_correlation(volume, np.zeros_like(volume))[1], 0.0)
+
+
+def test_reach_is_told_in_cycles_and_as_a_length():
+    assert reach_in_words(0.2, 0.143, None) == "stays above 0.143 up to 0.200 cycles per voxel"
+    assert reach_in_words(0.25, 0.5, 2.0).endswith("(8 Å)")
+    assert reach_in_words(0.25, 0.5, 2.5).endswith("(1 nm)")
+    assert reach_in_words(0.25, 0.5, 10.0).endswith("(4 nm)")
+    assert "(" not in reach_in_words(0.0, 0.5, 10.0)
+
+
+def test_a_curve_that_starts_below_has_no_reach_and_the_first_shell_does_not_count():
+    frequency = np.linspace(0, 0.5, 6)
+    assert resolution(frequency, np.array([0.1, 0.9, 0.9, 0.9, 0.9, 0.9]), 0.5) == 0.5
+    assert resolution(frequency, np.array([1.0, 0.4, 0.9, 0.9, 0.2, 0.9]), 0.5) == 0.0
+    assert resolution(frequency, np.array([1.0, 0.9, 0.5, 0.3, 0.9, 0.2]), 0.5) == pytest.approx(0.2)

@@ -64,6 +64,64 @@ def test_adjoint(depth, height, width, detector, offset, dtype, tolerance):
     assert abs(forward - back) < tolerance * abs(forward)
 
 
+@pytest.mark.parametrize("num_tilts", [1, 31, 32, 33, 70])
+def test_many_tilts_and_wide_slices_are_projected_as_one_by_one(num_tilts):
+    """The matrices are built from 32 tilts at a time, in panels of 32 layers."""
+    angles, offsets = np.linspace(-70, 65, num_tilts), np.linspace(-1, 2, num_tilts)
+    volume = np.random.default_rng(0).random((35, 2, 3))
+    whole = SliceProjector(
+        tilt_angles=angles, depth=35, width=3, detector_width=4, detector_offset=offsets, dtype=torch.float64
+    )
+    expected = np.concatenate(
+        [slow_projection(volume, [angle], 4, offset) for angle, offset in zip(angles, offsets, strict=True)]
+    )
+    np.testing.assert_allclose(whole(volume), expected, atol=1e-12)
+    assert (whole.num_tilts, whole.detector_width, whole.dtype) == (num_tilts, 4, torch.float64)
+
+
+@pytest.mark.parametrize("depth", [7, 12])
+def test_a_layer_projects_what_lies_in_it(depth):
+    width, detector = 10, 13
+    whole = SliceProjector(tilt_angles=ANGLES, depth=depth, width=width, detector_width=detector, dtype=torch.float64)
+    volume = np.random.default_rng(0).random((depth, 2, width))
+    layer_of = lambda distance: np.digitize(distance, [-3.1, 0.2, 1.7])  # noqa: E731
+    layers = whole.layers(layer_of)
+    z, x = np.arange(depth) - (depth - 1) / 2, np.arange(width) - (width - 1) / 2
+    for number, layer in enumerate(layers):
+        for tilt, angle in enumerate(np.deg2rad(ANGLES)):
+            inside = layer_of(z[:, None] * np.cos(angle) - x * np.sin(angle)) == number
+            expected = slow_projection(volume * inside[:, None, :], ANGLES[tilt : tilt + 1], detector)
+            np.testing.assert_allclose(layer(volume)[tilt], expected[0], atol=1e-12)
+    assert len(layers) == 4
+    assert len(whole.layers(lambda distance: np.zeros(distance.shape, int))) == 1
+
+
+@pytest.mark.parametrize(("detector", "columns"), [(17, 8), (16, 8), (15, 7)])
+def test_half_the_resolution_sees_every_second_pixel_at_half_the_scale(detector, columns):
+    angles, offsets, first = [-40.0, 10.0, 70.0], np.array([0.0, 0.7, -1.3]), np.array([0, 1, 1])
+    whole = SliceProjector(
+        tilt_angles=angles, depth=9, width=14, detector_width=detector, detector_offset=offsets, dtype=torch.float64
+    )
+    half = whole.half(5, 7, columns, first)
+    volume = np.random.default_rng(0).random((5, 2, 7))
+    for tilt, angle in enumerate(angles):
+        u = (first[tilt] + 2 * np.arange(columns) - (detector - 1) / 2 + offsets[tilt]) / 2  # in coarse voxels
+        expected = slow_projection(volume, [angle], columns, u.mean())
+        np.testing.assert_allclose(half(volume)[tilt], expected[0], atol=1e-12)
+    assert whole.half(5, 7, columns, first) is half
+    assert whole.half(5, 7, columns, 1 - first) is not half
+    assert half.dtype == torch.float64
+
+
+def test_a_part_is_the_matrix_of_some_columns():
+    whole = SliceProjector(tilt_angles=[-50.0, 20.0], depth=40, width=5, dtype=torch.float64)
+    identity = torch.eye(200, dtype=torch.float64)
+    columns = torch.tensor([3, 77, 199])
+    matrix, transposed = whole.part(columns)
+    np.testing.assert_allclose(matrix.to_dense(), whole.project(identity)[:, columns], atol=1e-15)
+    np.testing.assert_allclose(transposed.to_dense(), matrix.to_dense().T, atol=0)
+
+
 def test_gradients_of_both_directions_to_second_order():
     projector = SliceProjector(tilt_angles=[-30.0, 20.0, 70.0], depth=4, width=5, dtype=torch.float64)
     x = torch.rand(20, 2, dtype=torch.float64, requires_grad=True)
@@ -121,12 +179,20 @@ def test_native_layout_is_the_same_operator():
         ({"tilt_angles": []}, "tilt_angles"),
         ({"tilt_angles": [0.0, math.nan]}, "finite"),
         ({"tilt_angles": [0.0], "depth": 0}, "at least one"),
+        ({"tilt_angles": [0.0], "width": 0, "detector_width": 3}, "at least one"),
+        ({"tilt_angles": [0.0], "detector_width": 0}, "at least one"),
+        ({"tilt_angles": [[0.0, 1.0], [2.0, 3.0]]}, "one for each tilt"),
         ({"tilt_angles": [0.0, 1.0], "detector_offset": [1.0, 2.0, 3.0]}, "one per tilt"),
     ],
 )
 def test_wrong_geometry_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
         SliceProjector(**({"depth": 4, "width": 4} | options))
+
+
+def test_one_voxel_and_one_pixel_are_enough():
+    one = SliceProjector(tilt_angles=0.0, depth=1, width=1, detector_width=1, dtype=torch.float64)
+    assert float(one(torch.full((1, 1, 1), 3.0, dtype=torch.float64))) == pytest.approx(3.0)
 
 
 def test_wrong_shape_is_refused():

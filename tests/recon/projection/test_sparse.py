@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.projection.sparse import PanelledMatrix
+from recon.projection.sparse import PanelledMatrix, build_panelled, index_type
 
 
 def example(panel: int, shape: tuple[int, int] = (30, 50)) -> tuple[PanelledMatrix, torch.Tensor]:
@@ -40,3 +40,29 @@ def test_entries_and_rows_are_those_of_the_whole() -> None:
 def test_a_factor_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="49 rows do not match the matrix's 50 columns"):
         example(7)[0] @ torch.zeros(49, 2, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("panels", [(7, 5), (50, 30), (8, 64), (1, 1)])
+def test_a_matrix_built_from_groups_of_rows_is_that_of_all_entries(panels: tuple[int, int]) -> None:
+    _, dense = example(50)
+    rows, columns = np.nonzero(dense.numpy())
+    groups = (
+        (rows[here] - start, columns[here], dense.numpy()[rows[here], columns[here]])
+        for start in range(0, 30, panels[1])
+        for here in [(rows >= start) & (rows < start + panels[1])]
+    )
+    matrix, transposed = build_panelled(groups, (30, 50), panels=panels, dtype=torch.float64)
+    torch.testing.assert_close(matrix @ torch.eye(50, dtype=torch.float64), dense)
+    torch.testing.assert_close(transposed @ torch.eye(30, dtype=torch.float64), dense.T)
+    assert [panel.shape[1] for panel in matrix.panels][:-1] == [panels[0]] * (len(matrix.panels) - 1)
+    assert sum(panel.shape[1] for panel in matrix.panels) == 50
+    assert len(transposed.panels) == -(-30 // panels[1])
+    single, _ = build_panelled(
+        iter([(rows, columns, dense.numpy()[rows, columns])]), (30, 50), panels=(50, 30), dtype=torch.float32
+    )
+    assert single.panels[0].dtype == torch.float32
+
+
+def test_indices_are_wide_where_counts_are() -> None:
+    assert index_type(5, 2**31 - 1) is np.int32
+    assert index_type(2**31, 3) is np.int64

@@ -1,0 +1,145 @@
+"""Changes that no test can notice, or that change nothing but speed, by file: part of a line, what of it changes, and why.
+
+What changes is the text of the operator or number, or ``numbers``: each number of the line.
+"""
+
+from __future__ import annotations
+
+SPEED = "how much is computed at once: speed and memory only"
+GUESS = "where a search begins: the maximum found is the same (test_log_posterior), only the number of steps differs"
+FINER = (
+    "how fine a rule is that has long converged: the result is the same to more digits than any test or user asks for"
+)
+SAFE = "stands in where the value is not used, so that a gradient of nothing is not NaN: any ordinary number would do"
+BOTH = "where one formula takes over from another: both are exact there (tested on both sides)"
+RNG = "seed of the package's own random choices: another seed is another, equally good choice"
+
+LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
+    "noiseflow/distributions/transforms.py": [
+        ("small = t < 1e-3", "numbers", BOTH),
+        ("small = t < 1e-3", "t < 0.001", BOTH),
+        ("clamp(max=80.0)", "numbers", "beyond exp(80) only that it stays finite counts"),
+        ("torch.where(x < 0, self.left, self.right)", "x < 0", "at 0 the map is 0 with slope 1 whatever the weight"),
+        ("torch.where(y < 0, self.left, self.right)", "y < 0", "at 0 the map is 0 with slope 1 whatever the weight"),
+        ("torch.where(q > 0,", "q > 0", "at q = 0 both forms are the same number"),
+        (
+            "side = torch.where(value < low",
+            "value < low",
+            "at the end of the knots nothing lies beyond: the slope is not used",
+        ),
+    ],
+    "noiseflow/distributions/normal.py": [
+        ("limit: float = 12.0, count: int = 401", "numbers", FINER),
+        ("flip = low > -high", "low > -high", "an interval symmetric about zero is its own mirror image"),
+        ("narrow = width * (1 + middle.abs()) < 0.1", "numbers", BOTH),
+        ("narrow = width * (1 + middle.abs()) < 0.1", "width * (1 + middle.abs()) < 0.1", BOTH),
+        ("torch.where(narrow, width, zero + 1)", "zero + 1", SAFE),
+        ("torch.where(narrow, width, zero + 1)", "1", SAFE),
+        ("zero - k, end) for k, end in", "numbers", SAFE),
+        ("zero - k, end) for k, end in", "zero - k", SAFE),
+        ("-torch.ones_like(low) - high.detach().abs(), low)", "-torch.ones_like(low)", SAFE),
+        ("-torch.ones_like(low) - high.detach().abs(), low)", "-torch.ones_like(low) - high.detach().abs()", SAFE),
+        ("unbounded | (ratio >= 0), -torch", "ratio >= 0", "a ratio of 0 is that of an empty interval"),
+        ("return torch.where(x <= 0, left, right)", "x <= 0", "at 0 both forms are the same number"),
+        ("far = x < -1e4", "numbers", BOTH),
+        ("far = x < -1e4", "x < -10000.0", BOTH),
+        ("torch.where(far, x, -torch.ones_like(x))", "-torch.ones_like(x)", SAFE),
+        ("torch.where(high <= 0, left", "high <= 0", "at 0 both forms are the same number"),
+    ],
+    "noiseflow/distributions/law.py": [
+        ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
+        ("num_steps: int = 60", "numbers", FINER),
+        ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
+    ],
+    "noiseflow/distributions/digitised.py": [
+        ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
+        ("_ROUNDINGS = 8", "numbers", "slack for rounding errors, of which one or two occur"),
+        ("_MOST_LEVELS = 2**16", "numbers", SPEED),
+        ("< 1e-3  # a level itself", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        (
+            "(steps - nearest).abs() < 1e-3",
+            "(steps - nearest).abs() < 0.001",
+            "no level is off by exactly a thousandth",
+        ),
+        ("self.high - 1e-3 * self.step", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        ("math.ceil(steps - 1e-3)", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        ("for q in (1e-13, 1 - 1e-13)", "1e-13", FINER),
+        ("math.isfinite(edge) else 0.0", "numbers", SAFE),
+        ("value.numel() else 0.0", "numbers", "of no values, none is moved"),
+        (
+            "* _SHARE_OF_STEP <= self.step",
+            "torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step",
+            "from where on double precision is taken: both are exact there",
+        ),
+    ],
+    "noiseflow/fitting/observation_table.py": [
+        ("_MAX_LEVELS = 1024", "numbers", "both kinds of table keep the stated error"),
+        ("_CHUNK = 2**18", "numbers", SPEED),
+        ("_CHUNK = 2**18", "2 ** 18", SPEED),
+        ("_WORTHWHILE = 0.7", "numbers", SPEED),
+        ("stalled = size %", "numbers", SPEED),
+        ("stalled = size %", "size % len(SIZES) > 0", SPEED),
+        ("stalled = size %", "self.error > _WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
+        ("stalled = size %", "_WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
+        ("signal_low + 1e-6 * (1 + abs(signal_low))", "numbers", "only that a range of one signal has some width"),
+        ("// 65536", "numbers", SPEED),
+        ("count: int = 1024", "numbers", FINER),
+        ("manual_seed(0)", "numbers", RNG),
+        ("clamp(1e-7, 1 - 1e-7)", "numbers", "keeps a logarithm finite for draws that one in ten million is"),
+        ("nan=-1e30", "numbers", "less than any log-likelihood"),
+        ("torch.linspace(self.low, self.high, 64", "numbers", FINER),
+        ("self._observation, self._tolerance, self._size = ", "numbers", "set again before it is used"),
+    ],
+    "noiseflow/models/digitised.py": [
+        ("_LEAST_KEPT, _RAILED = 256, 0.02", "numbers", "where a fit begins; it goes on from there"),
+        ("torch.tensor_split(torch.argsort(signal), 64)", "numbers", "where a fit begins; it goes on from there"),
+        ("max(_LEAST_KEPT, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
+    ],
+    "noiseflow/metrics/evaluation.py": [
+        ("_CHUNK = 65536", "numbers", SPEED),
+        ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
+        ("_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192", "numbers", SPEED),
+        ("_SHIFT_WITHIN_GROUP = 1 / 16", "numbers", FINER),
+        ("low + 1e-12", "numbers", "only that bins of equal residuals have some width"),
+        ("seed: int = 0", "numbers", RNG),
+        ("np.random.default_rng(0)", "numbers", RNG),
+    ],
+    "recon/projection/projector.py": [
+        ("_PANEL = 32", "numbers", SPEED),
+        (
+            "abs(cosine) >= abs(sine)",
+            "abs(cosine) >= abs(sine)",
+            "at 45° rounding decides already which of the two sums it is",
+        ),
+        ("(share > 0)", "share > 0", "entries of weight 0 change no sum"),
+    ],
+    "recon/projection/sparse.py": [("_WIDEST = 256", "numbers", SPEED)],
+    "recon/metrics/metrics.py": [
+        ("/ power if power > 0 else 0.0", "0.0", "a flat result minus its mean is zero, whatever the gain"),
+        (
+            "/ (high - low) if high > low else 0.0",
+            "0.0",
+            "a flat result minus its least value is zero, whatever the gain",
+        ),
+    ],
+    "recon/fields/occupancy.py": [
+        ("Occupancy(torch.zeros(1, 1, 1)", "numbers", "an empty volume of any size; its mask is replaced"),
+    ],
+    "calibration/detector/log_posterior.py": [
+        ("NUM_RESCALINGS = 6", "numbers", "rounds at most; two suffice"),
+        ("np.where(inside[:, None], coordinates, 0.0)", "numbers", "rows outside the priors are not evaluated"),
+        ("if moved < 1e-4", "numbers", "changes of a scale so small move nothing"),
+        ("if moved < 1e-4", "moved < 0.0001", "changes of a scale so small move nothing"),
+        ("default=0.0", "numbers", "of no scales: below the threshold or not, the same posterior is returned"),
+        ("along_offset = 0.3 *", "numbers", GUESS),
+        ("along_offset = 0.3 *", "0.3 * float(np.exp(start[0]))", GUESS),
+        ("simplex = np.vstack", "numbers", GUESS),
+        ("simplex = np.vstack", "start + np.diag([0.03, along_offset, 0.2])", GUESS),
+        ('"xatol": 1e-4, "fatol": 1e-2, "maxiter": 400', "numbers", FINER),
+        ("1e-3 * line.gain**2", "numbers", GUESS),
+        ("for factor in (0.5, 0.7, 0.85", "numbers", GUESS),
+        ("for fraction in (0.02, 0.1, 0.3", "numbers", GUESS),
+        ("low + 0.1, high - 0.1", "numbers", GUESS),
+        ("np.array_split(coordinates, 7)", "numbers", SPEED),
+    ],
+}

@@ -1,0 +1,215 @@
+"""Rounded and clipped observations against the plain sum over what is rounded to each level."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+import noiseflow
+from noiseflow.distributions.digitised import DigitisedDistribution
+
+WIDTH = 0.31
+SIGNALS = torch.tensor([-0.2, 0.13, 0.5, 1.4], dtype=torch.float64)
+CONVERTERS = {
+    "rounded": (0.25, -math.inf, math.inf),
+    "rounded and clipped": (0.25, 0.0, 1.0),
+    "clipped below": (0.25, 0.1, math.inf),
+    "clipped above, between two levels": (0.25, -math.inf, 0.9),
+    "clipped on both sides, above between two levels": (0.25, 0.1, 1.0),
+    "one level between the limits": (0.5, 0.0, 0.5),
+}
+
+
+def made(step: float, low: float, high: float) -> DigitisedDistribution:
+    return noiseflow.Digitised(noiseflow.Gaussian(WIDTH).double(), step, low, high)(SIGNALS)
+
+
+def by_hand(value: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
+    """Rounding to whole steps from the low limit, or from zero where there is none, then clipping."""
+    origin = low if math.isfinite(low) else 0.0
+    return np.clip(np.round((value - origin) / step) * step + origin, low, high)
+
+
+def summed(converter: tuple[float, float, float], signal: float) -> dict[float, float]:
+    """Mass of every level, from a very fine sum over what is rounded to it."""
+    fine = np.linspace(-8, 8, 1_600_001)
+    mass = np.diff(torch.special.ndtr(torch.from_numpy(fine)).numpy())
+    levels = np.round(by_hand(signal + WIDTH * (fine[1:] + fine[:-1]) / 2, *converter), 9)
+    found, index = np.unique(levels, return_inverse=True)
+    return dict(zip(found.tolist(), np.bincount(index, mass).tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", CONVERTERS)
+def test_masses_and_their_sums_are_those_of_what_is_rounded_to_a_level(name: str) -> None:
+    law = made(*CONVERTERS[name])
+    for pixel, signal in enumerate(SIGNALS.tolist()):
+        masses = summed(CONVERTERS[name], signal)
+        levels = torch.tensor(list(masses), dtype=torch.float64)[:, None].expand(-1, 4)
+        expected = torch.tensor(list(masses.values()), dtype=torch.float64)
+        likely = expected > 1e-12
+
+        def of(found: Tensor, pixel: int = pixel) -> Tensor:
+            return found[:, pixel]
+
+        close = {"rtol": 1e-4, "atol": 2e-5}  # of the fine sum, whose cells straddle the edges
+        assert_close(of(law.log_prob(levels)).exp(), expected, **close)
+        assert_close(of(law.cdf(levels)), expected.cumsum(0), **close)
+        assert_close(of(law.cdf_below(levels)), expected.cumsum(0) - expected, **close)
+        assert_close(of(law.cdf(levels + 0.01)), expected.cumsum(0), **close)
+        assert_close(of(law.cdf_below(levels + 0.01)), expected.cumsum(0), **close)
+        assert_close(of(law.cdf(levels - 0.01)), expected.cumsum(0) - expected, **close)
+        pairs = law.log_interval_prob(levels[:-1], levels[1:]).exp()
+        assert_close(of(pairs), expected[1:], **close)
+        middle = (expected.cumsum(0) - expected / 2).clamp(0, 1)[:, None].expand(-1, 4)
+        found = of(law.icdf(middle))
+        assert_close(found[likely], levels[:, 0][likely])
+        mean = float((expected * levels[:, 0]).sum())
+        assert float(law.mean[pixel]) == pytest.approx(mean, abs=1e-5)
+        assert float(law.variance[pixel]) == pytest.approx(
+            float((expected * (levels[:, 0] - mean) ** 2).sum()), abs=1e-5
+        )
+        entropy = -float((expected[likely] * expected[likely].log()).sum())
+        assert float(law.entropy()[pixel]) == pytest.approx(entropy, abs=1e-4)
+        assert float(law.mode[pixel]) == pytest.approx(max(masses, key=masses.__getitem__))
+
+
+@pytest.mark.parametrize("name", CONVERTERS)
+def test_digitising_is_rounding_and_then_clipping(name: str) -> None:
+    values = torch.linspace(-3, 3, 997, dtype=torch.float64)
+    law = made(*CONVERTERS[name])
+    np.testing.assert_allclose(law.digitise(values), by_hand(values.numpy(), *CONVERTERS[name]), atol=1e-12)
+    drawn = law.sample((5,), generator=torch.Generator().manual_seed(0))
+    plain = law.base.sample((5,), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(drawn, law.digitise(plain))
+    assert bool(law.support.check(drawn).all())
+    assert not bool(law.support.check(drawn + 0.05).any())
+    _, low, high = CONVERTERS[name]
+    assert [float(end) for end in law.limits] == [low, high]
+    assert law.discrete
+    assert not law.has_rsample
+
+
+@pytest.mark.parametrize("name", CONVERTERS)
+def test_edges_are_where_the_limits_begin(name: str) -> None:
+    law = made(*CONVERTERS[name])
+    _, low, high = CONVERTERS[name]
+    below, above = law.edges
+    for edge, limit, side in ((below, low, -1), (above, high, 1)):
+        if math.isfinite(limit):
+            near = torch.tensor([edge + side * 1e-6, edge - side * 1e-6], dtype=torch.float64)
+            assert (law.digitise(near) == limit).tolist() == [True, False]
+        else:
+            assert edge == limit
+
+
+@pytest.mark.parametrize("name", [name for name in CONVERTERS if CONVERTERS[name][1] > -1 or CONVERTERS[name][2] < 9])
+def test_nothing_lies_beyond_a_limit_by_more_than_half_a_step(name: str) -> None:
+    step, low, high = CONVERTERS[name]
+    law = made(step, low, high)
+    for limit, side in ((low, -1), (high, 1)):
+        if math.isfinite(limit):
+            at = law.log_prob(torch.full((4,), limit, dtype=torch.float64))
+            assert_close(law.log_prob(torch.full((4,), limit + side * 0.49 * step, dtype=torch.float64)), at)
+            assert torch.isneginf(law.log_prob(torch.full((4,), limit + side * 0.51 * step, dtype=torch.float64))).all()
+            assert law.cdf(torch.full((4,), high, dtype=torch.float64)).tolist() == [1.0] * 4
+            assert law.cdf_below(torch.full((4,), low, dtype=torch.float64)).tolist() == [0.0] * 4
+            assert law.cdf(torch.full((4,), low - 0.2, dtype=torch.float64)).tolist() == [0.0] * 4
+            assert law.cdf_below(torch.full((4,), high + 0.2, dtype=torch.float64)).tolist() == [1.0] * 4
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.0, math.inf), (-math.inf, 0.9)])
+@pytest.mark.parametrize("shape", [(4,), (3, 4)])
+def test_clipping_alone_keeps_the_density_between_the_limits(low: float, high: float, shape: tuple[int, ...]) -> None:
+    law, normal = made(0.0, low, high), torch.distributions.Normal(SIGNALS, WIDTH)
+    inside = torch.full(shape, 0.4, dtype=torch.float64)
+    assert_close(law.log_prob(inside), normal.log_prob(inside))
+    assert law.edges == (low, high)
+    if math.isfinite(low):
+        at = torch.full(shape, low, dtype=torch.float64)
+        assert_close(law.log_prob(at).exp(), normal.cdf(at))
+        assert torch.isneginf(law.log_prob(at - 1e-6)).all()
+        assert_close(law.log_prob(at + 1e-6), normal.log_prob(at + 1e-6))
+        assert_close(law.cdf(at), normal.cdf(at))
+        assert law.cdf_below(at).abs().max() == 0
+    if math.isfinite(high):
+        at = torch.full(shape, high, dtype=torch.float64)
+        assert_close(law.log_prob(at).exp(), 1 - normal.cdf(at))
+        assert torch.isneginf(law.log_prob(at + 1e-6)).all()
+        assert_close(law.cdf(at), torch.ones_like(at))
+        assert_close(law.cdf_below(at), normal.cdf(at))
+    assert not law.discrete
+    assert law.has_rsample
+    draws = law.rsample((50_000,), generator=torch.Generator().manual_seed(0))
+    assert_close(law.mean, draws.mean(0), atol=5e-3, rtol=0)
+    assert_close(law.variance, draws.var(0), atol=5e-3, rtol=0)
+    assert bool(((draws >= low) & (draws <= high)).all())
+    assert bool(law.support.check(draws).all())
+
+
+def test_a_clipped_draw_moves_with_the_signal_unless_it_is_clipped() -> None:
+    signal = SIGNALS.clone().requires_grad_()
+    law = noiseflow.Digitised(noiseflow.Gaussian(WIDTH).double(), 0.0, 0.0, 1.0)(signal)
+    drawn = law.rsample((30,), generator=torch.Generator().manual_seed(0))
+    (slope,) = torch.autograd.grad(drawn.sum(), signal)
+    assert_close(slope, ((drawn > 0) & (drawn < 1)).sum(0).double())
+
+
+def test_single_precision_does_not_move_the_edges_of_cells() -> None:
+    """Readings of a million by steps of a half: in single precision an edge between two would be off by a quarter step."""
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.8), 0.5)
+    signal = torch.tensor([4_000_000.0, 8_000_000.5])
+    for step in (-0.5, 0.0, 1.5):
+        found = model(signal).log_prob(signal + step)
+        exact = model.double()(signal.double()).log_prob(signal.double() + step)
+        model.float()
+        assert_close(found.double(), exact, atol=1e-4, rtol=0)
+        assert found.dtype == torch.float32
+
+
+@pytest.mark.parametrize("step", [0.0, 0.1])
+def test_limits_that_single_precision_rounds_are_limits_still(step: float) -> None:
+    signal = SIGNALS.float()
+    law = noiseflow.Digitised(noiseflow.Gaussian(WIDTH), step, 0.1, 0.7)(signal)
+    normal = torch.distributions.Normal(signal, WIDTH)
+    below, above = normal.cdf(torch.tensor(0.1 + step / 2)), 1 - normal.cdf(torch.tensor(0.7 - step / 2))
+    for limit, mass in ((0.1, below), (0.7, above)):
+        for nudge in (0.0, 1e-8 if limit == 0.1 else -1e-8):
+            reading = torch.full((4,), limit + nudge, dtype=torch.float32)
+            assert_close(law.log_prob(reading).exp(), mass, rtol=1e-4, atol=1e-6)
+
+
+def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up() -> None:
+    law = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-4)(SIGNALS)
+    with pytest.raises(ValueError, match="likely levels"):
+        law.quadrature()
+    few = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-3)(SIGNALS[:1])
+    nodes, weights = few.quadrature()
+    assert_close(weights.sum(0), torch.ones(1, dtype=torch.float64), atol=1e-12, rtol=0)
+    assert float(nodes.min()) == pytest.approx(-0.2 - 7.35, abs=0.02)  # quantiles of 1e-13
+
+
+def test_a_rescaled_converter_digitises_what_is_rescaled() -> None:
+    law = made(0.25, 0.0, 1.0)
+    found = law.rescaled(torch.tensor(2.0).double(), torch.tensor(0.1).double())
+    expected = DigitisedDistribution(
+        noiseflow.Digitised(noiseflow.Gaussian(1.0), 0.25, 0.0, 1.0),
+        torch.distributions.Normal(2 * SIGNALS + 0.1, 2 * WIDTH),
+    )
+    levels = (torch.arange(5, dtype=torch.float64) / 4)[:, None].expand(-1, 4)
+    assert_close(found.log_prob(levels), expected.log_prob(levels))
+
+
+def test_only_a_module_and_its_signal_may_be_looked_up_in_tables() -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(WIDTH).double(), 0.25, 0.0, 1.0)
+    assert model(SIGNALS).source == (model, SIGNALS)
+    assert DigitisedDistribution(model, model(SIGNALS).base).source is None
+
+    class Plain:
+        step, low, high = 0.25, 0.0, 1.0
+
+    assert DigitisedDistribution(Plain(), model(SIGNALS).base, SIGNALS).source is None

@@ -1,0 +1,81 @@
+"""A detector that rounds and clips in front of a model: what it keeps for fits, where it starts, what describes it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import noiseflow
+
+LEVELS = torch.arange(-2, 19, dtype=torch.float64) / 16
+
+
+def detector() -> noiseflow.PhysicsFlow:
+    return noiseflow.PhysicsFlow(detector=noiseflow.PoissonGaussian(0.05, -0.02, 0.9)).double()
+
+
+@pytest.mark.parametrize("step", [1 / 16, 0.0])
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (0.0, math.inf), (-math.inf, 1.0), (0.0, 0.97), (-math.inf, math.inf)]
+)
+def test_what_a_fit_keeps_of_the_likelihood_is_the_likelihood(step: float, low: float, high: float) -> None:
+    model = noiseflow.Digitised(detector(), step, low, high)
+    reading = LEVELS.clamp(low, high)
+    signal = torch.linspace(0.05, 0.95, len(reading), dtype=torch.float64)
+    kept = model.fixed_part(signal, reading)
+    assert kept is not None
+    expected = model(signal).log_prob(reading)
+    assert torch.isfinite(expected).all()
+    assert torch.allclose(model.log_prob_from(signal, kept), expected, rtol=1e-9)
+    assert noiseflow.Digitised(noiseflow.RadialFlow(2), step, low, high).fixed_part(signal, reading) is None
+
+
+def test_settings_of_a_detector() -> None:
+    plain = noiseflow.Digitised(noiseflow.Gaussian(0.1))
+    assert (plain.step, plain.low, plain.high) == (1.0, -math.inf, math.inf)
+    assert plain.config() == {"step": 1.0}
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.1), 0.5, -1.0, 3.0)
+    assert model.config() == {"step": 0.5, "low": -1.0, "high": 3.0}
+    free = model.without_rails()
+    assert (free.step, free.low, free.high, free.model is model.model) == (0.5, -math.inf, math.inf, True)
+    assert noiseflow.Digitised(noiseflow.Gaussian(), 0.0).step == 0
+    for wrong in ((-0.1, 0.0, 1.0), (0.5, 1.0, 1.0)):
+        with pytest.raises(ValueError, match=r"step is|low is"):
+            noiseflow.Digitised(noiseflow.Gaussian(), *wrong)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_groups_of_pixels_that_a_limit_clips_are_left_out_or_mirrored(sign: float) -> None:
+    """Signals up to the limit, of width 0.1: near it half of the readings are clipped, far from it none."""
+    generator = torch.Generator().manual_seed(0)
+    signal = sign * torch.linspace(0.0, 1.5, 64_000)
+    observation = signal + 0.1 * torch.randn(signal.shape, generator=generator)
+    low, high = (-math.inf, 1.0) if sign > 0 else (-1.0, math.inf)
+    model = noiseflow.Digitised(noiseflow.Gaussian(), 0.0, low, high)
+    clipped = observation.clamp(low, high)
+    kept, seen = model._before_rails(signal, clipped, mirror=False)
+    reach = sign * signal
+    # at 2.05 standard deviations from the limit 2 % are clipped
+    assert float(kept[reach < 0.76].float().mean()) == 1.0
+    assert not kept[reach > 0.83].any()
+    assert torch.equal(seen, clipped)
+    kept, seen = model._before_rails(signal, clipped, mirror=True)
+    assert bool(kept[reach < 0.76].all())
+    near = (reach > 0.85) & (reach < 0.98)
+    free = sign * (clipped - signal) < 0
+    assert torch.equal(kept[near], free[near])
+    assert not kept[reach > 1.03].any()
+    spread = (seen - signal)[near & kept]
+    assert float(spread.std()) == pytest.approx(0.1, rel=0.05)
+    assert float(spread.mean()) == pytest.approx(0.0, abs=0.005)
+
+
+@pytest.mark.parametrize("pixels", [100, 40_000])
+def test_where_too_little_is_left_unclipped_all_of_it_counts(pixels: int) -> None:
+    signal = torch.full((pixels,), 0.99) + torch.linspace(0, 1e-3, pixels)
+    observation = (signal + 0.1 * torch.randn(pixels, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+    model = noiseflow.Digitised(noiseflow.Gaussian(), 0.0, 0.0, 1.0)
+    model.standardise(signal, observation)
+    assert float(model.model.log_scale.detach().exp()) == pytest.approx(float((observation - signal).std()), rel=0.5)
