@@ -103,6 +103,7 @@ class Targets:
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
             | ({"uncertainty": bars} if bars else {})
+            | {"slices_at_once": outcome.slices_at_once}
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
