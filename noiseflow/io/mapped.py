@@ -56,9 +56,11 @@ def temporary_map(
         return np.memmap(file, dtype, "r+", shape=tuple(shape))
 
 
-def mapped_copy(sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any) -> NDArray[Any]:
-    """Sections, one after the other, in a temporary file. Raises as `temporary_map`."""
-    result = temporary_map(shape, dtype)
+def mapped_copy(
+    sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any, *, in_memory: int = 0
+) -> NDArray[Any]:
+    """Sections, one after the other, in a temporary file. Arguments and errors as of `temporary_map`."""
+    result = temporary_map(shape, dtype, in_memory=in_memory)
     for target, section in zip(result, sections, strict=True):
         target[...] = section
     return result

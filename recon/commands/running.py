@@ -136,20 +136,21 @@ def memory_line(
 
 
 def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
-    """Slices of a block, where the whole volume does not fit into memory or workers share it; else None.
+    """Slices of a block, where the whole volume is large, does not fit into memory, or workers share it; else None.
 
     Raises:
         MemoryError: not even a few slices fit.
     """
     from recon.methods import find_method
-    from recon.scale.memory import available_memory, choose_slices
+    from recon.scale.memory import PLENTY, available_memory, choose_slices
 
     found, available = find_method(method), available_memory(device)
     if found.blockwise is None:
         return None
     if available is None:
         return None if workers is None else -(-grid.height // workers)
-    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1)
+    plenty = PLENTY if str(device).startswith("cpu") else available  # blocks on a GPU are not measured
+    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1, plenty=plenty)
 
 
 def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int) -> str:

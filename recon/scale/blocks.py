@@ -30,7 +30,7 @@ HALO = 8
 """Slices on either side of a block that a fit sees too, so that the regulariser sees across the border."""
 
 _FADE = 4  # slices on either side of a border; the outer half of the halo feels where its block ends
-SETTLED_ON = 32
+SETTLED_ON = 48
 """Slices on which what all blocks share is settled."""
 
 
