@@ -237,6 +237,7 @@ def reconstruct(
                 halves=halves,
                 reference=truth,
                 warned=warned,
+                filled=None if slices_at_once is None else scratch,
             )
         journal.discard()
     if strict and verdict.grade == "bad":

@@ -18,6 +18,7 @@ import typer
 from noiseflow.commands.console import START_AGAIN, end_stopped
 from noiseflow.described import printable
 from noiseflow.io import locked, partial_folder
+from noiseflow.io.mapped import is_filled_by_parts
 
 if TYPE_CHECKING:
     from noiseflow.commands.console import Output
@@ -166,9 +167,10 @@ def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int) ->
 
 @contextlib.contextmanager
 def scratch_beside(out: Path) -> Iterator[Path]:
-    """A name for a file beside `out`, gone at the end; what a killed run left is cleared by the next one."""
+    """A name for a volume beside `out`, gone at the end if it did not take its place; what a killed run left is cleared by the
+    next one."""
     with partial_folder(out) as folder:
-        yield folder / "blocks.npy"
+        yield folder / f"blocks{out.suffix if is_filled_by_parts(out) else '.npy'}"
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:

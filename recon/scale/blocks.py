@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import atomic_path
-from noiseflow.io.mapped import create_volume, finish_volume, temporary_map
+from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_map
 from noiseflow.io.numpy_files import write as write_npy
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -132,6 +132,7 @@ def assemble(
             if number and fade:
                 _fade_in(target, found, part, fade)
             target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
+            let_go(target)
     finish_volume(scratch, volume)
     return Volume(volume, size), projections
 
