@@ -74,6 +74,11 @@ def _from_numpy(array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.require(array, kind, ["C", "W"]))
 
 
+def strided(array: NDArray[Any], most: int) -> NDArray[Any]:
+    """Every n-th element along each axis, at most so many along each: enough to see limits of grey in a large array."""
+    return array[tuple(slice(None, None, -(-size // most)) for size in array.shape)]
+
+
 def unmasked(*arrays: Any) -> tuple[list[Any], Tensor | None]:
     """The arrays without their masks, and which values no masked array masks, (N,) boolean; None where none is masked."""
     masks = [np.ma.getmaskarray(each).reshape(-1) for each in arrays if np.ma.is_masked(each)]

@@ -37,6 +37,7 @@ class Reconstruction:
         choices: what was chosen or estimated, by name, for a table.
         likelihood: the noise model under which the volume was fitted, where `noise_model` only describes what the fit left.
         uncertainty: error bars of the volume, where they were asked for.
+        slices_at_once: slices of a block, at most; None where the volume was reconstructed whole.
     """
 
     volume: Volume
@@ -49,6 +50,7 @@ class Reconstruction:
     choices: dict[str, float | str] = field(default_factory=dict)
     likelihood: nn.Module | None = None
     uncertainty: Uncertainty | None = None
+    slices_at_once: int | None = None
 
     @property
     def weight(self) -> float:

@@ -136,8 +136,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     with partial_folder(path) as folder:
         partial = folder / Path(path).name
         yield partial
-        partial.chmod(0o666 & ~_umask())
-        partial.replace(link_target(path))
+        put_in_place(partial, path)
+
+
+def put_in_place(partial: Path, path: str | Path) -> None:
+    """Rename a whole file that lies in a temporary folder beside an output onto it, or onto a link's target."""
+    partial.chmod(0o666 & ~_umask())
+    partial.replace(link_target(path))
 
 
 @contextlib.contextmanager

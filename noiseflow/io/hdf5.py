@@ -9,17 +9,19 @@ import numpy as np
 
 from noiseflow.io.checks import require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_degrees, recorded_angles
 from noiseflow.io.microscope import choose_member
 from noiseflow.io.units import in_angstrom
 
 
-def read(path: Path, member: str | None = None) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read an image, stack or volume; tilt angles come from ``theta``, ``rotation_angle`` and the like.
 
     Args:
         path: the file.
         member: the dataset's full name, such as ``/exchange/data``.
+        mapped: read a large array section by section into a temporary file.
     """
     import h5py
 
@@ -31,14 +33,17 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         names = [name for name, item in found.items() if item.ndim in (2, 3) and item.dtype.kind in "iufc"]
         dataset = found[names[choose_member(names, [found[name].shape for name in names], member)]]
         require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
-        data = np.asarray(dataset)
+        native = dataset.dtype.newbyteorder("=")
+        data = (
+            mapped_copy(dataset, dataset.shape, native, in_memory=IN_MEMORY) if mapped else np.asarray(dataset, native)
+        )
         lists = [(name, item) for name, item in found.items() if item.ndim == 1 and item.shape == (len(data),)]
         angles = recorded_angles(
             ((name, list(np.asarray(item, float) * _unit(item))) for name, item in lists if item.dtype.kind in "iuf"),
             len(data),
         )
         voxel_size = _voxel_size(dataset)
-    return ImageFile(data.astype(data.dtype.newbyteorder("="), copy=False), voxel_size, angles)
+    return ImageFile(data, voxel_size, angles)
 
 
 def _unit(dataset: Any) -> float:

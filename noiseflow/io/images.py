@@ -40,7 +40,8 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
         path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, one grey ``.png`` image, or a folder
             of single images of the other formats; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5.
             Of a file that holds several images, ``FILE::NAME`` names one.
-        mapped: leave the pixels of an MRC or ``.npy`` file on the disk until they are used; changes to them stay in memory.
+        mapped: leave the pixels on the disk until they are used; changes to them stay out of the file. Large stacks that do not
+            lie there as they are (compressed TIFF, HDF5, OME-Zarr) are read piece by piece into a temporary file.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -128,7 +129,7 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix in MICROSCOPE_SUFFIXES:
         return partial(microscope.read, member=member)
     if suffix in HDF5_SUFFIXES:
-        return partial(hdf5.read, member=member)
+        return partial(hdf5.read, member=member, mapped=mapped)
     if suffix == ".npz":
         return partial(numpy_files.read_npz, member=member)
     if suffix in _NO_IMAGES:
@@ -142,10 +143,10 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
     if suffix in TIFF_SUFFIXES:
-        return tiff.read
+        return partial(tiff.read, mapped=mapped)
     if suffix == PNG_SUFFIX:
         return png.read
-    return ome_zarr.read if suffix == ".zarr" else partial(numpy_files.read_npy, mapped=mapped)
+    return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
 
 
 def _checked(image: ImageFile, path: Path) -> ImageFile:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import mmap
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -21,7 +23,8 @@ IN_MEMORY = 2**28
 def is_large(path: str | Path) -> bool:
     """Whether a file is better left on the disk."""
     file = Path(str(path).partition("::")[0])
-    return file.is_file() and file.stat().st_size > IN_MEMORY
+    parts = file.rglob("*") if file.suffix.lower() == ".zarr" else [file]
+    return sum(part.stat().st_size for part in parts if part.is_file()) > IN_MEMORY
 
 
 def is_mapped(array: NDArray[Any]) -> bool:
@@ -32,6 +35,16 @@ def is_mapped(array: NDArray[Any]) -> bool:
             return True
         base = getattr(base, "base", None)
     return False
+
+
+def let_go(array: NDArray[Any]) -> None:
+    """Give back the memory of pages of a file that were read or written; they stay in the file. Not for maps whose changes never
+    reach their file: they would be lost."""
+    base: Any = array
+    while base is not None and not isinstance(base, mmap.mmap):
+        base = getattr(base, "base", None)
+    if base is not None and hasattr(base, "madvise"):
+        base.madvise(mmap.MADV_DONTNEED)
 
 
 def temporary_map(
@@ -56,12 +69,19 @@ def temporary_map(
         return np.memmap(file, dtype, "r+", shape=tuple(shape))
 
 
-def mapped_copy(sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any) -> NDArray[Any]:
-    """Sections, one after the other, in a temporary file. Raises as `temporary_map`."""
-    result = temporary_map(shape, dtype)
+def mapped_copy(
+    sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any, *, in_memory: int = 0
+) -> NDArray[Any]:
+    """Sections, one after the other, in a temporary file. Arguments and errors as of `temporary_map`."""
+    result = temporary_map(shape, dtype, in_memory=in_memory)
     for target, section in zip(result, sections, strict=True):
         target[...] = section
     return result
+
+
+def is_filled_by_parts(path: Path) -> bool:
+    """Whether `create_volume` makes files of this suffix."""
+    return path.suffix.lower() in MRC_SUFFIXES | {".npy"}
 
 
 def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | None = None) -> NDArray[np.float32]:
@@ -103,8 +123,14 @@ def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
         return
     import mrcfile
 
-    total = sum(float(part.sum(dtype=np.float64)) for part in volume) / volume.size
-    squares = sum(float(np.sum((part - total) ** 2, dtype=np.float64)) for part in volume)
+    low, high, mean, squares, count = math.inf, -math.inf, 0.0, 0.0, 0
+    for part in volume:  # once over the file: mean and sum of squares about it, part by part
+        low, high = min(low, float(part.min())), max(high, float(part.max()))
+        own = float(part.mean(dtype=np.float64))
+        squares += float(np.sum((part - own) ** 2, dtype=np.float64))
+        squares += (own - mean) ** 2 * count * part.size / (count + part.size)
+        mean, count = mean + (own - mean) * part.size / (count + part.size), count + part.size
+        let_go(volume)
     with mrcfile.mmap(path, "r+") as file:
-        file.header.dmin, file.header.dmax, file.header.dmean = volume.min(), volume.max(), total
-        file.header.rms = np.sqrt(squares / volume.size)
+        file.header.dmin, file.header.dmax, file.header.dmean = low, high, mean
+        file.header.rms = math.sqrt(squares / count)

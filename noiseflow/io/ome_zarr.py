@@ -5,6 +5,7 @@ Source: https://ngff.openmicroscopy.org/0.5
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
 from noiseflow.io.ownership import MARK
 from noiseflow.io.units import in_angstrom
 
@@ -30,28 +32,43 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
     unit = {} if voxel_size is None else {"unit": "angstrom"}
     group = zarr.open_group(path, mode="w", zarr_format=3)
     datasets: list[dict[str, Any]] = []
-    level = np.asarray(data)
-    factors = np.ones(data.ndim)
+    shape, factors = data.shape, np.ones(data.ndim)
+    level: Any = None
     while True:
-        name = str(len(datasets))
-        chunks = tuple(min(_CHUNK, edge) for edge in level.shape)
-        group.create_array(name, data=level, chunks=chunks, dimension_names=list(axes))
+        name, finer = str(len(datasets)), level
+        chunks = tuple(min(_CHUNK, edge) for edge in shape)
+        level = group.create_array(name, shape=shape, dtype=data.dtype, chunks=chunks, dimension_names=list(axes))
+        for part in _parts(shape, chunks):
+            level[part] = data[part] if finer is None else _halved(finer[_twice(part, finer.shape)])
         transforms = [
             {"type": "scale", "scale": list(scale * factors)},
             {"type": "translation", "translation": list(scale * (factors - 1) / 2)},
         ]
         datasets.append({"path": name, "coordinateTransformations": transforms})
-        if max(level.shape) <= _SMALLEST_EDGE:
+        if max(shape) <= _SMALLEST_EDGE:
             break
-        level, factors = _halved(level), factors * [2 if edge > 1 else 1 for edge in level.shape]
+        factors = factors * [2 if edge > 1 else 1 for edge in shape]
+        shape = tuple(max(1, edge // 2) for edge in shape)
     multiscale: dict[str, Any] = {"name": path.stem.split(".")[0], "type": "mean", "datasets": datasets}
     multiscale["axes"] = [{"name": axis, "type": "space", **unit} for axis in axes]
     group.attrs["ome"] = {"version": "0.5", "multiscales": [multiscale]}
     group.attrs["_creator"] = {"name": MARK, "version": version("noiseflow")}
 
 
-def read(path: Path) -> ImageFile:
-    """Read the finest level of an OME-Zarr image or volume, of version 0.4 or 0.5."""
+def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[slice, ...]]:
+    """The chunks of an array, one after the other: all that memory holds of it."""
+    for number in np.ndindex(*(-(-edge // chunk) for edge, chunk in zip(shape, chunks, strict=True))):
+        corner = [index * chunk for index, chunk in zip(number, chunks, strict=True)]
+        yield tuple(slice(c, min(c + chunk, edge)) for c, chunk, edge in zip(corner, chunks, shape, strict=True))
+
+
+def _twice(part: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Where a part of a level lies in the level twice as fine, of that shape."""
+    return tuple(slice(2 * p.start, 2 * p.stop) if edge > 1 else p for p, edge in zip(part, shape, strict=True))
+
+
+def read(path: Path, *, mapped: bool = False) -> ImageFile:
+    """Read the finest level of an OME-Zarr image or volume, of version 0.4 or 0.5; `mapped`, to a temporary file, if large."""
     import zarr
 
     node = zarr.open(path, mode="r")
@@ -64,7 +81,10 @@ def read(path: Path) -> ImageFile:
     if not isinstance(array, zarr.Array):
         raise Unsupported("is no OME-Zarr image: its first dataset is no array")
     require_room(array.nbytes, path, compressed=True, size=int(array.nbytes_stored()))
-    data = np.asarray(array[:])
+    data = temporary_map(array.shape, array.dtype, in_memory=IN_MEMORY if mapped else array.nbytes)
+    for part in _parts(array.shape, array.chunks):
+        data[part] = array[part]
+        let_go(data)
     keep = [index for index, edge in enumerate(data.shape) if edge > 1 or index >= data.ndim - 2]
     transforms = first["datasets"][0].get("coordinateTransformations", [])
     scale = next((t["scale"] for t in transforms if t.get("type") == "scale"), [0] * data.ndim)

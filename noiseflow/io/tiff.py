@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.ownership import signature
 from noiseflow.io.units import in_angstrom
 
@@ -21,8 +22,8 @@ _OUTSIDE_OME = (np.float16, np.int64, np.uint64)
 _IMAGEJ_BYTES = 2**32 - 2**20
 
 
-def read(path: Path) -> ImageFile:
-    """Read the first series of a TIFF file."""
+def read(path: Path, *, mapped: bool = False) -> ImageFile:
+    """Read the first series of a TIFF file; `mapped`, leave its pixels there, or in a temporary file, if compressed."""
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
@@ -33,7 +34,7 @@ def read(path: Path) -> ImageFile:
         require_room(series.nbytes, path, compressed=compressed)
         if "S" in series.axes:
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
-        data = series.asarray()
+        data = _left_on_disk(path, series) if mapped and series.ndim == 3 else series.asarray()
         voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
     return ImageFile(data, voxel_size)
 
@@ -69,6 +70,17 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata, software=signature())
     return data
+
+
+def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
+    """The pixels of a stack where they are, if they lie there in one piece and in the machine's byte order."""
+    begin, native = series.dataoffset, series.dtype.newbyteorder("=")
+    kind = series.dtype.newbyteorder(series.parent.byteorder)
+    if begin is not None and kind == native:
+        return np.memmap(path, native, "c", begin, series.shape)
+    if len(series.pages) != series.shape[0]:
+        return np.asarray(series.asarray())
+    return mapped_copy((page.asarray() for page in series.pages), series.shape, native, in_memory=IN_MEMORY)
 
 
 def _pages(tiff: TiffFile) -> list[Any]:

@@ -15,6 +15,7 @@ _QUALITIES = (101, 90, 75, 60)
 _LOSSLESS = 101
 _MOST_HALVINGS = 12
 _PROBED = 6
+_MOST_PIXELS = 2**26  # 400³: more would hardly ever fit into a page, and trying takes memory for nothing
 
 
 @dataclass(frozen=True)
@@ -80,15 +81,17 @@ def make_sprites(
     """
     if stack.ndim != 3 or not stack.size:
         raise ValueError(f"a stack (section, y, x) is needed; this array has shape {stack.shape}")
-    if not np.isfinite(stack).all():
+    if not all(np.isfinite(section).all() for section in stack):
         raise ValueError("the stack has NaN or infinite pixels; replace them before drawing it")
     low, high = limits or (float(stack.min()), float(stack.max()))
     high = high if high > low else low + 1.0
     small = np.asarray(stack)
     for _ in range(_MOST_HALVINGS):
-        while max(small.shape[1:]) > _SHEET:
+        while max(small.shape[1:]) > _SHEET or (small.size > _MOST_PIXELS and max(small.shape[1:]) > 1):
             small = _halved(small, keep_sections)
-        grey = np.clip(np.rint((small.astype(np.float32) - low) * (255 / (high - low))), 0, 255).astype(np.uint8)
+        grey = np.empty(small.shape, np.uint8)
+        for target, section in zip(grey, small, strict=True):
+            target[...] = np.clip(np.rint((section.astype(np.float32) - low) * (255 / (high - low))), 0, 255)
         for quality in _QUALITIES:
             if _expected_bytes(grey, quality) <= most_bytes:
                 sprites = _packed(grey, quality, stack.shape, (low, high))

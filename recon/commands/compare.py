@@ -33,7 +33,7 @@ def compare(
     output = Output(json)
     if report is not None:
         io.check_folder(report, holds=["index.html"], overwrite=overwrite)
-    files = [io.read(path) for path in (volume, reference)]
+    files = [io.read(path, mapped=True) for path in (volume, reference)]
     first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
     tilt_angles = None if angles is None else io.read_angles(angles)
     with progress_bar("comparing", NUM_STEPS, json_mode=json) as progress:

@@ -115,7 +115,7 @@ def reconstruct(
     ] = 0.0,
     slices_at_once: Annotated[
         int | None,
-        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen by itself where memory is short."),
+        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen by itself for large volumes."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Reconstruct blocks in so many processes at a time (extra [distributed]).")
@@ -208,7 +208,7 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        if slices_at_once is None and not fsc:
+        if slices_at_once is None and not fsc and not uncertainty:
             many = workers if scheduler is None else 2
             slices_at_once = slices_for(tilt_series, grid, method, chosen_device, many)
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
@@ -237,6 +237,7 @@ def reconstruct(
                 halves=halves,
                 reference=truth,
                 warned=warned,
+                filled=None if slices_at_once is None else scratch,
             )
         journal.discard()
     if strict and verdict.grade == "bad":

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.console import Output
+from noiseflow.io.files import put_in_place
 from noiseflow.io.model_files import MODEL_SUFFIXES
 from recon.commands.inputs import Prepared
 from recon.reconstruction import Reconstruction
@@ -66,11 +67,16 @@ class Targets:
         halves: tuple[Volume, Volume] | None = None,
         reference: Volume | None = None,
         warned: Sequence[str] = (),
+        filled: Path | None = None,
     ) -> Verdict:
-        """Write what was asked for, report what was found, and return the verdict."""
+        """Write what was asked for, report what was found, and return the verdict. A volume that is `filled` already, in a file
+        beside its target and of the same kind, is put in its place."""
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
-        outcome.volume.write(self.volume)
+        if filled is not None and filled.suffix == self.volume.suffix:
+            put_in_place(filled, self.volume)
+        else:
+            outcome.volume.write(self.volume)
         bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
         verdict = judge(tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment)
         if self.noise_model is not None:
@@ -103,6 +109,7 @@ class Targets:
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
             | ({"uncertainty": bars} if bars else {})
+            | {"slices_at_once": outcome.slices_at_once}
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )

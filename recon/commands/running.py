@@ -18,6 +18,7 @@ import typer
 from noiseflow.commands.console import START_AGAIN, end_stopped
 from noiseflow.described import printable
 from noiseflow.io import locked, partial_folder
+from noiseflow.io.mapped import is_filled_by_parts
 
 if TYPE_CHECKING:
     from noiseflow.commands.console import Output
@@ -136,20 +137,21 @@ def memory_line(
 
 
 def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
-    """Slices of a block, where the whole volume does not fit into memory or workers share it; else None.
+    """Slices of a block, where the whole volume is large, does not fit into memory, or workers share it; else None.
 
     Raises:
         MemoryError: not even a few slices fit.
     """
     from recon.methods import find_method
-    from recon.scale.memory import available_memory, choose_slices
+    from recon.scale.memory import PLENTY, available_memory, choose_slices
 
     found, available = find_method(method), available_memory(device)
     if found.blockwise is None:
         return None
     if available is None:
         return None if workers is None else -(-grid.height // workers)
-    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1)
+    plenty = PLENTY if str(device).startswith("cpu") else available  # blocks on a GPU are not measured
+    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1, plenty=plenty)
 
 
 def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int) -> str:
@@ -165,9 +167,10 @@ def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int) ->
 
 @contextlib.contextmanager
 def scratch_beside(out: Path) -> Iterator[Path]:
-    """A name for a file beside `out`, gone at the end; what a killed run left is cleared by the next one."""
+    """A name for a volume beside `out`, gone at the end if it did not take its place; what a killed run left is cleared by the
+    next one."""
     with partial_folder(out) as folder:
-        yield folder / "blocks.npy"
+        yield folder / f"blocks{out.suffix if is_filled_by_parts(out) else '.npy'}"
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:

@@ -40,7 +40,7 @@ class Start:
     response: Transmission | Linear
     height: int
 
-    def rows(self, rows: slice) -> Tensor:
+    def rows(self, rows: slice | NDArray[np.int64]) -> Tensor:
         """The coarse volume of some slices, with as many layers along y as there are slices."""
         depth, _, width = self.rough.shape
         stretched = functional.interpolate(self.rough[None, None], (depth, self.height, width), mode="trilinear")

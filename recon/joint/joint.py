@@ -32,7 +32,7 @@ from recon.projection.defocused_projector import with_defocus
 from recon.projection.image_formation import Linear
 from recon.projection.projector import SliceProjector, from_rays
 from recon.reconstruction import Reconstruction
-from recon.series.first_guess import attenuation_scale, contrast_slab, estimate_response
+from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
@@ -102,13 +102,17 @@ class JointReconstructor:
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:
-        """Choose noise model, weight and response for all slices of a series, on the slab of most contrast."""
-        rows = contrast_slab(tilt_series, self._num_slices(grid))
+        """Choose noise model, weight and response for all slices of a series: the first two on the slab of most contrast, the
+        response on it and on the slab of least contrast, where vacuum tells a dimmer beam from a haze as in a whole fit."""
+        num_slices = self._num_slices(grid)
+        dense = contrast_slab(tilt_series, num_slices)
+        slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
+        rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
         start, part = self._start(tilt_series, grid), tilt_series.rows(rows)
-        model = self._model(start, part, replace(grid, height=rows.stop - rows.start), rows=rows)
+        model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
         run = self._slab(part, model, progress, share=noise_share(tilt_series.images))
-        run.fit_whole()  # of the slab: the response, and what is left for the noise, are those of a whole fit
-        return run.settled(rows, start)
+        run.fit_whole()
+        return run.settled(slabs, start)
 
     @kept_memory()
     def fit(
@@ -178,7 +182,7 @@ class JointReconstructor:
         tilt_series: TiltSeries,
         grid: VolumeGrid,
         *,
-        rows: slice | None = None,
+        rows: slice | NDArray[np.int64] | None = None,
         settled: Settled | None = None,
         projector: Projector | None = None,
     ) -> TomographySignal:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor, nn
@@ -28,7 +29,7 @@ class Settled:
         scale: of the field.
         facts: what was known of the series.
         start: the coarse volume that every block begins with.
-        slices: those that it was settled on.
+        slabs: the runs of slices that it was settled on.
         signal_model: of these slices, as fitted; None where it was left behind.
         fit_result: of the last fit of them.
     """
@@ -41,7 +42,7 @@ class Settled:
     scale: float
     facts: Facts
     start: Start
-    slices: slice
+    slabs: Sequence[slice]
     signal_model: TomographySignal | None
     fit_result: FitResult
 
@@ -81,8 +82,8 @@ class PlannedRun:
         self.runner.run([stage for stage in self.stages if stage.where == "whole"])
         return self.runner.result
 
-    def settled(self, slices: slice, start: Start) -> Settled:
-        """What a slab has settled, which was the whole of this run."""
+    def settled(self, slabs: Sequence[slice], start: Start) -> Settled:
+        """What some slabs have settled, which were the whole of this run."""
         model = self.runner.tasks["whole"].signal_model
         return Settled(
             simple=self.runner.models["simple"],
@@ -93,7 +94,7 @@ class PlannedRun:
             scale=float(model.field.scale),
             facts=self.facts,
             start=start,
-            slices=slices,
+            slabs=slabs,
             signal_model=model,
             fit_result=self.runner.result,
         )

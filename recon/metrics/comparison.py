@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.arrays import strided
 from noiseflow.commands.console import Progress
 from noiseflow.report import Report, new_figure, show_image
 from recon.metrics.metrics import (
@@ -17,7 +18,7 @@ from recon.metrics.metrics import (
     compare,
     compare_images,
     fourier_shell_correlation,
-    match,
+    matching_line,
     resolution,
 )
 from recon.projection.projector import SliceProjector
@@ -27,6 +28,8 @@ Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
+_SLAB_VOXELS = 2**24  # that are projected at a time
+_PREVIEW = 256  # voxels along each axis at most, which set the limits of grey
 
 
 @dataclass(frozen=True)
@@ -93,14 +96,16 @@ def compare_volumes(
 
 def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
     """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmissions of an incident intensity of one."""
-    depth, _, width = volume.shape
-    lattice = torch.from_numpy(np.asarray(volume, dtype=np.float32))
-    parts = []
+    depth, height, width = volume.shape
+    images = np.empty((len(tilt_angles), height, width), np.float32)
+    rows = max(1, _SLAB_VOXELS // (depth * width))
     for start in range(0, len(tilt_angles), _TOGETHER):
         part = tilt_angles[start : start + _TOGETHER]
-        parts.append(SliceProjector(tilt_angles=part, depth=depth, width=width)(lattice).numpy())
-    images = np.concatenate(parts)
-    return np.asarray(images if mode == "linear" else np.exp(-images))
+        projector = SliceProjector(tilt_angles=part, depth=depth, width=width)
+        for first in range(0, height, rows):
+            slab = torch.from_numpy(np.array(volume[:, first : first + rows], dtype=np.float32))
+            images[start : start + len(part), first : first + rows] = projector(slab).numpy()
+    return images if mode == "linear" else np.exp(-images, out=images)
 
 
 def _check_lattices(volume: Volume, reference: Volume) -> None:
@@ -131,13 +136,15 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
     report = Report(f"{names[0]} compared with {names[1]}")
     header, rows = error_table(comparison)
     report.table(header, rows, caption="MSE in squared ranges of the reference; projections are compared one by one.")
-    matched = match(np.asarray(volume, dtype=np.float64), np.asarray(reference, dtype=np.float64), scaling="affine")
-    limits = tuple(float(value) for value in np.percentile(reference, (0.5, 99.8)))
-    span = float(np.percentile(np.abs(matched - reference), 99.5))
+    line = matching_line(volume, reference, "affine")
+    some, known = strided(volume, _PREVIEW), strided(reference, _PREVIEW)
+    limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
+    span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]
-        images = [np.take(array, middle, axis=axis) for array in (reference, matched, matched - reference)]
+        true, found = (np.take(array, middle, axis=axis) for array in (reference, volume))
+        images = [true, line(found), line(found) - true]
         show_image(row[0], images[0], f"reference, {letter} = {middle}", limits=limits)  # type: ignore[arg-type]
         show_image(row[1], images[1], "volume, affinely matched", limits=limits)  # type: ignore[arg-type]
         show_image(row[2], images[2], "difference", limits=(-span, span))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -12,10 +13,12 @@ from torch import Tensor
 
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
+from noiseflow.io.mapped import IN_MEMORY, temporary_map
 
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
 Array = NDArray[Any]
+_SLAB_ELEMENTS = 2**22  # of a spectrum that are held at a time: 64 MiB
 
 
 @described(mse="squared ranges", psnr="dB")
@@ -47,27 +50,58 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
         ValueError: shapes differ, pixels are not finite, the reference is flat, or images have fewer than 3 x 3 pixels.
     """
     found, truth = _checked(result, reference)
-    matched = match(found, truth, scaling=scaling)
-    span = float(truth.max() - truth.min())
-    mse = float(np.mean((matched - truth) ** 2)) / span**2
+    if truth.ndim == 2:
+        found, truth = found[None], truth[None]
+    line, span = matching_line(found, truth, scaling), float(truth.max()) - float(truth.min())
+    squares, similar = 0.0, 0.0
+    for one, other in _sections(found, truth):
+        matched = line(one)
+        squares += float(np.sum((matched - other) ** 2))
+        similar += _similarity(matched, other, span)
+    mse = squares / truth.size / span**2
     psnr = math.inf if mse == 0 else -10 * math.log10(mse)
-    return Errors(mse, psnr, _dssim(matched, truth, span))
+    return Errors(mse, psnr, (1 - similar / len(truth)) / 2)
 
 
 def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
     """`result` brought to the scale of `reference`, as `compare` does it."""
+    return matching_line(result, reference, scaling)(result)
+
+
+@dataclass(frozen=True)
+class Line:
+    """(values − centre)·gain + level."""
+
+    centre: float = 0.0
+    gain: float = 1.0
+    level: float = 0.0
+
+    def __call__(self, values: Array) -> Array:
+        return values if self == Line() else np.asarray((values - self.centre) * self.gain + self.level)
+
+
+def matching_line(result: Array, reference: Array, scaling: Scaling) -> Line:
+    """What brings a result to the scale of its reference; volumes are looked at section by section."""
     if scaling == "raw":
-        return result
+        return Line()
     if scaling == "min-max":
-        low, high = float(result.min()), float(result.max())
-        gain = (float(reference.max()) - float(reference.min())) / (high - low) if high > low else 0.0
-        return (result - low) * gain + float(reference.min())
-    if scaling == "affine":
-        centred = result - result.mean()
-        power = float(np.mean(centred**2))
-        gain = float(np.mean(centred * (reference - reference.mean()))) / power if power > 0 else 0.0
-        return np.asarray(centred * gain + reference.mean())
-    raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
+        (low, high), (least, most) = ((float(a.min()), float(a.max())) for a in (result, reference))
+        return Line(low, (most - least) / (high - low) if high > low else 0.0, least)
+    if scaling != "affine":
+        raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
+    means = [sum(float(part.sum(dtype=np.float64)) for part in a) / a.size for a in (result, reference)]
+    power = product = 0.0
+    for one, other in _sections(result, reference):
+        centred = one - means[0]
+        power += float(np.sum(centred**2))
+        product += float(np.sum(centred * (other - means[1])))
+    return Line(means[0], product / power if power > 0 else 0.0, means[1])
+
+
+def _sections(*arrays: Array) -> Iterator[tuple[Array, ...]]:
+    """Sections of arrays that may be larger than memory, as float64."""
+    for parts in zip(*arrays, strict=True):
+        yield tuple(np.asarray(part, dtype=np.float64) for part in parts)
 
 
 def fourier_shell_correlation(first: Given, second: Given) -> tuple[Given, Given]:
@@ -83,17 +117,43 @@ def fourier_shell_correlation(first: Given, second: Given) -> tuple[Given, Given
         ValueError: shapes differ, or pixels are not finite.
     """
     one, other = _checked(first, second, flat=True)
-    f, g = np.fft.fftn(one), np.fft.fftn(other)
-    frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*(np.fft.fftfreq(n) for n in one.shape), indexing="ij")))
     shells = min(one.shape) // 2
-    shell = np.rint(frequency * 2 * shells).astype(int).ravel()
-    cross, power_f, power_g = (
-        np.bincount(shell, weights=values.ravel(), minlength=shells + 1)[: shells + 1]
-        for values in ((f * g.conj()).real, np.abs(f) ** 2, np.abs(g) ** 2)
-    )
+    cross, power_f, power_g = _shell_sums(one, other, shells)
     norm = np.sqrt(power_f * power_g)
     correlation = np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
     return alike(np.arange(shells + 1) / (2 * shells), first), alike(correlation, first)
+
+
+def _shell_sums(first: Array, second: Array, shells: int) -> Array:
+    """(3, shells + 1) of products of two spectra and of their powers; slab by slab, with the spectra in temporary files where
+    they are large."""
+    if first.ndim == 2:
+        first, second = first[None], second[None]
+    depth, height, width = first.shape
+    spectra = [_section_spectra(array) for array in (first, second)]
+    z, y, x = (axis**2 for axis in (np.fft.fftfreq(depth), np.fft.fftfreq(height), np.fft.rfftfreq(width)))
+    twice = np.full(len(x), 2.0)  # real volumes: the other half of the spectrum is the same
+    twice[0] = 1.0
+    if width % 2 == 0:
+        twice[-1] = 1.0
+    sums, rows = np.zeros((3, shells + 1)), max(1, _SLAB_ELEMENTS // (depth * len(x)))
+    for start in range(0, height, rows):
+        f, g = (np.fft.fft(spectrum[:, start : start + rows], axis=0) for spectrum in spectra)
+        squared = z[:, None, None] + y[start : start + rows, None] + x
+        shell = np.rint(np.sqrt(squared) * 2 * shells).astype(np.intp).ravel()
+        for total, values in zip(sums, ((f * g.conj()).real, np.abs(f) ** 2, np.abs(g) ** 2), strict=True):
+            total += np.bincount(shell, weights=(values * twice).ravel(), minlength=shells + 1)[: shells + 1]
+    return sums
+
+
+def _section_spectra(volume: Array) -> Array:
+    """(z, ky, kx) the Fourier transform of every section of a volume, its non-negative half along x."""
+    shape = (*volume.shape[:2], volume.shape[2] // 2 + 1)
+    exact = 16 * math.prod(shape) <= IN_MEMORY  # beyond, room on the disk counts for more than the eighth digit
+    found = temporary_map(shape, np.complex128 if exact else np.complex64, in_memory=IN_MEMORY)
+    for target, section in zip(found, volume, strict=True):
+        target[...] = np.fft.rfft2(np.asarray(section, dtype=np.float64))
+    return found
 
 
 def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
@@ -146,21 +206,16 @@ def reach_in_words(crossing: float, threshold: float, voxel_size: float | None) 
     return words + (f" ({period / 10:.3g} nm)" if period >= 10 else f" ({period:.3g} Å)")
 
 
-def _dssim(result: Array, reference: Array, span: float) -> float:
+def _similarity(result: Array, reference: Array, span: float) -> float:
+    """Structural similarity of two images."""
     from skimage.metrics import structural_similarity
 
-    if reference.ndim == 2:
-        result, reference = result[None], reference[None]
-    window = min(7, (min(reference.shape[1:]) - 1) // 2 * 2 + 1)
+    window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)
     if window < 3:
         raise ValueError(
-            f"the images have {reference.shape[1]} x {reference.shape[2]} pixels; at least 3 x 3 pixels are needed"
+            f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are needed"
         )
-    values = [
-        structural_similarity(a, b, data_range=span, win_size=window)  # type: ignore[no-untyped-call]
-        for a, b in zip(result, reference, strict=True)
-    ]
-    return (1 - float(np.mean(values))) / 2
+    return float(structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
 
 
 def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = False) -> tuple[Array, Array]:
@@ -173,4 +228,4 @@ def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = 
     require_finite(reference, "the reference")
     if not flat:
         require_contrast(reference, "the reference")
-    return result.astype(np.float64), reference.astype(np.float64)
+    return result, reference

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector, from_columns, from_rays, to_columns, to_rays
-from recon.projection.sparse import PanelledMatrix, build_panelled
+from recon.projection.sparse import PanelledMatrix, panelled_by_groups
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
@@ -67,7 +68,7 @@ class SliceProjector(Projector):
         self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
         self._halves: dict[tuple[int, ...], SliceProjector] = {}
         if torch.device(device).type == "cpu":
-            self._build_panels(dtype)
+            self.transposed = self._by_panels(dtype)
         else:
             self._set_entries(
                 *_joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
@@ -81,24 +82,22 @@ class SliceProjector(Projector):
             f"{self.detector_width} pixels, {kind} on {self.device})"
         )
 
-    def _build_panels(self, dtype: torch.dtype) -> None:
-        """Both matrices from a few tilts at a time: all entries at once would take several times the memory of the matrices."""
-        shape = (self.num_tilts * self.detector_width, self.depth * self.width)
-        self.matrix, self.transposed = build_panelled(
-            (
-                _joseph(
-                    self.tilt_angles[start : start + _PANEL],
-                    self.detector_offset[start : start + _PANEL],
-                    self.depth,
-                    self.width,
-                    self.detector_width,
-                )
-                for start in range(0, self.num_tilts, _PANEL)
-            ),
-            shape,
-            panels=(_PANEL * self.width, _PANEL * self.detector_width),
+    def _by_panels(self, dtype: torch.dtype) -> PanelledMatrix:
+        """The transposed matrix from a few tilts at a time: all entries at once would take several times its memory."""
+        size = (self.depth, self.width, self.detector_width)
+        parts = [slice(start, start + _PANEL) for start in range(0, self.num_tilts, _PANEL)]
+        entries = (_joseph(self.tilt_angles[part], self.detector_offset[part], *size) for part in parts)
+        return panelled_by_groups(
+            ((voxels, rays, weights) for rays, voxels, weights in entries),
+            (self.depth * self.width, self.num_tilts * self.detector_width),
+            panel=_PANEL * self.detector_width,
             dtype=dtype,
         )
+
+    @cached_property
+    def matrix(self) -> PanelledMatrix:
+        """From a slice's voxels to its rays; made when it is first needed, which it is not where vacuum is left out."""
+        return self.transposed.turned(_PANEL * self.width)
 
     def _set_entries(
         self, rays: NDArray[np.int64], voxels: NDArray[np.int64], weights: NDArray[np.float64], **kind: Any
@@ -112,21 +111,21 @@ class SliceProjector(Projector):
     @property
     def device(self) -> torch.device:
         """Where the matrix lives."""
-        return self.matrix.panels[0].device
+        return self.transposed.panels[0].device
 
     @property
     def dtype(self) -> torch.dtype:
         """Number type of the matrix."""
-        return self.matrix.panels[0].dtype
+        return self.transposed.panels[0].dtype
 
     def project(self, columns: Tensor) -> Tensor:
         """Native layout, no copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
-        result: Tensor = _Product.apply(columns, self.matrix, self.transposed)  # type: ignore[no-untyped-call]
+        result: Tensor = _Product.apply(columns, self, False)  # type: ignore[no-untyped-call]
         return result
 
     def backproject(self, rays: Tensor) -> Tensor:
         """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
-        result: Tensor = _Product.apply(rays, self.transposed, self.matrix)  # type: ignore[no-untyped-call]
+        result: Tensor = _Product.apply(rays, self, True)  # type: ignore[no-untyped-call]
         return result
 
     def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
@@ -177,14 +176,14 @@ class _Product(torch.autograd.Function):
     """Sparse times dense; its gradient is the transposed product, and the gradient's gradient the product again."""
 
     @staticmethod
-    def forward(ctx: Any, dense: Tensor, matrix: PanelledMatrix, transposed: PanelledMatrix) -> Tensor:
-        ctx.matrices = matrix, transposed
-        return matrix @ dense
+    def forward(ctx: Any, dense: Tensor, projector: SliceProjector, transposed: bool) -> Tensor:
+        ctx.of = projector, transposed
+        return (projector.transposed if transposed else projector.matrix) @ dense
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        matrix, transposed = ctx.matrices
-        return _Product.apply(gradient, transposed, matrix), None, None  # type: ignore[no-untyped-call]
+        projector, transposed = ctx.of
+        return _Product.apply(gradient, projector, not transposed), None, None  # type: ignore[no-untyped-call]
 
 
 def _joseph(

@@ -75,6 +75,16 @@ class PanelledMatrix:
                 torch.addmm(part, panel, dense[span, start : start + widest], beta=min(number, 1), out=part)
         return result
 
+    def turned(self, panel: int) -> PanelledMatrix:
+        """The transpose, in panels of `panel` columns, made panel by panel."""
+        from scipy.sparse import vstack
+
+        own = [_scipy(each) for each in self.panels]
+        starts = range(0, self.shape[0], panel)
+        return PanelledMatrix(
+            [csr_tensor(vstack([each[at : at + panel].T.tocsr() for each in own], format="csr")) for at in starts]
+        )
+
     def entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Row, column and value of every entry."""
         found = []
@@ -86,13 +96,9 @@ class PanelledMatrix:
 
     def some_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The matrix of some rows, (n,) indices, and its transpose; CSR tensors in one piece, for few rows reach few lines."""
-        from scipy.sparse import csr_array, hstack
+        from scipy.sparse import hstack
 
-        chosen = []
-        for panel in self.panels:
-            parts = tuple(p.cpu().numpy() for p in (panel.values(), panel.col_indices(), panel.crow_indices()))
-            chosen.append(csr_array(parts, shape=tuple(panel.shape))[rows.cpu().numpy()])
-        whole = hstack(chosen, format="csr")
+        whole = hstack([_scipy(panel)[rows.cpu().numpy()] for panel in self.panels], format="csr")
         like = self.panels[0]
         return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
 
@@ -101,38 +107,37 @@ Entries = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.floating[Any]]]
 """Row, column and value of entries."""
 
 
-def build_panelled(
-    groups: Iterable[Entries], shape: tuple[int, int], *, panels: tuple[int, int], dtype: torch.dtype
-) -> tuple[PanelledMatrix, PanelledMatrix]:
-    """A matrix and its transpose from groups of entries, whose memory is let go of one by one.
+def panelled_by_groups(
+    groups: Iterable[Entries], shape: tuple[int, int], *, panel: int, dtype: torch.dtype
+) -> PanelledMatrix:
+    """A matrix from groups of entries, whose memory is let go of one by one.
 
     Args:
-        groups: entries of so many whole rows as a panel of the transpose has columns, counted from the first of them.
+        groups: entries of the columns of one panel after the other; columns are counted from the first of the panel.
         shape: rows and columns.
-        panels: columns of a panel of the matrix, and of its transpose.
+        panel: columns of a panel.
         dtype: of the values.
     """
-    from scipy.sparse import csr_array, vstack
+    from scipy.sparse import csr_array
 
-    kind = torch.empty((), dtype=dtype).numpy().dtype
-    pieces: list[list[Any]] = [[] for _ in range(0, shape[1], panels[0])]
-    transposed: list[Tensor] = []
-    for number, (rows, columns, values) in enumerate(groups):
-        size = (min(panels[1], shape[0] - number * panels[1]), shape[1])
-        group = csr_array((values.astype(kind), (columns, rows)), shape=size[::-1])
-        transposed.append(csr_tensor(group))
-        for start, piece in zip(range(0, shape[1], panels[0]), pieces, strict=True):
-            piece.append(group[start : start + panels[0]].T.tocsr())
-    matrix = []
-    for piece in pieces:
-        matrix.append(csr_tensor(vstack(piece, format="csr")))
-        piece.clear()
-    return PanelledMatrix(matrix), PanelledMatrix(transposed)
+    kind, panels = torch.empty((), dtype=dtype).numpy().dtype, []
+    for start, (rows, columns, values) in zip(range(0, shape[1], panel), groups, strict=True):
+        size = (shape[0], min(panel, shape[1] - start))
+        panels.append(csr_tensor(csr_array((values.astype(kind), (rows, columns)), shape=size)))
+    return PanelledMatrix(panels)
 
 
 def index_type(*counts: int) -> type[np.signedinteger[Any]]:
     """The smaller type of index that holds all these counts: entries, rows and columns of a large matrix pass 2³¹."""
     return np.int32 if max(counts) < 2**31 else np.int64
+
+
+def _scipy(matrix: Tensor) -> Any:
+    """A CSR tensor as SciPy's, of the same memory where that is the processor's."""
+    from scipy.sparse import csr_array
+
+    parts = tuple(part.cpu().numpy() for part in (matrix.values(), matrix.col_indices(), matrix.crow_indices()))
+    return csr_array(parts, shape=tuple(matrix.shape))
 
 
 def csr_tensor(matrix: Any) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -31,7 +31,8 @@ class Tiles:
     Args:
         mask: (depth, width, height) of the lattice, True where occupied.
         projector: of the whole lattice.
-        known: tiles of another mask of the lattice, for the same projector; what is the same is taken over.
+        known: tiles of another mask of the lattice, for the same projector; what is the same is taken over, the rest let go of,
+            and they cannot be used any more.
 
     Attributes:
         mask: as given.
@@ -48,10 +49,10 @@ class Tiles:
         sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
         parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
         neighbours = neighbours_of(columns, (depth, width))
-        before: Sequence[Tile | None] = [None] * len(rows) if known is None else [*known]
+        before: list[Tile] = [] if known is None else known._given_up()
         self._tiles: list[Tile] = [
-            Tile(span, here, part, near, *_matrices(projector, here, tile))
-            for span, here, part, near, tile in zip(rows, columns, parts, neighbours, before, strict=True)
+            Tile(span, here, part, near, *_matrices(projector, here, before.pop(0) if before else None))
+            for span, here, part, near in zip(rows, columns, parts, neighbours, strict=True)
         ]
         self._like = self._tiles[0].matrix.values()
         self.filled = self._like.new_empty(parts[-1].stop)
@@ -129,6 +130,12 @@ class Tiles:
 
     def __iter__(self) -> Iterator[Tile]:
         return iter(self._tiles)
+
+    def _given_up(self) -> list[Tile]:
+        """The tiles, which are as large as several matrices of the projector; without them, nothing here can be used."""
+        tiles = self._tiles
+        del self._tiles, self._upsampling
+        return tiles
 
 
 def _matrices(projector: Projector, columns: Tensor, known: Tile | None) -> tuple[Tensor, Tensor]:

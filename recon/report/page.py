@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from noiseflow import io
+from noiseflow.arrays import strided
 from noiseflow.commands.console import invocation
+from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.noise import noise_charts
 from recon.report.verdict import add_verdict
+from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict.verdict import Verdict
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
+_PREVIEW = 256  # pixels along each axis at most, that limits of grey and charts of the noise are made from
+_MOST_PIXELS = 2**24  # that correlations of residuals come from: their errors are far below what matters
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -90,11 +96,11 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
         FileNotFoundError: there is no such file.
         ValueError: it cannot be read, or is no volume on this grid.
     """
-    image = io.read(path)
+    image = io.read(path, mapped=True)
     if image.data.shape != grid.shape:
         raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
     io.require_finite(image.data, path)
-    return Volume(image.data.astype(np.float32), None if image.voxel_size is None else image.voxel_size[0])
+    return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
 
 
 def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
@@ -142,7 +148,7 @@ def _text(value: object) -> str:
 def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     values = volume.attenuation
     sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
-    low, high = float(np.percentile(values, 0.5)), float(np.percentile(values, 99.8))
+    low, high = (float(end) for end in np.percentile(strided(values, _PREVIEW), (0.5, 99.8)))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading("Volume")
@@ -157,18 +163,18 @@ def _add_volume(report: Report, volume: Volume, unit: str) -> None:
 
 
 def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
-    images, predicted = tilt_series.images.astype(np.float32), outcome.projections
-    ends = np.percentile(images, (0.1, 99.9))
+    images, predicted = tilt_series.images, outcome.projections
+    some = strided(images, _PREVIEW)
+    ends = np.percentile(some, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
-    sprites = make_sprites(
-        np.concatenate([images, predicted]), most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True
-    )
+    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
+    sprites = make_sprites(both, most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True)
     size = tilt_series.pixel_size
     data = {
         "sprites": sprites.as_json(),
         "angles": tilt_series.tilt_angles.tolist(),
         "start": int(np.argmin(np.abs(tilt_series.tilt_angles))),
-        "limits": [float(end) for end in np.percentile(images, (0.5, 99.5))],
+        "limits": [float(end) for end in np.percentile(some, (0.5, 99.5))],
         "names": ["data", "clean projection"],
         "unit": "detector units",
         "pixelSize": None if size is None else size * images.shape[2] / sprites.shape[2],
@@ -204,17 +210,19 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
 def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     if outcome.noise_model is None:
         return
-    images = tilt_series.images.astype(np.float32)
-    use = slice(None) if tilt_series.mask is None else tilt_series.mask
+    images, predicted = (
+        strided(stack, _PREVIEW).astype(np.float32) for stack in (tilt_series.images, outcome.projections)
+    )
+    use = slice(None) if tilt_series.mask is None else strided(tilt_series.mask, _PREVIEW)
     report.heading("Noise")
-    caption = (
-        "The data are all pixels of the tilt series, against the clean projections of the volume; the model is exact."
-    )
-    report.charts(
-        noise_charts(outcome.noise_model, outcome.projections[use].ravel(), images[use].ravel()), caption=caption
-    )
+    caption = "The data are pixels of the tilt series, against the clean projections of the volume; the model is exact."
+    report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
     device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
-    pair = (torch.from_numpy(np.ascontiguousarray(stack)).to(device) for stack in (outcome.projections, images))
+    rows = contrast_slab(tilt_series, _MOST_PIXELS // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
+    pair = (
+        torch.from_numpy(np.ascontiguousarray(stack[:, rows], dtype=np.float32)).to(device)
+        for stack in (outcome.projections, tilt_series.images)
+    )
     report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import atomic_path
-from noiseflow.io.mapped import create_volume, finish_volume, temporary_map
+from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_map
 from noiseflow.io.numpy_files import write as write_npy
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -30,7 +30,7 @@ HALO = 8
 """Slices on either side of a block that a fit sees too, so that the regulariser sees across the border."""
 
 _FADE = 4  # slices on either side of a border; the outer half of the halo feels where its block ends
-SETTLED_ON = 32
+SETTLED_ON = 48
 """Slices on which what all blocks share is settled."""
 
 
@@ -132,6 +132,7 @@ def assemble(
             if number and fade:
                 _fade_in(target, found, part, fade)
             target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
+            let_go(target)
     finish_volume(scratch, volume)
     return Volume(volume, size), projections
 

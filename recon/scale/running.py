@@ -56,7 +56,9 @@ def reconstruct_in_blocks(
                 solve_block(method, tilt_series, part, files)
         else:
             _on_cluster(client, method, tilt_series, parts, files)
-        return method.finish(*assemble(parts, files, tilt_series, grid, scratch))
+        return replace(
+            method.finish(*assemble(parts, files, tilt_series, grid, scratch)), slices_at_once=slices_at_once
+        )
 
 
 @contextmanager

@@ -64,7 +64,22 @@ def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
     height = tilt_series.images.shape[1]
     if num_slices >= height:
         return slice(0, height)
-    energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
-    total = np.convolve(energy, np.ones(num_slices), mode="valid")
-    start = int(total.argmax())
+    start = int(_variation(tilt_series, num_slices).argmax())
     return slice(start, start + num_slices)
+
+
+def calm_slab(tilt_series: TiltSeries, num_slices: int, apart_from: slice) -> slice:
+    """The run of at most `num_slices` neighbouring slices in which the images vary least, none of them in another run."""
+    num_slices = min(num_slices, max(apart_from.start, tilt_series.images.shape[1] - apart_from.stop))
+    if num_slices == 0:
+        return slice(0, 0)
+    variation = _variation(tilt_series, num_slices)
+    variation[max(0, apart_from.start - num_slices + 1) : apart_from.stop] = np.inf
+    start = int(variation.argmin())
+    return slice(start, start + num_slices)
+
+
+def _variation(tilt_series: TiltSeries, num_slices: int) -> NDArray[np.float64]:
+    """How much the mean image varies in every run of so many neighbouring slices, by its first."""
+    energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
+    return np.convolve(energy, np.ones(num_slices), mode="valid")

@@ -90,7 +90,7 @@ class TiltSeries:
         """(tilt, y, u), True for the pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
-    def rows(self, rows: slice) -> TiltSeries:
+    def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
         """Some rows (y) of all images; they may be flat, where the whole is not."""
         return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
 

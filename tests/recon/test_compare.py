@@ -1,10 +1,13 @@
 """`noiseflow compare`: errors in three dimensions and in projections, shell correlation, pictures, and what it refuses."""
 
+import tracemalloc
+
 import mrcfile
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from recon.metrics import comparison, metrics
 from recon.metrics.comparison import compare_volumes, project
 from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, resolution
 from recon.series.tilt_series import Volume
@@ -93,3 +96,31 @@ def test_what_cannot_be_compared_gets_one_clear_line(volumes, tmp_path):
         run_command("compare", a, write(tmp_path / "image.mrc", truth[0]))
     with pytest.raises(ValueError, match="flat"):
         run_command("compare", a, write(tmp_path / "flat.mrc", np.ones_like(truth)))
+
+
+def test_volumes_larger_than_memory_are_compared_section_by_section(tmp_path, monkeypatch):
+    generator = np.random.default_rng(0)
+    truth = generator.random((96, 64, 80), dtype=np.float32)
+    found = truth + 0.1 * generator.standard_normal(truth.shape, dtype=np.float32)
+    angles = np.array([-30.0, 0.0, 30.0])
+    whole = compare_volumes(Volume(found), Volume(truth), tilt_angles=angles)
+    for name, array in (("found", found), ("truth", truth)):
+        np.save(tmp_path / name, array)
+    mapped = [Volume(np.load(tmp_path / f"{name}.npy", mmap_mode="r")) for name in ("found", "truth")]
+    for module, name, value in (
+        (metrics, "IN_MEMORY", 0),
+        (metrics, "_SLAB_ELEMENTS", 2**12),
+        (comparison, "_SLAB_VOXELS", 2**14),
+    ):
+        monkeypatch.setattr(module, name, value)
+    tracemalloc.start()
+    try:
+        parts = compare_volumes(*mapped)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < truth.nbytes
+    with_angles = compare_volumes(*mapped, tilt_angles=angles)
+    assert parts.volume["affine"] == pytest.approx(whole.volume["affine"])
+    assert with_angles.projections["raw"].mse == pytest.approx(whole.projections["raw"].mse, rel=1e-5)
+    np.testing.assert_allclose(parts.correlation, whole.correlation, atol=1e-5)

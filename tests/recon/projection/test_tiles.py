@@ -91,8 +91,11 @@ def test_what_is_the_same_is_taken_over_from_other_tiles(mask):
     projector, before, _, _ = operators(mask)
     wider = mask.clone()
     wider[4, 4, 20] = True
+    kept = next(iter(before)).matrix
     tiles, expected = Tiles(wider, projector, known=before), Tiles(wider, projector)
-    assert next(iter(tiles)).matrix is next(iter(before)).matrix
+    assert next(iter(tiles)).matrix is kept
+    with pytest.raises(AttributeError):  # their matrices are gone
+        before.project(torch.zeros(before.filled.numel(), dtype=torch.float64))
     values = torch.rand(expected.filled.numel(), dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     torch.testing.assert_close(tiles.project(values), expected.project(values), rtol=0, atol=0)
 

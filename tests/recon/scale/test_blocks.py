@@ -84,9 +84,10 @@ def tall(tmp_path):
     return tmp_path / "tall.mrc"
 
 
-def test_command_holds_one_block_in_memory(tall, tmp_path, run):
+@pytest.mark.parametrize("name", ["v.npy", "v.mrc"])
+def test_command_holds_one_block_in_memory(tall, tmp_path, run, name):
     """Neither images nor volume nor projections, of 14, 27 and 14 MiB, are ever whole in memory."""
-    command = ["reconstruct", tall, "-o", tmp_path / "v.npy", "--method", "sirt", "--steps", 2]
+    command = ["reconstruct", tall, "-o", tmp_path / name, "--method", "sirt", "--steps", 2]
     command += ["--slices-at-once", 7000 // 4]
     peaks = []
     for _ in range(2):  # imports count in the first run

@@ -168,5 +168,6 @@ def test_slices_are_chosen_by_the_memory_that_is_free():
     assert slices is not None
     assert needed_memory(*block_memory(series, grid, slices, fitted=True)) < 12 * 2**30
     assert choose_slices(series, grid, 24 * 2**30, workers=2) == slices
+    assert choose_slices(series, grid, 2**40, plenty=4 * 2**30) == 64
     with pytest.raises(MemoryError, match="--thickness"):
         choose_slices(series, grid, 2**30)

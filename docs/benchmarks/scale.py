@@ -1,0 +1,134 @@
+"""Time, memory and accuracy over size: every row is the command that a user would run, in a process of its own.
+
+    python docs/benchmarks/scale.py run                      # all rows but the largest; those already there are kept
+    python docs/benchmarks/scale.py run --row shells-512 --row shells-1000
+    python docs/benchmarks/scale.py run --threads 2 --cache /data/scale --out FILE
+    python docs/benchmarks/scale.py page                     # scale.md and its figure from the JSON
+
+Peak memory is the largest resident set of the process that the operating system saw, pages of mapped files included. Simulated
+series stay in the cache folder, and are made slab by slab; volumes are removed when they are judged. Results go to
+results/scale.json beside this file, with commit, date, machine and its load for every row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import scale_page
+from scale_measure import psnr, run, seams
+
+from noiseflow.commands.console import Output
+from recon.benchmarks.scenes import Results
+
+RESULTS = Path(__file__).parent / "results" / "scale.json"
+TILTS = "-59.5:57.5:1.5"  # 79
+Cell = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A reconstruction to measure.
+
+    Attributes:
+        phantom, size: of the scene.
+        options: of ``noiseflow reconstruct``.
+        threads: of the process; None takes those of ``--threads``.
+    """
+
+    phantom: str
+    size: int
+    options: tuple[str, ...] = ()
+    threads: int | None = None
+
+
+ROWS = {
+    **{f"shells-{size}": Row("shells", size) for size in (64, 128, 192, 256, 512)},
+    "slab-512": Row("slab", 512),
+    "sirt-512": Row("shells", 512, ("--method", "sirt")),
+    "l2-512": Row("shells", 512, ("--method", "l2")),
+}
+LARGE = {
+    "shells-1000": Row("shells", 1000),
+    "blocks-128": Row("shells", 128, ("--slices-at-once", "32")),
+    "blocks-256": Row("shells", 256, ("--slices-at-once", "64")),
+    "slab-128": Row("slab", 128),
+    "slab-blocks-128": Row("slab", 128, ("--slices-at-once", "32")),
+    "processes-1": Row("shells", 256, ("--slices-at-once", "64"), threads=2),
+    "processes-2": Row("shells", 256, ("--slices-at-once", "64", "--workers", "2")),
+}
+"""Rows that run where they are named alone."""
+
+
+def main() -> None:
+    """Run the chosen rows, save each, or draw the page."""
+    every = ROWS | LARGE
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("run", "page"))
+    parser.add_argument("--row", action="append", choices=every, help="by default all but " + ", ".join(LARGE))
+    parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)), help="all cores by default")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "noiseflow-scale")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="JSON file; by default the one of the page")
+    options = parser.parse_args()
+    results, output = Results(options.out, "scale"), Output(json_mode=False)
+    if options.part == "page":
+        scale_page.write(results.content)
+        return
+    options.cache.mkdir(parents=True, exist_ok=True)
+
+    def cell(key: str, compute: Callable[[], Cell]) -> Cell:
+        if options.again:
+            results.cells.pop(key, None)
+        return results.cell(key, compute)
+
+    failed = []
+    for name in options.row or ROWS:
+        row = every[name]
+        try:
+            folder = scene(row, options.cache, options.threads, results)
+            threads = options.threads if row.threads is None else row.threads
+            found = cell(f"scale/{name}", lambda r=row, f=folder, t=threads: measure(r, f, t))
+        except RuntimeError as error:  # the rows that follow do not depend on this one
+            failed.append(f"{name}: {error}")
+            continue
+        output.line(scale_page.in_words(name, found))
+    if failed:
+        raise ValueError("; ".join(failed))
+
+
+def scene(row: Row, cache: Path, threads: int, results: Results) -> Path:
+    """The folder of a simulated series, made where it is not there; what that took is a row, too."""
+    name = f"{row.phantom}-{row.size}"
+    folder = cache / name
+    if not (folder / "tilts.mrc").is_file():
+        words = ("simulate", folder, "--phantom", row.phantom, "--size", row.size, "--noise", "clipped")
+        results.cells.pop(f"simulate/{name}", None)
+        results.cell(
+            f"simulate/{name}", lambda: run(*words, f"--tilts={TILTS}", threads=threads)[0] | {"size": row.size}
+        )
+    return folder
+
+
+def measure(row: Row, folder: Path, threads: int) -> Cell:
+    """Reconstruct, and judge the volume."""
+    with tempfile.TemporaryDirectory(prefix="volume-", dir=folder) as scratch:
+        out, truth = Path(scratch) / "volume.mrc", folder / "truth.mrc"
+        figures, said = run("reconstruct", folder / "tilts.mrc", "-o", out, *row.options, threads=threads)
+        judged = {"psnr": psnr(out, truth)} | seams(out, truth, said["slices_at_once"])
+    about = {"phantom": row.phantom, "size": row.size, "options": list(row.options), "threads": threads}
+    keep = {"seconds inside": said["seconds"], "choices": said["choices"], "verdict": said["verdict"]["grade"]}
+    return about | figures | judged | keep
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"scale.py: {error}")

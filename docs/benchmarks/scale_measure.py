@@ -1,0 +1,83 @@
+"""One row of the scale benchmark: a command in a process of its own, what it took, and how good its volume is."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow import io
+from recon.scale.blocks import HALO, blocks
+
+_NEAR = 8  # slices on either side of a border that say how much the volume jumps elsewhere
+Array = NDArray[Any]
+
+
+def run(*words: str | Path | int, threads: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Run a command of noiseflow.
+
+    Returns:
+        Seconds, processor seconds and peak memory (GiB) of the process, and what it said.
+
+    Raises:
+        RuntimeError: it failed; the message is the last line that it wrote.
+    """
+    command = [sys.executable, "-m", "noiseflow", *map(str, words), "--json"]
+    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as told:
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdout=said, stderr=told, env=os.environ | {"OMP_NUM_THREADS": str(threads)}
+        )
+        _, status, usage = os.wait4(process.pid, 0)  # which alone tells of this child and no other
+        seconds = time.perf_counter() - started
+        process.returncode = os.waitstatus_to_exitcode(status)
+        for stream in (said, told):
+            stream.seek(0)
+        if process.returncode:
+            lines = told.read().decode(errors="replace").strip().splitlines()
+            raise RuntimeError(f"exit {process.returncode}: {lines[-1] if lines else 'without a word'}")
+        answer = json.loads(said.read().decode().strip().splitlines()[-1])
+    unit = 1 if sys.platform == "darwin" else 1024
+    figures = {"seconds": seconds, "processor seconds": usage.ru_utime + usage.ru_stime}
+    return figures | {"peak GiB": usage.ru_maxrss * unit / 2**30}, answer
+
+
+def psnr(volume: Path, truth: Path) -> float:
+    """PSNR (dB) of a volume over the range of the truth, without any rescaling, section by section."""
+    found, known = (io.read(path, mapped=True).data for path in (volume, truth))
+    total = sum(float(np.sum((a.astype(np.float64) - b) ** 2)) for a, b in zip(found, known, strict=True))
+    span = max(float(section.max()) for section in known) - min(float(section.min()) for section in known)
+    return float(-10 * np.log10(total / known.size / span**2))
+
+
+def seams(volume: Path, truth: Path, slices_at_once: int | None) -> dict[str, Any]:
+    """How much a volume jumps across the borders of its blocks, relative to neighbouring slices inside; and the truth there.
+
+    Each is the ratio of mean absolute differences that is largest over the borders; None where there is no border.
+    """
+    found, known = (io.read(path, mapped=True).data for path in (volume, truth))
+    parts = [] if slices_at_once is None else blocks(found.shape[1], slices_at_once, HALO)
+    borders = [part.rows.start - 1 for part in parts[1:]]
+    ratios = [[_ratio(array, border) for border in borders] for array in (found, known)]
+    return {
+        "blocks": max(1, len(parts)),
+        "seam": max(ratios[0], default=None),
+        "seam of the truth": max(ratios[1], default=None),
+    }
+
+
+def _ratio(array: Array, border: int) -> float:
+    first, stop = max(0, border - _NEAR), min(array.shape[1], border + _NEAR + 2)
+    total = np.zeros(stop - first - 1)
+    for section in array[:, first:stop]:  # section by section: a slab of a large volume lies all over the file
+        total += np.abs(np.diff(section, axis=0)).mean(1)
+    inside = np.delete(total, border - first)
+    return float(total[border - first] / np.median(inside))
