@@ -32,7 +32,7 @@ LEAST_STEPS = DRAWS * ROUNDS // NUM_WALKERS
 """Steps of the chain that cost what importance sampling may; where fewer are allowed, only the chain is tried."""
 
 LARGEST_NUM_STEPS = 4000
-"""Steps of the chain: 64 000 evaluations, which take up to two minutes where single electrons show; then the posterior is refused."""
+"""Steps of the chain: 64 000 evaluations, up to two minutes where single electrons show; then the posterior is refused."""
 
 NUM_SAMPLES = 2000
 """Equally weighted samples that are kept."""

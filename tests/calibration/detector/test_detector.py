@@ -9,7 +9,8 @@ from scipy import ndimage, stats
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
-from calibration.detector.measure import _shares, dark_offset, measure_detector
+from calibration.detector.log_posterior import LogPosterior
+from calibration.detector.measure import _shares, dark_offset, measure_detector, readings_of
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import (
     NUM_WALKERS,
@@ -292,3 +293,22 @@ def test_share_of_the_signals_noise_is_that_of_one_setting_only_where_it_agrees(
         assert (shot, read) == pytest.approx((1 / 16, 1 / 256), rel=0.05)
     else:  # the exposures' scale is a half, the noise that of 16 times the electrons
         assert shot == pytest.approx(1 / 16, rel=0.25)
+
+
+def test_offset_of_a_pair_alone_lies_below_its_darkest_pixels():
+    generator = np.random.default_rng(165)
+    scene = random_scene(generator, 128, mean=42.0)
+    setting = {"gain": 1.72, "offset": 100.0, "read_noise": 4.08}
+    pair = align_pair(ExposurePair(*(exposed(generator, electrons, **setting) for electrons in (scene, 16 * scene))))
+    found = readings_of(pair)[0][0]
+    darkest, error = found.darkest()
+    lowest = np.sort(100 + 1.72 * scene, axis=None)
+    assert lowest[:64].mean() < darkest < lowest[:512].mean()
+    density = LogPosterior([collect_levels([found])])
+    gain, read_noise = 1.72, 4.08
+    levels = replace(density.levels[0], darkest=np.full_like(density.levels[0].darkest, np.inf))
+    without = LogPosterior([levels])
+    above, below = (density.coordinates(gain, darkest + side * error, read_noise) for side in (4.0, -4.0))
+    assert density(below) == pytest.approx(without(below))
+    assert without(above) - density(above) == pytest.approx(8.0, rel=0.01)
+    assert measure_detector([pair]).posterior.offset.q95 < darkest + 2 * error
