@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
+from calibration.detector.importance import DRAWS, ROUNDS
 from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import KINDS, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
@@ -121,7 +122,7 @@ def measure_exposures(
     detector, figures, reason = None, None, ""
     verdict = Verdict("bad", ())
     try:
-        with bar("Sampling the detector's posterior", 16000) as progress:
+        with bar("Sampling the detector's posterior", DRAWS * ROUNDS) as progress:
             detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         verdict = judge_calibration(pairs, detector, figures, correlation, repairs)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.detector.levels import REACH, Levels, Readings, constants, gathered
+from calibration.detector.levels import REACH, Levels, Readings, constants, gathered, with_darkest
 from calibration.exposures.frames import Image
 
 LEVEL_WIDTH = 0.8
@@ -68,7 +68,7 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
             excess = (second / mass - (first / mass) ** 2 - about) / noise
             row |= {"own": noise, "shift": first / mass + offset - mean, "excess": excess}
         rows.append(row)
-    return rows
+    return with_darkest(rows, one)
 
 
 def true_moments(estimate: Image, density: Image, unit: float, variance: float) -> tuple[Image, Image, Image]:

@@ -13,8 +13,10 @@ from calibration.exposures.frames import Image
 DRAWS = 256
 """Draws of a round: enough to see a density of three parameters."""
 
-ROUNDS = 12
-"""Rounds after which a chain is the better tool."""
+ROUNDS = 40
+"""Rounds, at most. A smooth posterior takes 3 to 6. Where single electrons may show, at a read noise of under 0.4 electrons,
+the likelihood is a field of narrow peaks: the first draw that meets one outweighs all others until later rounds have measured
+how narrow it is, which took 26 rounds in the worst of 34 trials."""
 
 ENOUGH = 600.0
 """Effective samples: the 5 % and 95 % quantiles then err by 0.1 standard deviations."""
@@ -92,13 +94,14 @@ def importance_sample(
         The draws, or None where `ROUNDS` rounds are not worth `ENOUGH` samples.
     """
     kernels: list[tuple[Image, Image]] = [(start[None], _factor(2.0 * covariance))]
-    draws, values = np.empty((0, 3)), np.empty(0)
+    draws, values, proposal = np.empty((0, 3)), np.empty(0), np.empty(0)
     for number in range(ROUNDS):
         centres, factor = kernels[-1]
         fresh = centres[generator.integers(len(centres), size=DRAWS)] + _student(generator, DRAWS) @ factor.T
+        earlier = np.logaddexp(proposal, _log_mixture(draws, centres, factor))
+        proposal = np.concatenate([earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels])])
         draws = np.concatenate([draws, fresh])
         values = np.concatenate([values, _in_parts(log_density, fresh)])
-        proposal = np.logaddexp.reduce([_log_mixture(draws, *one) for one in kernels], axis=0)
         log_weight = np.where(np.isfinite(values), values - proposal, -np.inf)
         if not np.isfinite(log_weight).any():
             return None
@@ -141,4 +144,7 @@ def _log_mixture(draws: Image, centres: Image, factor: Image) -> Image:
 
 
 def _in_parts(log_density: Callable[[Image], Image], draws: Image) -> Image:
-    return np.concatenate([log_density(draws[start : start + PARTS]) for start in range(0, len(draws), PARTS)])
+    """The density of draws in the order of their read noise: the least of a part settles how many frequencies all take."""
+    order = np.argsort(draws[:, 2])
+    parts = [log_density(draws[order[start : start + PARTS]]) for start in range(0, len(draws), PARTS)]
+    return np.concatenate(parts)[np.argsort(order)]

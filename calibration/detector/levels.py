@@ -22,6 +22,11 @@ REACH = 8.0
 noise."""
 
 
+NUM_DARKEST = 64
+"""Pixels whose mean signal stands for the darkest of a scene: few enough to be the darkest, and known to an eighth of their
+scatter."""
+
+
 @dataclass(frozen=True)
 class Readings:
     """Readings of one exposure beside an independent estimate of their signal.
@@ -49,6 +54,11 @@ class Readings:
     step: float = 1.0
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
+
+    def darkest(self) -> tuple[float, float]:
+        """Mean signal of the pixels whose neighbours are the darkest, and its standard error."""
+        signal = self.signal[np.argsort(self.level)[:NUM_DARKEST]]
+        return float(signal.mean()), float(np.hypot(signal.std(), self.step) / np.sqrt(len(signal)))
 
     def rescaled(self, scale: Scale) -> Readings:
         """The same readings with their signals on another scale of the same long exposure."""
@@ -99,6 +109,8 @@ class Levels:
         own: (L,) variance of the estimate's own noise that the next two go by, counts².
         shift: (L,) how far the mean true signal lies above the mean estimate, counts.
         excess: (L,) by how many times `own` the true signals' variance exceeds that of the estimates.
+        darkest, darkest_error: (L,) signal of the darkest pixels of an exposure and its standard error, counts, beside its first
+            level; infinite beside the others, and where no light was.
         scales: of the pairs.
         scale: (L,) index into `scales`; −1 where the mean of the level is its readings' own.
         absolute: the histograms are of the readings themselves.
@@ -121,6 +133,8 @@ class Levels:
     own: Image
     shift: Image
     excess: Image
+    darkest: Image
+    darkest_error: Image
     scale: NDArray[np.int64]
     scales: tuple[Scale, ...] = ()
     absolute: bool = False
@@ -174,6 +188,8 @@ class Levels:
             origin=moved,
             spread=factor**2 * self.spread,
             shift=factor * self.shift,
+            darkest=factor * self.darkest + shift,
+            darkest_error=factor * self.darkest_error,
             scales=tuple(scales),
         )
 
@@ -195,7 +211,7 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS
         dithered = replace(one, observation=one.observation + dither)
         number = 1 if one.dark else max(1, min(num_levels, len(one.level) // 200))
         groups = np.array_split(np.argsort(one.level), number)
-        rows += [_residual_level(dithered, group) for group in groups]
+        rows += with_darkest([_residual_level(dithered, group) for group in groups], one)
     return gathered(rows, readings, absolute=False)
 
 
@@ -206,10 +222,20 @@ def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolu
     return Levels(**columns, scales=scales, absolute=absolute)
 
 
+def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, Any]]:
+    """The levels of an exposure, the darkest signal of all beside the first."""
+    if rows and not one.dark:
+        rows[0]["darkest"], rows[0]["darkest_error"] = one.darkest()
+    return rows
+
+
 def constants(one: Readings) -> dict[str, Any]:
     names = ("shot_share", "read_share", "weight", "step")
     rails = {"low": one.rails[0], "high": one.rails[1]}
-    rest = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0}
+    rest = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0} | {
+        "darkest": np.inf,
+        "darkest_error": 1.0,
+    }
     return {name: getattr(one, name) for name in names} | rails | rest | {"scale": one.scale.pair if one.scale else -1}
 
 

@@ -139,7 +139,7 @@ class LevelMasses:
         depends on the parameters of a scale, (W, L, P)."""
         transform, slope = self._transform(gain, offset, read_noise, self._tracked)
         mass = np.maximum(self._folded(transform), LEAST_MASS)
-        value = np.einsum("wlk,lk->w", np.log(mass), self._counts)
+        value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - self._darkness(offset)
         if slope is None:
             none = np.zeros(mass.shape[:2])
             return value, none, none, lambda index: np.zeros((*none.shape, 1))
@@ -214,6 +214,14 @@ class LevelMasses:
         """(W, L) how far an offset common to both exposures moves the signals of their pair."""
         common = self.levels.common
         return np.where(common, (1 - self.levels.slope) * offset[:, None] - self.levels.intercept, 0.0)
+
+    def _darkness(self, offset: Image) -> Image:
+        """(W,) nats against an offset above the darkest signal, where no light can be: half the square over its error.
+
+        Without it such an offset would bend the variance line, as if dark pixels had read noise alone.
+        """
+        lack = np.maximum(offset[:, None] - self.levels.darkest - self._moved(offset), 0.0) / self.levels.darkest_error
+        return np.asarray(0.5 * np.sum(lack**2, axis=1))
 
     def _design(self, index: int, offset: Image) -> Image:
         levels = self.levels

@@ -31,6 +31,16 @@ EXCESS_NOISE = (
 LEAST_GAIN = 1e-4
 """Standard deviations of the noise below which a gain is none: such a noise would be that of 10⁸ electrons and more."""
 
+AGREEMENT = 3.0
+"""Standard errors within which the long exposure's measured shot noise agrees with that of one detector setting."""
+
+LOOSEST = 0.75
+"""Relative width of that test beyond which it would accept anything: of the signal's own noise, itself a sixteenth of all at a
+ratio of 16."""
+
+LARGEST_SLOPE = 0.5
+"""Scale of the exposures above which the signal's own noise is too large a share to be taken on such a test."""
+
 FEW_ELECTRONS = 25.0
 """Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
 
@@ -189,17 +199,33 @@ def _fine(pair: AlignedPair, level: Image, step: float) -> Mask:
 def _shares(pair: AlignedPair) -> tuple[float, float]:
     """Variance of the signal estimate over that of the reading, for shot noise and for read noise.
 
-    One detector setting at a known exposure ratio makes them 1/ratio and 1/ratio², less what the interpolation smooths
-    away; otherwise the measured share stands for both.
+    One detector setting makes them the exposures' scale and its square, less what the interpolation smooths away. That is so
+    where a ratio was given, and taken to be so where the shot noise measured in the long exposure agrees; otherwise the
+    measured share stands for both.
     """
-    if pair.exposure_ratio is not None and pair.one_setting:
-        noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-        kept = float(np.var(pair.registration.warp(noise)[0][pair.mask]))
-        return kept / pair.exposure_ratio, kept / pair.exposure_ratio**2
+    ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else _plain_ratio(pair)
+    if ratio is not None:
+        kept = _kept(pair)
+        return kept / ratio, kept / ratio**2
     signal = pair.signal[pair.mask]
     share = float(np.mean(pair.signal_variance(signal)) / np.mean(pair.total_variance(signal)))
     share = min(max(share, 0.0), 0.9)
     return share / (1 - share), share / (1 - share)
+
+
+def _plain_ratio(pair: AlignedPair) -> float | None:
+    """The exposure ratio that the scale tells where the signal's own shot noise is what it then must be, else None."""
+    own, total, slope = pair.signal_variance, pair.total_variance, pair.scaling.slope
+    if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
+        return None
+    expected = _kept(pair) * slope / (1 + _kept(pair) * slope) * total.rate
+    return 1 / slope if abs(own.rate - expected) < AGREEMENT * own.rate_error < LOOSEST * expected else None
+
+
+def _kept(pair: AlignedPair) -> float:
+    """Share of white noise in the long exposure that its interpolation keeps."""
+    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
+    return float(np.var(pair.registration.warp(noise)[0][pair.mask]))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

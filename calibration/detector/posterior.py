@@ -28,8 +28,11 @@ LARGEST_RHAT = 1.05
 FARTHEST = 12.0
 """Nats below the maximum beyond which a walker has gone astray."""
 
-LEAST_EVALUATIONS = DRAWS * ROUNDS
-"""Steps allowed, below which only the chain is asked for."""
+LEAST_STEPS = DRAWS * ROUNDS // NUM_WALKERS
+"""Steps of the chain that cost what importance sampling may; where fewer are allowed, only the chain is tried."""
+
+LARGEST_NUM_STEPS = 4000
+"""Steps of the chain: 64 000 evaluations, up to two minutes where single electrons show; then the posterior is refused."""
 
 NUM_SAMPLES = 2000
 """Equally weighted samples that are kept."""
@@ -109,7 +112,7 @@ def sample_posterior(
     offset: tuple[float, float] | None = None,
     start: tuple[float, float, float] | None = None,
     num_steps: int = 200,
-    largest_num_steps: int = 16000,
+    largest_num_steps: int = LARGEST_NUM_STEPS,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DetectorPosterior:
@@ -136,7 +139,7 @@ def sample_posterior(
     likely, kept = np.concatenate(log_posterior.parameters(best)), tuple(log_posterior.levels)
     generator = np.random.default_rng(seed)
     walkers = _walkers(log_posterior, best, generator)
-    if len(walkers) > 3 and largest_num_steps > LEAST_EVALUATIONS:
+    if len(walkers) > 3 and largest_num_steps > LEAST_STEPS:
         spread = np.cov(walkers.T)
         drawn = importance_sample(log_posterior, best, spread, generator, progress)
         if drawn is not None and drawn.disagreement() < LARGEST_RHAT:

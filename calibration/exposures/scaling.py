@@ -14,6 +14,9 @@ from noiseflow.described import described
 
 Mask = NDArray[np.bool_]
 
+BLOCK = 8
+"""Side, pixels, of blocks whose sums are independent: the filter of the finest band and an interpolation reach 3 pixels."""
+
 
 @described(intercept="counts", intercept_error="counts", level_error="counts")
 @dataclass(frozen=True)
@@ -44,14 +47,15 @@ class Scaling:
         return offset, float(np.hypot(self.level_error / (1 - self.slope), lever * self.slope_error))
 
 
-@described(floor="counts²", rate="counts")
+@described(floor="counts²", rate="counts", rate_error="counts")
 @dataclass(frozen=True)
 class VarianceLine:
     """A variance that grows linearly with the signal, as shot noise with read noise does: floor + rate·signal,
-    counts²."""
+    counts². `rate_error` is the standard error of the rate; 0 where it was not estimated."""
 
     floor: float
     rate: float
+    rate_error: float = 0.0
 
     def __call__(self, signal: Image) -> Image:
         """Variance at each signal, never negative."""
@@ -116,9 +120,23 @@ def own_variance(
     squares = scaling.slope**2 * warp(finest_band(long) ** 2) - finest_band(short) * finest_band(signal)
     whole = np.asarray(ndimage.binary_erosion(mask, np.ones((3, 3)), border_value=0))
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
-    line = fit_line(signal[whole], squares[whole])
+    chosen = signal[whole]
+    weight = _inverse_square(
+        fit_line(chosen, ((short - signal) ** 2)[whole]), chosen
+    )  # better known than the own noise
+    line = _weighted_line(chosen, squares[whole], weight)
+    error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
     kept = float(np.var(warp(np.random.default_rng(0).standard_normal(long.shape))[whole]))  # by the interpolation
-    return VarianceLine(kept * line.floor, kept * line.rate)
+    return VarianceLine(kept * line.floor, kept * line.rate, kept * error)
+
+
+def _rate_error(signal: Image, departure: Image, weight: Image, mask: Mask) -> float:
+    """Standard error of a line's rate, from the scatter between blocks of `BLOCK`² pixels."""
+    row, column = np.indices(mask.shape) // BLOCK
+    block = (row * (column.max() + 1) + column)[mask]
+    lever = signal - np.average(signal, weights=weight)
+    sums = np.bincount(block, weight * lever * departure)
+    return float(np.sqrt(np.sum(sums**2)) / np.sum(weight * lever**2))
 
 
 def finest_band(image: Image) -> Image:
@@ -130,14 +148,24 @@ def finest_band(image: Image) -> Image:
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
     """Least-squares line through squared residuals, weighted by their expected spread (that of a variance is the
     variance)."""
-    centre = signal.mean()
-    design = np.stack([np.ones_like(signal), signal - centre])
     weight = np.ones_like(signal)
     for _ in range(3):
-        floor, rate = np.linalg.solve(design * weight @ design.T, design * weight @ squares)
-        level = np.maximum(floor + rate * (signal - centre), 0.1 * abs(squares.mean()))
-        weight = 1 / np.maximum(level, np.finfo(float).tiny) ** 2
+        line = _weighted_line(signal, squares, weight)
+        weight = _inverse_square(line, signal)
+    return line
+
+
+def _weighted_line(signal: Image, squares: Image, weight: Image) -> VarianceLine:
+    centre = signal.mean()
+    design = np.stack([np.ones_like(signal), signal - centre])
+    floor, rate = np.linalg.solve(design * weight @ design.T, design * weight @ squares)
     return VarianceLine(float(floor - rate * centre), float(rate))
+
+
+def _inverse_square(line: VarianceLine, signal: Image) -> Image:
+    """Weights of squares whose expectation is the line, but for its lowest tenth."""
+    level = np.maximum(line.floor + line.rate * signal, 0.1 * abs(line.floor + line.rate * signal.mean()))
+    return np.asarray(1 / np.maximum(level, np.finfo(float).tiny) ** 2)
 
 
 def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:

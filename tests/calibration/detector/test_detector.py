@@ -9,7 +9,8 @@ from scipy import ndimage, stats
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
-from calibration.detector.measure import dark_offset, measure_detector
+from calibration.detector.log_posterior import LogPosterior
+from calibration.detector.measure import _shares, dark_offset, measure_detector, readings_of
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import (
     NUM_WALKERS,
@@ -21,9 +22,10 @@ from calibration.detector.posterior import (
 from calibration.detector.shape import misfit
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
-from calibration.registration.aligned import align_with
+from calibration.registration.aligned import align_pair, align_with
 
 from ..conftest import expose, rigid, textured_scene
+from ..simulators import exposed, random_scene
 
 GAIN, OFFSET, READ_NOISE = 2.0, 100.0, 1.5
 
@@ -270,3 +272,35 @@ def test_ctrl_c_in_the_chain_prints_no_traceback(capsys):
     with pytest.raises(KeyboardInterrupt):
         sampler.run_mcmc(np.random.default_rng(0).normal(size=(NUM_WALKERS, 3)), 1)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("long_gain", [GAIN, GAIN / 8])
+def test_share_of_the_signals_noise_is_that_of_one_setting_only_where_it_agrees(long_gain):
+    generator = np.random.default_rng(8)
+    scene = random_scene(generator, 160)
+    short = exposed(generator, scene, gain=GAIN, offset=100.0, read_noise=1.5)
+    long = exposed(generator, 16 * scene, gain=long_gain, offset=100.0, read_noise=1.5)
+    shot, read = _shares(align_pair(ExposurePair(short, long)))
+    if long_gain == GAIN:
+        assert (shot, read) == pytest.approx((1 / 16, 1 / 256), rel=0.05)
+    else:  # the exposures' scale is a half, the noise that of 16 times the electrons
+        assert shot == pytest.approx(1 / 16, rel=0.25)
+
+
+def test_offset_of_a_pair_alone_lies_below_its_darkest_pixels():
+    generator = np.random.default_rng(165)
+    scene = random_scene(generator, 128, mean=42.0)
+    setting = {"gain": 1.72, "offset": 100.0, "read_noise": 4.08}
+    pair = align_pair(ExposurePair(*(exposed(generator, electrons, **setting) for electrons in (scene, 16 * scene))))
+    found = readings_of(pair)[0][0]
+    darkest, error = found.darkest()
+    lowest = np.sort(100 + 1.72 * scene, axis=None)
+    assert lowest[:64].mean() < darkest < lowest[:512].mean()
+    density = LogPosterior([collect_levels([found])])
+    gain, read_noise = 1.72, 4.08
+    levels = replace(density.levels[0], darkest=np.full_like(density.levels[0].darkest, np.inf))
+    without = LogPosterior([levels])
+    above, below = (density.coordinates(gain, darkest + side * error, read_noise) for side in (4.0, -4.0))
+    assert density(below) == pytest.approx(without(below))
+    assert without(above) - density(above) == pytest.approx(8.0, rel=0.01)
+    assert measure_detector([pair]).posterior.offset.q95 < darkest + 2 * error

@@ -89,3 +89,16 @@ def test_structure_in_the_residual_is_told_from_noise(exposures):
     wave = 0.3 * np.sqrt(2 * aligned.total_variance(aligned.signal)) * np.sin(2 * np.pi * x / 64)
     changed = replace(aligned, short=aligned.short + wave)
     assert structured_share(changed) - structured_share(aligned) == pytest.approx(0.3**2, rel=0.15)
+
+
+def test_shot_noise_of_the_long_exposure_is_measured_where_few_bright_pixels_scatter_most():
+    generator = np.random.default_rng(3)
+    electrons = 20.0 * np.exp(0.9 * np.clip(textured_scene(generator, 160)(*np.mgrid[:160, :160]), -2, 4))
+    rates = []
+    for seed in range(6):
+        draw = np.random.default_rng(seed)
+        short, long = (100.0 + 2 * draw.poisson(ratio * electrons) for ratio in (1.0, 16.0))
+        own = align_pair(ExposurePair(short, long)).signal_variance
+        assert own.rate == pytest.approx(2 / 16, abs=4 * own.rate_error)
+        rates.append((own.rate - 2 / 16) / own.rate_error)
+    assert 0.3 < np.std(rates) < 2.0
