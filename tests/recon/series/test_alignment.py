@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import rotate
 
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import AxisUndetermined, find_alignment
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 ANGLES = np.arange(-60, 61, 4.0)
 
@@ -169,6 +172,19 @@ def test_images_that_fit_any_axis_are_no_answer(kind):
     assert abs((first.axis - second.axis + 90) % 180 - 90) >= 20
     for named in (first, second):
         assert f"--tilt-axis {named.axis:.0f}" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_noise_that_a_volume_fits_does_not_turn_the_axis_of_a_dense_slab():
+    angles, acquisition = np.arange(-70, 71, 3.0), ACQUISITIONS["low-dose"]
+    clean, _ = clean_tilt_series(
+        make_phantom("slab", 64, generator=np.random.default_rng(1)), angles, acquisition=acquisition
+    )
+    turned = rotate(
+        clean.images.astype(float), 33.0, axes=(2, 1), reshape=False, order=3, cval=clean.images.min()
+    ).clip(0)
+    found = find_alignment(add_noise(replace(clean, images=turned), acquisition.noise(), seed=1))
+    assert abs(found.tilt_axis) == pytest.approx(33.0, abs=1.5)  # unsmoothed, 8° and more off
 
 
 def test_a_stated_axis_decides_where_the_images_do_not():
