@@ -487,13 +487,13 @@ def _spikes(source: Source) -> TiltSeries:
     return replace(source.series, images=np.where(hit, np.float32(30 * abs(images).max()), images))
 
 
-@way("drift within every tilt", "resolution", "alignment")
-def _drift_within(source: Source) -> TiltSeries:
-    """Exposures blurred along the drift, which the stage corrects between tilts."""
-    images = source.series.images.astype(np.float64)
-    return _with(
-        source, np.mean([ndimage.shift(images, (0, 0, by), order=1, cval=source.empty) for by in range(-3, 4)], 0)
-    )
+@way("drift within every tilt", "resolution")
+def _drift_within(source: Source) -> Spoilt:
+    """Exposures blurred along u, the same at all tilts: the images of an object that is blurred across the axis."""
+    images, moves = source.series.images.astype(np.float64), range(-3, 4)
+    blurred = np.mean([ndimage.shift(images, (0, 0, by), order=1, cval=source.empty) for by in moves], axis=0)
+    deviation = float(np.std(moves))
+    return Spoilt(_with(source, blurred), truth=ndimage.gaussian_filter(source.truth, (deviation, 0, deviation)))
 
 
 @way("half of the tilts with another gain", "beam", "specimen")
@@ -518,7 +518,8 @@ def _growing_blur(source: Source) -> TiltSeries:
 
 @way("half of the thickness", "thickness", "geometry")
 def _half_thickness(source: Source) -> Spoilt:
-    return Spoilt(source.series, thickness=source.truth.shape[0] // 2)
+    depth = source.truth.shape[0]
+    return Spoilt(source.series, depth // 2, truth=source.truth[depth // 4 : depth // 4 + depth // 2])
 
 
 @way("contrast inverted in a third of the tilts", "mode", "specimen", "tilts", "beam", late=True)

@@ -227,3 +227,18 @@ def test_raw_needle_is_aligned_or_its_axis_asked_for(hint):
     found = find_alignment(series, tilt_axis=hint)
     assert (found.tilt_axis - 92.8 + 90) % 180 - 90 == pytest.approx(0, abs=2)
     assert found.residual < 0.01
+
+
+def test_a_raw_series_whose_file_states_another_axis_is_asked_to_be_aligned():
+    raw = replace(blobs(90.0, random_shifts(6.0), shape=(28, 28)), tilt_axis=90.0)
+    with pytest.raises(ValueError, match=r"axis at 90°.*do not fit.*--refine-alignment.*--tilt-axis 0"):
+        prepare(raw)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match="do not fit"):  # as before, where the axis is said to be along y
+            prepare(raw, tilt_axis=0.0)
+    aligned = replace(
+        blobs(0.0, np.zeros((len(ANGLES), 2)), shape=(28, 28)), tilt_axis=90.0
+    )  # the title is of the raw one
+    with pytest.warns(UserWarning, match=r"taken as aligned.*--refine-alignment"):
+        assert prepare(aligned).alignment is None
