@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.described import described
+from recon.series.orientation import Orientation
 from recon.series.tilt_series import Volume
 
 if TYPE_CHECKING:
@@ -32,12 +33,13 @@ class Reconstruction:
         method: the method that made it.
         noise_model: the noise model it was fitted with; None where the method has none.
         fit_result: held-out likelihood and its history; None where nothing was fitted.
-        signal_model: field, projector and image formation, as fitted; None where the method has none.
+        signal_model: field, projector and image formation, as fitted, in `orientation`; None where the method has none.
         weight_choice: the weights tried and their held-out likelihoods, where the weight was chosen.
         choices: what was chosen or estimated, by name, for a table.
         likelihood: the noise model under which the volume was fitted, where `noise_model` only describes what the fit left.
         uncertainty: error bars of the volume, where they were asked for.
         slices_at_once: slices of a block, at most; None where the volume was reconstructed whole.
+        orientation: flips of the series before the fit; all other attributes are of the series as it was given.
     """
 
     volume: Volume
@@ -51,6 +53,22 @@ class Reconstruction:
     likelihood: nn.Module | None = None
     uncertainty: Uncertainty | None = None
     slices_at_once: int | None = None
+    orientation: Orientation = field(default_factory=Orientation)
+
+    def turned(self, orientation: Orientation) -> Reconstruction:
+        """The same for the series flipped back, whose tilts stand in reverse where their angles were negated."""
+        if orientation == Orientation():
+            return self
+        bars, images = self.uncertainty, orientation.images(self.projections)
+        if bars is not None:
+            bars = replace(bars, std=_turned(bars.std, orientation), bias=_turned(bars.bias, orientation))
+        return replace(
+            self,
+            volume=_turned(self.volume, orientation),
+            projections=np.ascontiguousarray(images[::-1]) if orientation.negated else images,
+            uncertainty=bars,
+            orientation=orientation,
+        )
 
     @property
     def weight(self) -> float:
@@ -65,4 +83,9 @@ class Reconstruction:
     @property
     def response(self) -> dict[str, list[float]]:
         """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty where nothing was fitted."""
-        return {} if self.signal_model is None else self.signal_model.response()
+        found = {} if self.signal_model is None else self.signal_model.response()
+        return {name: values[::-1] for name, values in found.items()} if self.orientation.negated else found
+
+
+def _turned(volume: Volume, orientation: Orientation) -> Volume:
+    return replace(volume, attenuation=orientation.volume(volume.attenuation))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from recon.metrics.comparison import project
 from recon.series.tilt_series import Mode, TiltSeries
@@ -485,6 +485,120 @@ def _spikes(source: Source) -> TiltSeries:
     images = source.series.images.astype(np.float32)
     hit = source.generator.random(images.shape) < 0.003
     return replace(source.series, images=np.where(hit, np.float32(30 * abs(images).max()), images))
+
+
+@way("drift within every tilt", "resolution")
+def _drift_within(source: Source) -> Spoilt:
+    """Exposures blurred along u, the same at all tilts: the images of an object that is blurred across the axis."""
+    images, moves = source.series.images.astype(np.float64), range(-3, 4)
+    blurred = np.mean([ndimage.shift(images, (0, 0, by), order=1, cval=source.empty) for by in moves], axis=0)
+    deviation = float(np.std(moves))
+    return Spoilt(_with(source, blurred), truth=ndimage.gaussian_filter(source.truth, (deviation, 0, deviation)))
+
+
+@way("half of the tilts with another gain", "beam", "specimen")
+def _other_gain(source: Source) -> TiltSeries:
+    gain = np.where(np.arange(source.series.num_tilts) < source.series.num_tilts // 2, 1.0, 1.5)
+    return _with(source, source.series.images * gain[:, None, None])
+
+
+@way("signs of a third of the angles flipped", "geometry", "angles", "specimen", "tilts")
+def _signs(source: Source) -> TiltSeries:
+    angles = source.series.tilt_angles.copy()
+    angles[::3] = -angles[::3] + 1e-3
+    return _angles(source, angles)
+
+
+@way("blur that grows with the tilt", "resolution")
+def _growing_blur(source: Source) -> TiltSeries:
+    blurs = 3 * np.abs(np.sin(np.deg2rad(source.series.tilt_angles)))
+    images = source.series.images.astype(np.float64)
+    return _with(source, np.stack([ndimage.gaussian_filter(i, b) for i, b in zip(images, blurs, strict=True)]))
+
+
+@way("half of the thickness", "thickness", "geometry")
+def _half_thickness(source: Source) -> Spoilt:
+    depth = source.truth.shape[0]
+    return Spoilt(source.series, depth // 2, truth=source.truth[depth // 4 : depth // 4 + depth // 2])
+
+
+@way("contrast inverted in a third of the tilts", "mode", "specimen", "tilts", "beam", late=True)
+def _partly_inverted(source: Source) -> TiltSeries:
+    images = source.series.images.astype(np.float64)
+    images[::3] = images.max() + images.min() - images[::3]
+    return _with(source, images)
+
+
+@way("detector's response bent", "mode", "saturation")
+def _bent(source: Source) -> TiltSeries:
+    """The square root of the contrast: strong contrast counts for too little."""
+    contrast = (source.series.images - source.empty) / (source.full - source.empty)
+    return _with(source, source.empty + (source.full - source.empty) * np.sqrt(contrast.clip(0)))
+
+
+@way("borders of zeros after an alignment", "field", "lines", "alignment", late=True)
+def _zero_borders(source: Source) -> TiltSeries:
+    images = source.series.images.copy()
+    for image in images:
+        left, top = source.generator.integers(2, images.shape[2] // 5, 2)
+        image[:, :left] = 0
+        image[:top] = 0
+    return _with(source, images)
+
+
+@way("compressed by blocks of 8 pixels", "pattern", "residuals", late=True)
+def _compressed(source: Source) -> TiltSeries:
+    """The cosine transform of every block keeps its ten lowest frequencies, coarsely rounded, as a photograph's file does."""
+    images = source.series.images.astype(np.float64)
+    height, width = (8 * (size // 8) for size in images.shape[1:])
+    blocks = images[:, :height, :width].reshape(len(images), height // 8, 8, width // 8, 8)
+    step = 0.05 * 8 * abs(source.full - source.empty)
+    spectrum = step * np.round(fft.dctn(blocks, axes=(2, 4), norm="ortho") / step)
+    kept = np.add.outer(np.arange(8), np.arange(8))[:, None, :] < 4
+    images[:, :height, :width] = fft.idctn(spectrum * kept, axes=(2, 4), norm="ortho").reshape(
+        len(images), height, width
+    )
+    return _with(source, images)
+
+
+@way("hot rows that come and go", "lines", "outliers", "pattern", late=True)
+def _hot_rows(source: Source) -> TiltSeries:
+    images = source.series.images.copy()
+    for image in images:
+        image[source.generator.integers(0, images.shape[1], 2)] = source.series.images.max()
+    return _with(source, images)
+
+
+@way("ten neighbouring tilts in reversed order", "geometry", "angles", "tilts", "specimen")
+def _run_reversed(source: Source) -> TiltSeries:
+    images, start = source.series.images.copy(), source.series.num_tilts // 2
+    images[start : start + 10] = images[start : start + 10][::-1]
+    return _with(source, images)
+
+
+@way("images rotated more and more, up to 10°", "geometry", "axis", "specimen", "alignment")
+def _rotating(source: Source) -> TiltSeries:
+    degrees = np.linspace(-5, 5, source.series.num_tilts)
+    images = source.series.images
+    return _with(
+        source,
+        np.stack(
+            [
+                ndimage.rotate(i, d, reshape=False, order=1, cval=source.empty)
+                for i, d in zip(images, degrees, strict=True)
+            ]
+        ),
+    )
+
+
+@way("a bright background that moves", "pattern", "beam")
+def _moving_background(source: Source) -> TiltSeries:
+    """A smooth hill, of a tenth of the contrast, that stays where it is for a few tilts and then lies elsewhere."""
+    count, height, width = source.series.images.shape
+    centres = source.generator.uniform(0.2, 0.8, (count, 2)) * (height, width)
+    y, x = np.arange(height)[:, None], np.arange(width)
+    hills = [np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * (width / 5) ** 2)) for a, b in centres]
+    return _with(source, source.series.images + 0.2 * (source.full - source.empty) * np.stack(hills))
 
 
 def _later(source: Source, volume: Array) -> TiltSeries:

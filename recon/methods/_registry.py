@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from noiseflow.described import described
+from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
 from recon.fields.regularisers._names import DEFAULT
@@ -26,6 +27,7 @@ from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
 from recon.scale.running import reconstruct_in_blocks
+from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import first_copies
 
@@ -204,7 +206,7 @@ def reconstruct(
         return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
-        return _run(found, tilt_series, grid, chosen)
+        return _run_oriented(found, tilt_series, grid, chosen)
     if chosen.uncertainty:
         raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if slices_at_once < 1:
@@ -224,6 +226,17 @@ def reconstruct(
         slices_at_once=slices_at_once,
         client=client,
     )
+
+
+def _run_oriented(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+    """Run a method on a series by rising angle in the one orientation that its mirror images share, and flip the result back."""
+    if settings.noise_model is not None and needs_image(settings.noise_model):
+        return _run(method, tilt_series, grid, settings)  # maps of the detector's pixels stay where they are
+    orientation = Orientation.of(tilt_series)
+    turned = orientation.series(tilt_series)
+    if orientation.negated:
+        turned = turned.select(np.arange(turned.num_tilts)[::-1])
+    return _run(method, turned, grid, settings).turned(orientation)
 
 
 def _run(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:

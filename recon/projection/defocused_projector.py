@@ -90,7 +90,7 @@ class DefocusedProjector(Projector):
 
     def _blurred(self, rays: Tensor, blur: float) -> Tensor:
         images = rays.view(self.num_tilts, self.detector_width, -1)
-        along_u, along_y = (_gaussian_matrix(size, blur, like=rays) for size in images.shape[1:])
+        along_u, along_y = (gaussian_matrix(size, blur, like=rays) for size in images.shape[1:])
         return (along_u @ images @ along_y).reshape(rays.shape)
 
 
@@ -129,7 +129,7 @@ def _reach(deviation: float) -> int:
     return math.ceil(_REACH * deviation) + 1
 
 
-def _gaussian_matrix(size: int, deviation: float, *, like: Tensor) -> Tensor:
+def gaussian_matrix(size: int, deviation: float, *, like: Tensor) -> Tensor:
     """Symmetric (size, size): a sampled Gaussian of unit sum; what it carries over the edges is lost."""
     reach = torch.arange(-_reach(deviation), _reach(deviation) + 1, dtype=torch.float64)
     position = torch.arange(size, dtype=torch.float64)

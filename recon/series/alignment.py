@@ -73,8 +73,17 @@ class Alignment:
         start = (np.array(image.shape) - 1) / 2 + shift - back @ ((np.array(shape) - 1) / 2)
         seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
         mask = seen > 0.99
+        exact = self.tilt_axis % 90 == 0 and np.array_equal(
+            start, np.round(start)
+        )  # pixels on pixels: values are copied
         moved = affine_transform(
-            image.astype(np.float64), back, start, output_shape=shape, order=3, mode="nearest", output=np.float32
+            image.astype(np.float64),
+            back,
+            start,
+            output_shape=shape,
+            order=0 if exact else 3,
+            mode="nearest",
+            output=np.float32,
         )
         return filled(moved, mask), mask
 

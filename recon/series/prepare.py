@@ -19,6 +19,8 @@ from recon.series.screening import Screening, screen
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
+_ALONG_Y = 3.0  # degrees from y: a volume about an axis so near still explains its images
+
 Progress = Callable[[str, int, int, str], None]
 """``progress(title, done, total, note)``."""
 
@@ -73,7 +75,8 @@ def prepare(
         progress: called with each step of the alignment.
 
     Raises:
-        ValueError: a tilt axis that is no number, too few tilts to align, or images moved out of view entirely.
+        ValueError: a tilt axis that is no number, too few tilts to align, or images moved out of view entirely; or the images
+            contradict each other about y, and their file states another tilt axis.
     """
     if tilt_axis is not None and not np.isfinite(tilt_axis):
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")
@@ -84,6 +87,7 @@ def prepare(
         tilt_series = alignment.apply(tilt_series)
     check_contrast(tilt_series)
     found = screen(tilt_series)
+    _require_axis(tilt_series, found, tilt_axis)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
 
@@ -128,6 +132,20 @@ def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
     """The pixel values to use, image by image."""
     for number, image in enumerate(series.images):
         yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
+
+
+def _require_axis(series: TiltSeries, found: Screening, given: float | None) -> None:
+    """Where a file states another axis than y and nobody said what to do: an aligned series may still carry it, a raw one may
+    not be taken as aligned."""
+    stated = series.tilt_axis
+    if given is not None or stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
+        return
+    words = f"the file states the tilt axis at {stated:g}°, and images are taken as aligned, with the axis along y"
+    advice = f"give --refine-alignment, which starts there, --tilt-axis {stated:g} if only the direction is off, or --tilt-axis 0"
+    if found.suspect.any():
+        misfits = f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others"
+        raise ValueError(f"{words}, but {misfits}; {advice} if they are aligned")
+    warnings.warn(f"{words}; if they are not, {advice} to silence this", stacklevel=3)
 
 
 def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> None:

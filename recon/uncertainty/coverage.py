@@ -14,6 +14,7 @@ from recon.methods._registry import reconstruct
 from recon.projection.base import from_rays, to_columns
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
+from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries
 from recon.uncertainty.posterior import Posterior
 from recon.uncertainty.result import Uncertainty
@@ -82,6 +83,8 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
             f"{len(order)} tilts: leaving out one of {every} leaves nothing to judge by; give a smaller number"
         )
     kept, judged = tilt_series.select(np.setdiff1d(order, left)), tilt_series.select(left)
+    orientation = Orientation.of(kept)  # that of the signal model
+    kept, judged = orientation.series(kept), orientation.series(judged)
     kept = kept.select(np.argsort(kept.tilt_angles, kind="stable"))
     outcome = replace(reconstruct(kept, **settings), uncertainty=None)
     volumes: list[Tensor] = []

@@ -29,6 +29,7 @@ _STEADY_CHANCE, _STEADY_PART = (
     0.3,
 )  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
 _SIGNALS = 16  # bins of equal counts: finer than any smooth misfit
+_BORDERS = 0.1  # of the images: fewer are single faults, which the screening throws out
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -37,7 +38,7 @@ def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[
     images = residuals.images
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
-    for check in (_saturation, _spikes, _lines, _pattern, _uneven):
+    for check in (_saturation, _spikes, _lines, _borders, _pattern, _uneven):
         found, finding = check(tilt_series, images, residuals)
         evidence |= found
         findings += finding
@@ -86,6 +87,34 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
             sentence = f"{count} of {size} {name} hold one value in all tilts, unlike their neighbours"
             findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
     return {"dead lines": dead}, findings
+
+
+def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Sides of single images that hold one value, unlike the pixels beside them: what an alignment moved in from outside."""
+    if tilt_series.mask is not None:  # what was moved in is known
+        return {}, []
+    span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
+    sides = [
+        images.transpose(0, 2, 1),
+        images.transpose(0, 2, 1)[:, ::-1],
+    ]  # (tilt, lines from the side, pixels along it)
+    filled = np.mean([_filled(side, span) for side in sides], axis=0)
+    share = float((filled > 0).mean())
+    evidence = {"filled borders": share}
+    if share < _BORDERS:
+        return evidence, []
+    sentence = (
+        f"{share:.0%} of the images have borders that hold one value, up to {filled.max():.0f} pixels wide on average"
+    )
+    return evidence, [Finding("lines", 2.0, sentence, "mask these borders with --mask FILE", "seen")]
+
+
+def _filled(lines: Array, span: float) -> Array:
+    """(tilt,) how many of the first lines hold one value that the line after them does not come near."""
+    flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
+    count = np.argmin(flat, axis=1)
+    after = lines[np.arange(len(lines)), count].mean(1)
+    return np.where(np.abs(after - lines[:, 0, 0]) > _STEP * span, count, 0)
 
 
 def _dead(lines: Array, span: float) -> int:

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import Coarse
+from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
@@ -17,6 +19,8 @@ _WEDGE, _GAP, _FEWEST = 90.0, 15.0, 20  # degrees without data: with more, most 
 _LEFT_OUT = 0.1  # of the tilts: so many are no exceptions
 _FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of a tilt's own structure that the others predict; of the tilts
 _TWINS = 0.2  # of the structure: twins show the same object but for noise
+_JUMP, _AROUND = 3.0, 9  # times the change between the tilts around, and of how many; good series reach 0.9
+_JUMP_SHARE = 0.1  # of the images' structure; what an alignment leaves in a quiet needle is 0.001
 _RADIANS = 1.6
 _DRIFT = 0.2  # of the beam: the fit follows a drift, but not exactly
 
@@ -31,6 +35,7 @@ def tilt_findings(
         _coverage(tilt_series.tilt_angles),
         _repeats(tilt_series),
         _twins(coarse),
+        _jumps(coarse),
         _foreign(coarse, errors),
         _screened(screening),
     ):
@@ -102,6 +107,34 @@ def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     return evidence, [
         Finding("angles", min(6.0, 3 * share / _TWINS), words, "check the list of tilt angles and its signs", "seen")
     ]
+
+
+def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
+    """Neighbouring tilts that differ far more than those around them: one object turns smoothly.
+
+    What neighbouring rows of the difference share is free of noise; it grows with the square of the step.
+    """
+    images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
+    apart = np.diff(angles) > 0.02
+    if apart.sum() < _AROUND or images.shape[1] < 2:
+        return {}, []
+    differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
+    shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
+    chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
+    usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
+    whole = max(neighbours(images - images.mean(), 1), 1e-30)
+    ratios = np.where(shared * steps**2 > _JUMP_SHARE * whole, (shared - 3 * chance) / usual, 0.0)
+    largest = int(np.argmax(ratios))
+    evidence = {"largest jump": float(ratios[largest])}
+    if ratios[largest] < _JUMP:
+        return evidence, []
+    first, second = np.flatnonzero(apart)[largest] + (0, 1)
+    words = (
+        f"between {angles[first]:g}° and {angles[second]:g}° the images change {ratios[largest]:.0f} times as much as between "
+        "the tilts around: angles are in the wrong order there, or the specimen moved"
+    )
+    strength = min(2.9, ratios[largest] / _JUMP)
+    return evidence, [Finding("angles", strength, words, "check the list of angles and the images of these tilts")]
 
 
 def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:

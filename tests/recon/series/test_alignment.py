@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import rotate
 
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import AxisUndetermined, find_alignment
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 ANGLES = np.arange(-60, 61, 4.0)
 
@@ -171,6 +174,19 @@ def test_images_that_fit_any_axis_are_no_answer(kind):
         assert f"--tilt-axis {named.axis:.0f}" in str(caught.value)
 
 
+@pytest.mark.slow
+def test_noise_that_a_volume_fits_does_not_turn_the_axis_of_a_dense_slab():
+    angles, acquisition = np.arange(-70, 71, 3.0), ACQUISITIONS["low-dose"]
+    clean, _ = clean_tilt_series(
+        make_phantom("slab", 64, generator=np.random.default_rng(1)), angles, acquisition=acquisition
+    )
+    turned = rotate(
+        clean.images.astype(float), 33.0, axes=(2, 1), reshape=False, order=3, cval=clean.images.min()
+    ).clip(0)
+    found = find_alignment(add_noise(replace(clean, images=turned), acquisition.noise(), seed=1))
+    assert abs(found.tilt_axis) == pytest.approx(33.0, abs=1.5)  # unsmoothed, 8° and more off
+
+
 def test_a_stated_axis_decides_where_the_images_do_not():
     found = find_alignment(replace(revolution("rod"), tilt_axis=27.0))
     assert found.tilt_axis == pytest.approx(30, abs=6)
@@ -211,3 +227,18 @@ def test_raw_needle_is_aligned_or_its_axis_asked_for(hint):
     found = find_alignment(series, tilt_axis=hint)
     assert (found.tilt_axis - 92.8 + 90) % 180 - 90 == pytest.approx(0, abs=2)
     assert found.residual < 0.01
+
+
+def test_a_raw_series_whose_file_states_another_axis_is_asked_to_be_aligned():
+    raw = replace(blobs(90.0, random_shifts(6.0), shape=(28, 28)), tilt_axis=90.0)
+    with pytest.raises(ValueError, match=r"axis at 90°.*do not fit.*--refine-alignment.*--tilt-axis 0"):
+        prepare(raw)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match="do not fit"):  # as before, where the axis is said to be along y
+            prepare(raw, tilt_axis=0.0)
+    aligned = replace(
+        blobs(0.0, np.zeros((len(ANGLES), 2)), shape=(28, 28)), tilt_axis=90.0
+    )  # the title is of the raw one
+    with pytest.warns(UserWarning, match=r"taken as aligned.*--refine-alignment"):
+        assert prepare(aligned).alignment is None

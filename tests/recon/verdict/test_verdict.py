@@ -149,6 +149,7 @@ def test_a_good_reconstruction_is_good() -> None:
         "pure noise",
         "missing rows",
         "one image repeated over a third of the tilts",
+        "ten neighbouring tilts in reversed order",
     ],
 )
 @pytest.mark.usefixtures("one_thread")
@@ -157,6 +158,15 @@ def test_what_spoils_a_series_is_named(name: str) -> None:
     verdict = judged(spoilt.series, spoilt.thickness)
     assert verdict.grade != "good"
     assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_borders_that_an_alignment_filled_are_seen_until_they_are_masked() -> None:
+    name = "borders of zeros after an alignment"
+    series = spoil(scene("shells", "clipped"), name, other=scene(seed=9), seed=5).series
+    verdict = judged(series)
+    assert "lines" in verdict.subjects[:2], verdict.reasons
+    assert "lines" not in judged(replace(series, mask=series.images > 0)).subjects
 
 
 @pytest.mark.slow
