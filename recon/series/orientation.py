@@ -62,8 +62,15 @@ class Orientation:
         return _flipped(images, {-2: self.upside_down, -1: self.mirrored})
 
     def volume(self, volume: NDArray[Any]) -> NDArray[Any]:
-        """A volume (z, y, x), there or back: u = x cos θ + z sin θ."""
-        return _flipped(volume, {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored})
+        """A volume (z, y, x), there or back: u = x cos θ + z sin θ. One that lies in a file is flipped there."""
+        axes = {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored}
+        if not is_mapped(volume):
+            return _flipped(volume, axes)
+        for z in range((len(volume) + 1) // 2 if axes[0] else len(volume)):
+            other = len(volume) - 1 - z if axes[0] else z
+            lower, upper = (_flipped(np.array(volume[place]), {0: axes[1], 1: axes[2]}) for place in (z, other))
+            volume[other], volume[z] = lower, upper
+        return volume
 
 
 def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
@@ -74,4 +81,4 @@ def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArra
 
 
 def _flipped(array: NDArray[Any], axes: dict[int, bool]) -> NDArray[Any]:
-    return np.ascontiguousarray(np.flip(array, [axis for axis, flip in axes.items() if flip]))
+    return np.ascontiguousarray(np.flip(array, tuple(axis for axis, flip in axes.items() if flip)))

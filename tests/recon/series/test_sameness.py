@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -256,3 +257,14 @@ def test_order_is_restored_and_a_level_taken_off_exactly() -> None:
     assert low.images.dtype == np.float32
     np.testing.assert_allclose(low.images.astype(np.float64) + level - 2.0**20, images, atol=1e-6)
     assert without_level(replace(given, mode="transmission"))[1] == 0
+
+
+@pytest.mark.parametrize("flips", itertools.product((False, True), repeat=3))
+def test_a_volume_in_a_file_is_flipped_there_as_one_in_memory_is(tmp_path, flips):
+    volume = np.random.default_rng(0).random((5, 3, 4), np.float32)
+    in_file = np.lib.format.open_memmap(tmp_path / "volume.npy", "w+", np.float32, volume.shape)
+    in_file[:] = volume
+    expected = Orientation(*flips).volume(volume)
+    assert Orientation(*flips).volume(in_file) is in_file
+    in_file.flush()
+    assert np.array_equal(np.load(tmp_path / "volume.npy"), expected)
