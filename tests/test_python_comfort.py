@@ -169,6 +169,7 @@ def instances() -> list[Any]:
     result = reconstructor(series, grid)
     return [
         *(make() for make in MODELS),
+        noiseflow.AtLevel(noiseflow.Gaussian(0.1), 1000.0),
         noiseflow.Digitisation(1.0, 0, 255),
         noiseflow.KnownSignal(SIGNAL),
         noiseflow.StaticScene(NOISY),
