@@ -122,8 +122,9 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     schedule = Schedule() if schedule is None else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
     stages = _on_the_slab(facts, schedule) if choosing else []
-    if not choosing and not facts.settled:
-        stages.append(FitStage("start noise", "noise", "whole", "simple", _START, standardise=True))
+    if not facts.settled and not (choosing and (facts.quiet or facts.simple_is_final)):
+        # the slab of most contrast leaves more than the volume does
+        stages.append(FitStage("start noise of the volume", "noise", "whole", "simple", _START, standardise=True))
     usual = schedule.quiet if facts.quiet else schedule.whole
     stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps)
     if facts.quiet and facts.simple_is_final and not facts.settled:

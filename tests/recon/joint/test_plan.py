@@ -27,6 +27,7 @@ PLANS = {
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
+        whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6
         whole  fit                          signal      113  chosen, rate 0.6
         """,
@@ -54,6 +55,7 @@ PLANS = {
         slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
+        whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6, half resolution
         whole  go on                        signal      37  chosen, rate 0.6, half resolution
         whole  fit                          signal      76  chosen, rate 0.6
@@ -62,7 +64,7 @@ PLANS = {
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
         """
-        whole  start noise                  noise       10  simple
+        whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6, half resolution
         whole  go on                        signal      37  chosen, rate 0.6, half resolution
         whole  fit                          signal      76  chosen, rate 0.6
