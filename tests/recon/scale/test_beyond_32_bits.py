@@ -1,5 +1,4 @@
-"""More than 2³¹ voxels, pixels or non-zeros: the last element is right. Files are sparse and arrays virtual: none is so large on the
-disk or in memory."""
+"""More than 2³¹ voxels, pixels or non-zeros: the last element is right. Files are sparse and arrays virtual, and hold nothing."""
 
 import os
 
