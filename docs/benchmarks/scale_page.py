@@ -79,9 +79,9 @@ def estimates(content: Cell) -> str:
     )
     return text + (
         f"- **Time**: at 512³ a slice of a block takes {slice_seconds:.2f} s of processor time, halo included, and what is "
-        f"settled first takes {start:.0f} s. Both grow with the area of a slice. The first runs on all workers, the second on one. The "
-        f"blocks are then put together at {_DISK / 1e6:.0f} MB a second, which is assumed. A volume without vacuum takes as many "
-        "times longer as `slab-512` does beside `shells-512`.\n"
+        f"settled first takes {start:.0f} s. Both grow with the area of a slice. The first runs on all workers, the second "
+        f"on one. The blocks are then put together at {_DISK / 1e6:.0f} MB a second, which is assumed. A volume without "
+        "vacuum takes as many times longer as `slab-512` does beside `shells-512`.\n"
         "- **Memory**: the estimate of `noiseflow reconstruct --dry-run`. The matrix of the projector alone is tilts × width × "
         "depth × 32 bytes, in every worker.\n"
         "- **Disk**: the finished blocks with their halo, the volume, and the series, until the volume is whole.\n"
