@@ -35,6 +35,12 @@ def kept_memory() -> Iterator[None]:
             libc.malloc_trim(0)
 
 
+def hand_back() -> None:
+    """Give the system what is kept so far, within `kept_memory`: what follows wants arrays of other sizes."""
+    if libc := _glibc():
+        libc.malloc_trim(0)
+
+
 def _glibc() -> ctypes.CDLL | None:
     try:
         libc = ctypes.CDLL("libc.so.6")

@@ -3,7 +3,7 @@
     python docs/benchmarks/scale.py run                      # all rows but the largest; those already there are kept
     python docs/benchmarks/scale.py run --row shells-512 --row shells-1000
     python docs/benchmarks/scale.py run --threads 2 --cache /data/scale --out FILE
-    python docs/benchmarks/scale.py page                     # scale.md and its figure from the JSON
+    python docs/benchmarks/scale.py page                     # scale.md, its figure, and scale_estimates.md from the JSON
 
 Peak memory is the largest resident set of the process that the operating system saw, pages of mapped files included. Simulated
 series stay in the cache folder, and are made slab by slab; volumes are removed when they are judged. Results go to
@@ -50,6 +50,7 @@ class Row:
 
 ROWS = {
     **{f"shells-{size}": Row("shells", size) for size in (64, 128, 192, 256, 512)},
+    "start-512": Row("shells", 512, ("--steps", "1")),
     "slab-512": Row("slab", 512),
     "sirt-512": Row("shells", 512, ("--method", "sirt")),
     "l2-512": Row("shells", 512, ("--method", "l2")),

@@ -79,5 +79,5 @@ def _ratio(array: Array, border: int) -> float:
     total = np.zeros(stop - first - 1)
     for section in array[:, first:stop]:  # section by section: a slab of a large volume lies all over the file
         total += np.abs(np.diff(section, axis=0)).mean(1)
-    inside = np.delete(total, border - first)
-    return float(total[border - first] / np.median(inside))
+    inside = float(np.median(np.delete(total, border - first)))
+    return float(total[border - first]) / inside if inside else 1.0  # vacuum on either side jumps nowhere

@@ -1,10 +1,34 @@
-"""The results page of the scale benchmark, scale.md, from results/scale.json alone."""
+"""The results pages of the scale benchmark, scale.md and scale_estimates.md, from results/scale.json alone."""
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from noiseflow.io import atomic_path
+from recon.benchmarks.provenance import measured_on
+from recon.scale.blocks import HALO, SETTLED_ON, block_memory, blocks
+from recon.scale.memory import needed_memory
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+HERE = Path(__file__).parent
+_SHELLS = ("shells-64", "shells-128", "shells-192", "shells-256", "shells-512", "shells-1000")
+_OTHERS = ("slab-128", "slab-blocks-128", "blocks-128", "blocks-256", "slab-512", "sirt-512", "l2-512")
+_GOALS = {"shells-512": (240, 4), "slab-512": (720, 4), "shells-1000": (2700, 12)}
+_TILTS, _LARGER, _WORKERS, _SLICES = 79, (1000, 2000, 4000), (1, 16, 256), 64
+_DISK = 500e6  # bytes a second of a disk that workers share: assumed
 Cell = dict[str, Any]
+
+
+def write(content: Cell) -> None:
+    """Write both pages and the figure."""
+    _draw({name: row for name, row in _rows(content, "scale/").items() if name in _SHELLS})
+    for name, text in (("scale.md", page(content)), ("scale_estimates.md", estimates(content))):
+        with atomic_path(HERE / name) as partial:
+            partial.write_text(text, encoding="utf-8")
 
 
 def in_words(name: str, row: Cell) -> str:
@@ -14,3 +38,179 @@ def in_words(name: str, row: Cell) -> str:
         f"{name}: {row['seconds']:.0f} s, {row['processor seconds']:.0f} s of processor time, {row['peak GiB']:.2f} GiB, "
         f"{row['psnr']:.2f} dB, {row['blocks']} blocks{seam}"
     )
+
+
+def page(content: Cell) -> str:
+    """The results as Markdown."""
+    rows = _rows(content, "scale/")
+    parts = [
+        "# Time and memory over size",
+        "![Seconds and peak memory of the joint fit over voxels × tilts, shells of 64³ to the largest size measured](scale.png)",
+        "Every row is one command, `noiseflow reconstruct`, in a process of its own: 79 tilts, clipped noise, everything chosen. "
+        "Written by `python docs/benchmarks/scale.py page` from `results/scale.json`; "
+        "`python docs/benchmarks/scale.py run` measures the rows. Peak memory is the largest resident set that the operating "
+        "system saw, pages of mapped files included. *Seam* is how much the volume jumps across the border of two blocks, over "
+        "neighbouring slices inside, at the border where that is largest; beside it, the same of the truth. *Load* is the number "
+        "of processes that waited for a core when the row began: where it is high, only processor time compares.",
+        _table(rows),
+        _growth(rows),
+        _processes(rows),
+        _simulated(_rows(content, "simulate/")),
+        measured_on([content]),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def estimates(content: Cell) -> str:
+    """What larger volumes would take, as Markdown; from the rows of 512³."""
+    rows = _rows(content, "scale/")
+    text = "# Estimates for 1000³ to 4000³\n\n"
+    if not {"shells-512", "start-512"} <= rows.keys():
+        return text + "Rows `shells-512` and `start-512` are needed: `python docs/benchmarks/scale.py run`.\n"
+    slice_seconds, start = _constants(rows["shells-512"], rows["start-512"])
+    lines = [
+        "| volume | workers | one worker's memory | disk | network | time |",
+        "|---|---|---|---|---|---|",
+        *(_estimate(size, workers, slice_seconds, start) for size in _LARGER for workers in _WORKERS),
+    ]
+    text += (
+        "Not measured: computed by `python docs/benchmarks/scale.py page` for shells, 79 tilts, blocks of "
+        f"{_SLICES} slices, one thread a worker.\n\n" + "\n".join(lines) + "\n\n"
+    )
+    return text + (
+        f"- **Time**: at 512³ a slice of a block takes {slice_seconds:.2f} s of processor time, halo included, and what is "
+        f"settled first takes {start:.0f} s. Both grow with the area of a slice. The first runs on all workers, the second "
+        f"on one. The blocks are then put together at {_DISK / 1e6:.0f} MB a second, which is assumed. A volume without "
+        "vacuum takes as many times longer as `slab-512` does beside `shells-512`.\n"
+        "- **Memory**: the estimate of `noiseflow reconstruct --dry-run`. The matrix of the projector alone is tilts × width × "
+        "depth × 32 bytes, in every worker.\n"
+        "- **Disk**: the finished blocks with their halo, the volume, and the series, until the volume is whole.\n"
+        "- **Network**: the same blocks, written once and read once, and rows of the series, read once.\n\n"
+        "## What would break first\n\n"
+        "1. The matrix of the projector: 9 GiB at 2000 pixels of width and 79 tilts, 38 GiB at 4000. Wider images need tiles "
+        "along x, or a projector without a matrix.\n"
+        "2. Settling runs on one worker: beyond a few dozen workers it takes most of the time.\n"
+        "3. One process puts the blocks together; 4000³ voxels are 238 GiB.\n"
+    )
+
+
+def _rows(content: Cell, start: str) -> dict[str, Cell]:
+    return {key.removeprefix(start): row for key, row in content["cells"].items() if key.startswith(start)}
+
+
+def _table(rows: dict[str, Cell]) -> str:
+    lines = [
+        "| row | blocks | threads | seconds | processor s | peak GiB | PSNR (dB) | seam | truth | load | goal |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name in (*_SHELLS, *_OTHERS):
+        if name not in rows:
+            continue
+        row, goal = rows[name], _GOALS.get(name)
+        seams = ("–", "–") if row["seam"] is None else (f"{row[key]:.2f}" for key in ("seam", "seam of the truth"))
+        cells = [f"{name} {' '.join(row['options'])}", row["blocks"], row["threads"], f"{row['seconds']:.0f}"]
+        cells += [
+            f"{row['processor seconds']:.0f}",
+            f"{row['peak GiB']:.2f}",
+            f"{row['psnr']:.2f}",
+            *seams,
+            row["load"],
+        ]
+        cells.append("" if goal is None else f"{goal[0]} s, {goal[1]} GiB")
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def _growth(rows: dict[str, Cell]) -> str:
+    """The exponents of a power law through the shells up to 512³."""
+    found = [rows[name] for name in _SHELLS if name in rows and rows[name]["size"] <= 512]
+    if len(found) < 2:
+        return ""
+    work = np.log([row["size"] ** 3 * _TILTS for row in found])
+    exponents = {
+        name: np.polyfit(work, np.log([row[name] for row in found]), 1)[0] for name in ("seconds", "processor seconds")
+    }
+    return (
+        f"From {found[0]['size']}³ to {found[-1]['size']}³, time grows with voxels × tilts to the power of "
+        f"{exponents['seconds']:.2f} (processor time: {exponents['processor seconds']:.2f}); the goal is 0.9 or less."
+    )
+
+
+def _processes(rows: dict[str, Cell]) -> str:
+    if not {"processes-1", "processes-2"} <= rows.keys():
+        return ""
+    one, two = (rows[name]["seconds"] for name in ("processes-1", "processes-2"))
+    return (
+        f"256³ in four blocks: {two:.0f} s with two Dask workers of one thread, {one:.0f} s with one process of two threads; "
+        f"{one / two:.2f} of its speed, and the goal is 0.9 or more."
+    )
+
+
+def _simulated(rows: dict[str, Cell]) -> str:
+    if not rows:
+        return ""
+    parts = [f"{name} {row['processor seconds']:.0f} s and {row['peak GiB']:.2f} GiB" for name, row in rows.items()]
+    return f"`noiseflow simulate` made the series: {', '.join(parts)}."
+
+
+def _constants(whole: Cell, start: Cell) -> tuple[float, float]:
+    """Processor seconds of a slice of a block, and of what is settled, at the size of these rows.
+
+    The row `start` takes one step in place of all; the last fit of the slabs that settle is among those that it leaves out.
+    """
+    slices = sum(part.wide.stop - part.wide.start for part in blocks(whole["size"], _SLICES, HALO))
+    of_slice = (whole["processor seconds"] - start["processor seconds"]) / (slices + SETTLED_ON)
+    return of_slice, start["processor seconds"] + SETTLED_ON * of_slice
+
+
+def _estimate(size: int, workers: int, slice_seconds: float, start: float) -> str:
+    parts, area = blocks(size, _SLICES, HALO), (size / 512) ** 2
+    heights = [part.wide.stop - part.wide.start for part in parts]
+    rounds = math.ceil(len(parts) / workers) * max(heights) if workers > 1 else sum(heights)
+    kept, volume, series = 4 * size**2 * sum(heights), 4 * size**3, 4 * _TILTS * size**2
+    seconds = area * (start + rounds * slice_seconds) + (kept + volume) / _DISK
+    shape = np.broadcast_to(np.float32(1), (_TILTS, size, size))
+    block = block_memory(_Virtual(shape), VolumeGrid(size, size, size), _SLICES, fitted=True)
+    memory = needed_memory(*block)
+    cells = [f"{size}³", workers, _bytes(memory), _bytes(kept + volume + series), _bytes(2 * kept + series)]
+    return "| " + " | ".join(map(str, [*cells, _time(seconds)])) + " |"
+
+
+class _Virtual(TiltSeries):
+    """A series without its pixels."""
+
+    def __init__(self, images: Any) -> None:
+        for name, value in (("images", images), ("mask", None), ("tilt_angles", np.arange(float(len(images))))):
+            object.__setattr__(self, name, value)
+
+
+def _bytes(count: float) -> str:
+    return f"{count / 2**40:.1f} TiB" if count >= 2**40 else f"{count / 2**30:.0f} GiB"
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds >= 5400 else f"{seconds / 60:.0f} min"
+
+
+def _draw(rows: dict[str, Cell]) -> None:
+    """Seconds and memory over voxels × tilts."""
+    from matplotlib.figure import Figure
+
+    if not rows:
+        return
+    found = sorted(rows.values(), key=lambda row: row["size"])
+    work = [row["size"] ** 3 * _TILTS for row in found]
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    time, memory = figure.subplots(1, 2)
+    for name, style in (("seconds", "o-"), ("processor seconds", "s--")):
+        time.loglog(work, [row[name] for row in found], style, label=name)
+    time.legend()
+    time.set(xlabel="voxels × tilts", ylabel="seconds", title="Time")
+    memory.loglog(work, [row["peak GiB"] for row in found], "o-")
+    memory.set(xlabel="voxels × tilts", ylabel="peak memory, GiB", title="Memory")
+    for axis in (time, memory):
+        for row, place in zip(found, work, strict=True):
+            axis.annotate(f"{row['size']}³", (place, axis.get_ylim()[0]), fontsize=8, ha="center", va="bottom")
+        axis.grid(alpha=0.3)
+    with atomic_path(HERE / "scale.png") as partial:
+        figure.savefig(partial, dpi=110)

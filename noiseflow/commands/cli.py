@@ -23,7 +23,7 @@ from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
 from noiseflow.plugins import load_plugin, package_of, plugins
 
-_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "compare", "doctor")
+_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "doctor")
 _TYPED = "noiseflow.typed"
 _UNASKED = ("DEFAULT", "DEFAULT_MAP")
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}

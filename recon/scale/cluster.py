@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+_ONE_AT_A_TIME = threading.Lock()
 _PATIENCE = 20  # s; a scheduler that is there answers within one
+
+
+@contextmanager
+def all_threads_of_worker() -> Iterator[int]:
+    """The number of threads of the Dask worker that runs this; it gives them all to one task, for a second one would need its
+    memory again."""
+    import dask.distributed
+
+    library: Any = dask.distributed  # it has no types
+    with _ONE_AT_A_TIME:
+        yield max(1, library.get_worker().state.nthreads)
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
@@ -42,9 +60,8 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         with client:
             yield client
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     options: dict[str, Any] = {"dashboard_address": None, "processes": True, "silence_logs": 50}
-    threads = max(1, cores // (workers or 1))
+    threads = max(1, usable_cores() // (workers or 1))
     with (
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
         library.Client(cluster, set_as_default=False) as client,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,10 +17,8 @@ from noiseflow.io import atomic_path
 from noiseflow.io.numpy_files import write as write_npy
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
+from recon.scale.cluster import all_threads_of_worker
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-
-_ONE_AT_A_TIME = threading.Lock()
-"""A worker with several threads gives them all to one block: a second one would need its memory again."""
 
 
 def reconstruct_in_blocks(
@@ -139,8 +136,6 @@ def _no_result(*_: Any) -> Any:
 
 
 def _solve_stored(method: Blockwise, source: StoredSeries, block: Block, files: BlockFiles) -> None:
-    from dask.distributed import get_worker
-
-    with _ONE_AT_A_TIME:
-        torch.set_num_threads(max(1, get_worker().state.nthreads))
+    with all_threads_of_worker() as threads:
+        torch.set_num_threads(threads)
         solve_block(method, source.open(), block, files)

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from noiseflow.kept_memory import _glibc, kept_memory
+from noiseflow.kept_memory import _glibc, hand_back, kept_memory
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux" or _glibc() is None, reason="glibc alone is told")
 _BYTES, _PAGE = 64 * 2**20, 4096
@@ -33,6 +33,14 @@ def test_pages_are_cleared_once_and_handed_back_by_the_outermost() -> None:
         assert new_pages() < 100
         held = resident()
     assert resident() < held - _BYTES / 2
+
+
+def test_between_two_parts_of_something_long_memory_can_be_handed_back() -> None:
+    with kept_memory():
+        new_pages()
+        held = resident()
+        hand_back()
+        assert resident() < held - _BYTES / 2
 
 
 @kept_memory()

@@ -1,0 +1,96 @@
+"""The command `noiseflow batch`."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, progress_bar
+
+if TYPE_CHECKING:
+    from recon.scale.many import Job, Row
+
+
+def batch(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder of tilt series, or a CSV table: column tilts, and out and options where they differ."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
+    table: Annotated[
+        Path | None,
+        typer.Option(help="Table of verdicts and figures: .csv or .json; batch.csv beside the volumes if not given."),
+    ] = None,
+    noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
+    options: Annotated[
+        str,
+        typer.Option(help="Further options of reconstruct for all series, in quotes: '--method sirt --thickness 64'."),
+    ] = "",
+    workers: Annotated[int, typer.Option(min=1, help="Series at a time; they share this machine's cores.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the series.")
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume", help="Leave out series that the table calls done; go on with those that were stopped."
+        ),
+    ] = False,
+    overwrite: OverwriteOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Reconstruct many tilt series, and write one table of verdicts and figures. One that fails does not stop the others."""
+    from noiseflow import io
+    from recon.scale.cluster import client_of
+    from recon.scale.many import jobs_of, read_table, reconstruct_all, write_table
+
+    output, table = Output(json), out / "batch.csv" if table is None else table
+    if table.suffix.lower() not in (".csv", ".json"):
+        raise ValueError(f"--table {table}: name a .csv or a .json file")
+    words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
+    jobs = jobs_of(source, out, words)
+    out.mkdir(parents=True, exist_ok=True)
+    with io.locked(table):
+        rows = [row for row in read_table(table) if row["status"] == "done"] if resume else []
+        known = {row["volume"] for row in rows if Path(row["volume"]).exists()}
+        rows = [row for row in rows if row["volume"] in known]
+        left = [job for job in jobs if str(job.out) not in known]
+        if known:
+            output.line(f"{len(known)} of {len(jobs)} series are done already")
+        with (
+            client_of(None, scheduler) as client,
+            progress_bar("series", max(1, len(left)), json_mode=json) as progress,
+        ):
+            for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
+                rows.append(row)
+                write_table(table, _in_order(rows, jobs))
+                progress(done, Path(row["series"]).name)
+                output.line(_in_words(row))
+        write_table(table, rows := _in_order(rows, jobs))
+    failed = [row for row in rows if row["status"] != "done"]
+    output.line(f"{len(rows) - len(failed)} of {len(jobs)} series reconstructed; table: {table}")
+    output.result({"table": table, "series": rows})
+    if failed:
+        raise ValueError(f"{len(failed)} of {len(jobs)} series failed; {table} says why, and --resume tries them again")
+
+
+def _shared_words(options: str, noise_model: Path | None, *, resume: bool, overwrite: bool) -> list[str]:
+    words = shlex.split(options)
+    if noise_model is not None:
+        words += ["--noise-model", str(noise_model)]
+    return words + ["--resume"] * resume + ["--overwrite"] * overwrite
+
+
+def _in_order(rows: list[Row], jobs: list[Job]) -> list[Row]:
+    places = {str(job.out): place for place, job in enumerate(jobs)}
+    return sorted(rows, key=lambda row: places.get(row["volume"], len(places)))
+
+
+def _in_words(row: Row) -> str:
+    name = Path(row["series"]).name
+    return f"{name}: {row['verdict']}. {row['reason']}" if row["status"] == "done" else f"{name} failed: {row['error']}"

@@ -1,0 +1,62 @@
+"""The scale benchmark: its page says what its JSON says, and its measures of volumes and processes are right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from noiseflow import io
+from recon.metrics.metrics import compare
+from recon.scale.blocks import HALO, blocks
+
+BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
+
+
+@pytest.fixture(autouse=True)
+def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def test_pages_agree_with_their_json() -> None:
+    import scale_page
+
+    content = json.loads((BENCHMARKS / "results" / "scale.json").read_text(encoding="utf-8"))
+    assert (BENCHMARKS / "scale.md").read_text(encoding="utf-8") == scale_page.page(content)
+    assert (BENCHMARKS / "scale_estimates.md").read_text(encoding="utf-8") == scale_page.estimates(content)
+
+
+def test_a_seam_is_the_jump_across_a_border(tmp_path: Path) -> None:
+    from scale_measure import psnr, seams
+
+    generator = np.random.default_rng(0)
+    truth = generator.random((6, 64, 8), dtype=np.float32)
+    found = truth + np.float32(0.01) * generator.standard_normal(truth.shape, dtype=np.float32)
+    found[:, blocks(64, 20, HALO)[2].rows.start :] += 5
+    for name, array in (("found", found), ("truth", truth)):
+        io.write(tmp_path / f"{name}.mrc", array)
+    said = seams(tmp_path / "found.mrc", tmp_path / "truth.mrc", 20)
+    assert said["blocks"] == 4
+    assert said["seam"] > 10
+    assert said["seam of the truth"] == pytest.approx(1, abs=0.3)
+    assert psnr(tmp_path / "found.mrc", tmp_path / "truth.mrc") == pytest.approx(compare(found, truth).psnr, rel=1e-5)
+    io.write(tmp_path / "empty.mrc", np.zeros_like(truth))
+    assert seams(tmp_path / "empty.mrc", tmp_path / "empty.mrc", 20)["seam"] == 1
+    assert seams(tmp_path / "found.mrc", tmp_path / "truth.mrc", None)["seam"] is None
+
+
+def test_memory_of_a_command_is_that_of_its_own_process(tmp_path: Path) -> None:
+    from scale_measure import run
+
+    array = np.random.default_rng(0).random((8, 8, 8), dtype=np.float32)
+    io.write(tmp_path / "v.mrc", array)
+    held = np.ones(2**28, np.uint8)  # of this process, and not of the child's
+    figures, said = run("compare", tmp_path / "v.mrc", tmp_path / "v.mrc", threads=1)
+    assert said["errors"]["raw"]["mse"] == 0
+    assert 0.05 < figures["peak GiB"] < 1
+    assert figures["processor seconds"] > 0.1
+    del held
+    with pytest.raises(RuntimeError, match=r"missing\.mrc"):
+        run("compare", tmp_path / "missing.mrc", tmp_path / "v.mrc", threads=1)
