@@ -124,7 +124,8 @@ def _thinned(pixels: Pixels, seed: int) -> Pixels:
     blocks = np.unique(pixels.block)
     if len(blocks) <= MOST_BLOCKS:
         return pixels
-    kept = np.isin(pixels.block, np.random.default_rng(seed).permutation(blocks)[:MOST_BLOCKS])
+    generator = np.random.default_rng([seed, 1])  # not the one that chose the blocks kept apart
+    kept = np.isin(pixels.block, generator.permutation(blocks)[:MOST_BLOCKS])
     return Pixels(*(values[kept] for values in (pixels.signal, pixels.observation, pixels.held_out, pixels.block)))
 
 

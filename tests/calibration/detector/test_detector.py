@@ -1,5 +1,6 @@
 """The detector's likelihood is exact, its posterior honest, and what cannot be measured is refused."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from calibration.detector.posterior import (
 from calibration.detector.shape import misfit, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
-from calibration.registration.aligned import align_pair, align_with
+from calibration.registration.aligned import align_pair, align_with, block_split
 from calibration.registration.bursts import align_burst
 
 from ..conftest import expose, rigid, textured_scene
@@ -329,10 +330,11 @@ def test_frames_of_a_burst_share_their_histograms_and_even_pixels_raise_no_alarm
 
 
 def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
-    number = 2 * MOST_BLOCKS
-    block = np.repeat(np.arange(number), 4)
-    pixels = Pixels(np.zeros(block.size), np.zeros(block.size), block % 2 == 0, block)
+    side = 8 * math.isqrt(2 * MOST_BLOCKS)
+    row, column = np.indices((side, side)) // 8
+    block, apart = row * (side // 8) + column, block_split((side, side), np.random.default_rng(0))
+    pixels = Pixels(np.zeros(block.size), np.zeros(block.size), apart.ravel(), block.ravel())
     kept = _thinned(pixels, 0)
     assert len(np.unique(kept.block)) == MOST_BLOCKS
-    assert len(kept.signal) == 4 * MOST_BLOCKS
+    assert len(kept.signal) == 64 * MOST_BLOCKS
     assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)
