@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
     "poisson": "Poisson",
+    "counting": "DeadTimeCounter",
     "poisson-gaussian": "PoissonGaussian",
     "excess-noise": "ExcessNoise",
     "signal-gaussian": "SignalDependentGaussian",
@@ -37,6 +38,9 @@ BLOCK = 8
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
 """Those that are fitted always; the flexible ones only where these leave something to gain."""
+
+MOST_COUNTS = 1e4
+"""Mean counts above which values are no counts of single events: dead times of counters end there at exposures of a frame."""
 
 FLEXIBLE = ("mixture", "flow", "spline", "physics-flow")
 """Those of some thousand parameters."""
@@ -173,7 +177,7 @@ def fit_models(
     Raises:
         ValueError: an unknown kind, or a model that cannot be fitted.
     """
-    models = _fitted(sorted(kinds or SIMPLE, key=_rank), pixels, detector, seed, device)
+    models = _fitted(sorted(kinds or _simple(pixels), key=_rank), pixels, detector, seed, device)
     if progress is not None:
         progress(len(models), "simple models")
     losses = {name: _losses(model, pixels) for name, model in models.items()}
@@ -186,6 +190,13 @@ def fit_models(
     if progress is not None:
         progress(len(KINDS), "all models")
     return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]
+
+
+def _simple(pixels: Pixels) -> tuple[str, ...]:
+    """The models fitted always; and a counter with dead time to whole numbers that scatter less than Poisson counts."""
+    whole = pixels.observation.min() >= 0 and np.array_equal(pixels.observation, np.round(pixels.observation))
+    scatter = float(np.mean((pixels.observation - pixels.signal) ** 2))
+    return (*SIMPLE, "counting") if whole and scatter < float(pixels.signal.mean()) < MOST_COUNTS else SIMPLE
 
 
 def attainable(model: nn.Module, pixels: Pixels) -> float:
