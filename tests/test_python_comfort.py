@@ -41,6 +41,7 @@ MODELS: list[Callable[[], torch.nn.Module]] = [
     lambda: noiseflow.ScanNoise(noiseflow.Gaussian()),
     lambda: noiseflow.WithMaps(noiseflow.Gaussian(), np.full(SIGNAL.shape, 1.1)),
     noiseflow.ExcessNoise,
+    noiseflow.DeadTimeCounter,
 ]
 
 

@@ -345,3 +345,24 @@ def test_legends_hide_no_data():
     figure.draw_without_rendering()
     (legend,) = figure.legends
     assert not legend.get_window_extent().overlaps(axis.get_window_extent())
+
+
+def test_figures_on_cards_stay_on_one_line(browser, tmp_path):
+    values = (
+        "good",
+        "2.0046 counts/e⁻",
+        "2.008 (1.967 … 2.049)",
+        "104.9 (81.61 … 122.8)",
+        "Poisson-Gaussian corrected by a flow",
+    )
+    report = Report("Cards")
+    report.facts([(f"figure {number}", value) for number, value in enumerate(values)])
+    page = browser.new_page(viewport={"width": 1200, "height": 600})
+    page.goto(report.save(tmp_path / "cards.html").as_uri())
+    heights = page.evaluate(
+        "[...document.querySelectorAll('.facts dd')].map(d => d.offsetHeight / parseFloat(getComputedStyle(d).lineHeight))"
+    )
+    assert len(heights) == len(values)
+    assert max(heights) < 1.5
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1200
+    page.close()

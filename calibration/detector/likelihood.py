@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from calibration.detector.levels import Levels, Scale
 from calibration.exposures.frames import Image
 
-LEAST_MASS = 1e-8
-"""Probability below which rounding errors of the Fourier transform rule; outliers so far out all count alike."""
-
 LEAST_SIZE = 1e-8
-"""Size of a characteristic function that is left out."""
+"""Size of a characteristic function that is left out: of 10⁷ readings it moves a tenth of one from its cell."""
+
+LEAST_MASS = LEAST_SIZE
+"""Probability below which what was left out of the transform rules; outliers so far out all count alike."""
 
 LARGEST_GAIN = 30.0
 """Nats that another scale of the signals may gain: where it seems more, the second order no longer holds."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,8 @@ ratio of 16."""
 
 LARGEST_SLOPE = 0.5
 """Scale of the exposures above which the signal's own noise is too large a share to be taken on such a test."""
+
+COLUMNS = ("observation", "signal", "level")
 
 FEW_ELECTRONS = 25.0
 """Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
@@ -98,9 +100,7 @@ def measure_detector(
         residual, fine = readings_of(pair, number)
         plain += residual
         cells += fine
-    plain += [
-        one for burst, is_dark in ((dark, True), (flat, False)) if burst for one in _burst_readings(burst, is_dark)
-    ]
+    plain = pooled(plain) + [_burst_readings(one, dark=one is dark) for one in (dark, flat) if one is not None]
     offset = dark_offset(dark) if dark else None
     levels = [collect_levels(plain)] if plain else []
     start = None
@@ -243,14 +243,26 @@ def dark_deviation(dark: Burst | None) -> float | None:
     return float(np.sqrt(max(float(dark.frames.var(axis=0, ddof=1).mean()) - rounding, 0.0)))
 
 
-def _burst_readings(burst: Burst, dark: bool) -> list[Readings]:
+def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
     """Every frame beside the mean of the others, with no scene to align."""
     number = len(burst.frames)
-    total, share = burst.frames.sum(0), 1 / (number - 1)
-    found = []
-    for frame in burst.frames:
-        others = (total - frame) / (number - 1)
-        signal = others + (frame - others).mean()
-        parts = (frame.ravel(), signal.ravel(), np.full(frame.size, frame.mean()))
-        found.append(Readings(*parts, share, share, 1 - 1 / number, dark, rounding_step(frame)))
-    return found
+    others, share = (burst.frames.sum(0) - burst.frames) / (number - 1), 1 / (number - 1)
+    signal = others + (burst.frames - others).mean(axis=(1, 2), keepdims=True)
+    level = np.broadcast_to(burst.frames.mean(axis=(1, 2), keepdims=True), signal.shape)
+    step = rounding_step(burst.frames)
+    return Readings(
+        burst.frames.ravel(), signal.ravel(), level.ravel(), share, share, 1 - 1 / number, dark=dark, step=step
+    )
+
+
+def pooled(readings: Sequence[Readings]) -> list[Readings]:
+    """Readings with those of the frames of a burst taken together: one histogram of all frames at a level holds what a hundred
+    small ones do, and takes a hundredth of the time."""
+    groups: dict[Any, list[Readings]] = {}
+    for number, one in enumerate(readings):
+        constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)
+        groups.setdefault(number if one.scale or one.dark else constants, []).append(one)
+    return [
+        replace(group[0], **{name: np.concatenate([getattr(one, name) for one in group]) for name in COLUMNS})
+        for group in groups.values()
+    ]

@@ -67,7 +67,10 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
         found = [without_places(pair, mask) for pair, mask in zip(found, changed, strict=True)]
         misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in map(fit_scene, found)]
     found = [refitted(pair) if bad and one else pair for pair, bad, one in zip(found, misfits, single, strict=True)]
-    after = tuple(fit_scene(pair) for pair in found)
+    fitted = [pair for pair, _, _ in offsets]
+    after = tuple(
+        before if now is then else fit_scene(now) for before, now, then in zip(scene, found, fitted, strict=True)
+    )
     rows, columns = (float(np.sqrt(np.mean([deviation[axis] ** 2 for _, *deviation in offsets]))) for axis in (0, 1))
     return found, Repairs(share, scene, after, any(misfits), rows, columns)
 

@@ -189,8 +189,8 @@ def _ring_sum(image: Image, inner: int, blur: float) -> Image:
 
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> Image:
     """Robust standard deviation of the residual at each pixel's level, interpolated between equally filled levels."""
-    order = np.argsort(level)
-    groups = np.array_split(order, max(1, min(num_levels, len(order) // 50)))
-    centres = np.array([level[group].mean() for group in groups])
-    spreads = np.array([np.subtract(*np.percentile(residual[group], (84.13, 15.87))) / 2 for group in groups])
+    number = max(1, min(num_levels, len(level) // 50))
+    groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)
+    centres, (high, low) = level[groups].mean(1), np.percentile(residual[groups], (84.13, 15.87), axis=1)
+    spreads = (high - low) / 2
     return np.asarray(np.maximum(np.interp(level, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))

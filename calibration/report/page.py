@@ -40,6 +40,7 @@ LABELS = {
     "gaussian": "Gaussian, one width",
     "poisson": "Poisson",
     "poisson-gaussian": "Poisson-Gaussian",
+    "counting": "counter with dead time",
     "excess-noise": "Poisson-Gaussian with excess noise",
     "signal-gaussian": "Gaussian, width by signal",
     "mixture": "mixture of Gaussians",

@@ -28,14 +28,7 @@ def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noi
 def peaks_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """log P(low < residual ≤ high), and its derivatives with respect to all four arguments where asked for.
-
-    Args:
-        low, high: (n,) observation − rate, electrons, float64.
-        rate: (n,) expected electrons, float64.
-        mode: (n,) that of `posterior_mode`.
-        read_noise: scalar, electrons, float64.
-    """
+    """As `electron_cells.cell_and_slopes`, of cells that `is_near_peak` accepts."""
     sigma = float(read_noise)
     half = (high - low) / 2
     gap = (low + high) / 2 - (mode - rate)

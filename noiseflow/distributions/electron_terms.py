@@ -7,7 +7,7 @@ from torch import Tensor
 
 from noiseflow.distributions.electron_contour import poisson_normal_mode, positive_rate
 
-REACH = 6.5  # standard deviations whose complement, 1e-10, is left out
+REACH = 6.5  # standard deviations of electrons that are summed: 1e-10 is left out, below the 3e-7 by which nodes of a cell err
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:

@@ -15,7 +15,10 @@ from noiseflow.distributions.answers import answering
 from noiseflow.distributions.expectations import mode_of, panels
 from noiseflow.distributions.pixels import Pixels, Taking, broadcast_shapes
 
-_PANELS, _TAIL = 512, 1e-10  # of the default quadrature: panels of four nodes between the quantiles of this probability
+# Of the default quadrature. Beyond the quantiles of this probability lie 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats of an entropy. The 13
+# standard deviations between them are cut into fortieths, four nodes each, so that at 100 electrons, where a deviation is 10
+# electrons, peaks of single electrons are resolved down to a read noise of 0.15.
+_PANELS, _TAIL = 512, 1e-10
 
 
 class NoiseDistribution(Pixels, Distribution):

@@ -21,6 +21,7 @@ FLOWS = {
 OTHERS = {
     "Gaussian": lambda: noiseflow.Gaussian(),
     "Poisson": lambda: noiseflow.Poisson(gain=0.05, offset=-0.2),
+    "counter with dead time": lambda: noiseflow.DeadTimeCounter(0.2),
     "rounded": lambda: noiseflow.Digitised(noiseflow.RadialFlow(), step=1 / 16),
     "8-bit": lambda: noiseflow.Digitised(noiseflow.Gaussian(), step=1 / 255, low=0.0, high=1.0),
     "clipped": lambda: noiseflow.Digitised(noiseflow.Gaussian(), step=0.0, low=0.0, high=1.0),

@@ -1,5 +1,6 @@
 """The detector's likelihood is exact, its posterior honest, and what cannot be measured is refused."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 from scipy import ndimage, stats
 
 from calibration.detector.cells import collect_cells, true_moments
-from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
+from calibration.detector.levels import NUM_BINS, NUM_LEVELS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
-from calibration.detector.measure import _shares, dark_offset, measure_detector, readings_of
+from calibration.detector.measure import _shares, dark_offset, measure_detector, pooled, readings_of
+from calibration.detector.models import MOST_BLOCKS, Pixels, _thinned
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import (
     NUM_WALKERS,
@@ -19,10 +21,11 @@ from calibration.detector.posterior import (
     _sampler,
     sample_posterior,
 )
-from calibration.detector.shape import misfit
+from calibration.detector.shape import misfit, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
-from calibration.registration.aligned import align_pair, align_with
+from calibration.registration.aligned import align_pair, align_with, block_split
+from calibration.registration.bursts import align_burst
 
 from ..conftest import expose, rigid, textured_scene
 from ..simulators import exposed, random_scene
@@ -304,3 +307,26 @@ def test_offset_of_a_pair_alone_lies_below_its_darkest_pixels():
     assert density(below) == pytest.approx(without(below))
     assert without(above) - density(above) == pytest.approx(8.0, rel=0.01)
     assert measure_detector([pair]).posterior.offset.q95 < darkest + 2 * error
+
+
+def test_frames_of_a_burst_share_their_histograms_and_even_pixels_raise_no_alarm():
+    generator = np.random.default_rng(1)
+    frames = Burst(np.stack([exposed(generator, np.full((44, 52), 200.0)) for _ in range(40)]))
+    pairs, _ = align_burst(frames)
+    assert unevenness(pairs) == 0.0
+    readings = pooled([one for number, pair in enumerate(pairs) for one in readings_of(pair, number)[0]])
+    assert len(readings) == 1
+    levels = collect_levels(readings)
+    assert levels.count.sum() == pytest.approx(40 * 44 * 52, rel=1e-3)
+    assert len(levels.signal) <= NUM_LEVELS
+
+
+def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
+    side = 8 * math.isqrt(2 * MOST_BLOCKS)
+    row, column = np.indices((side, side)) // 8
+    block, apart = row * (side // 8) + column, block_split((side, side), np.random.default_rng(0))
+    pixels = Pixels(np.zeros(block.size), np.zeros(block.size), apart.ravel(), block.ravel())
+    kept = _thinned(pixels, 0)
+    assert len(np.unique(kept.block)) == MOST_BLOCKS
+    assert len(kept.signal) == 64 * MOST_BLOCKS
+    assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)

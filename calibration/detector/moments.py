@@ -1,0 +1,77 @@
+"""Moments of equal frames, over time and over pixels: what figures of a camera are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.exposures.frames import Burst, Image, rounding_step
+from noiseflow.described import described
+
+
+@described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
+@dataclass(frozen=True)
+class Level:
+    """Temporal and spatial moments of equal frames.
+
+    Attributes:
+        mean: counts.
+        variance: over time, averaged over pixels, counts², without rounding's.
+        variance_error: standard error.
+        third: third central moment over time, counts³; None for two frames.
+        third_error: its standard error.
+        spatial: variance of the pixels' means over the frame, without that of the temporal noise, counts².
+        image: (y, x) mean frame, counts.
+        noise: (y, x) variance of each pixel over time, counts².
+        frames: number of frames.
+        flicker: relative deviation of the frames' means beyond what their noise explains.
+        clipped: share of pixel values at the converter's end.
+    """
+
+    mean: float
+    variance: float
+    variance_error: float
+    third: float | None
+    third_error: float
+    spatial: float
+    image: Image
+    noise: Image
+    frames: int
+    flicker: float
+    clipped: float
+
+
+def level_of(burst: Burst) -> Level:
+    """Moments of equal frames."""
+    frames, number = burst.frames, len(burst.frames)
+    image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
+    rounding = rounding_step(frames[0]) ** 2 / 12
+    means = frames.mean(axis=(1, 2))
+    drift = max(float(means.var(ddof=1)) - float(noise.mean()) / image.size, 0.0)  # light that changed between frames
+    variance = float(noise.mean()) - drift
+    residual = (frames - image) - (means - means.mean())[:, None, None]
+    fourth = float(np.mean(residual**4)) * (number / (number - 1)) ** 2 if number > 2 else 3 * variance**2
+    error = np.sqrt(max(fourth - variance**2, 0.5 * variance**2) / (image.size * (number - 1)))
+    third, third_error = None, 0.0
+    if number > 2:
+        scale = number**2 / ((number - 1) * (number - 2))  # unbiased third central moment
+        cubes = (residual**3).mean(axis=0) * scale
+        third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
+    spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
+    end = frames.max()
+    clipped = float(np.mean(frames == end)) if np.mean(frames == end) > 1e-3 else 0.0
+    flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
+    return Level(
+        float(image.mean()),
+        variance - rounding,
+        float(error),
+        third,
+        third_error,
+        spatial,
+        image,
+        noise,
+        number,
+        flicker,
+        clipped,
+    )

@@ -1,0 +1,114 @@
+"""Processor time of `noiseflow calibrate`: `python docs/benchmarks/calibration_time.py [--only WORD]`.
+
+Simulated exposures are written to files, and the command runs from there to model and report, on one thread. The page
+calibration_time.md is written from ``results/calibration_time.json``, where rows that are not measured again stay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+# this folder holds a file of the package's name, which must not hide the package; the simulators are those of the tests
+sys.path = [path for path in sys.path if Path(path or ".").resolve() != HERE] + [str(HERE.parents[1])]
+COMMAND = "python docs/benchmarks/calibration_time.py"
+RESULTS, PAGE = HERE / "results" / "calibration_time.json", HERE / "calibration_time.md"
+CASES: dict[str, tuple[str, tuple[str, ...], float | None]] = {
+    "pair 256": ("a pair of 256² pixels", ("--short", "--long"), 10.0),
+    "pair 1024": ("a pair of 1024² pixels", ("--short", "--long"), None),
+    "pair 2048": ("a pair of 2048² pixels", ("--short", "--long"), 60.0),
+    "flats": ("100 flats of 44 × 52 pixels and as many darks", ("--flat", "--dark"), 5.0),
+    "burst": ("a burst of 100 frames of 44 × 52 pixels", ("--short",), None),
+}
+"""Cases, the options they need, and the goal in seconds."""
+
+
+def exposures(name: str) -> list[Any]:
+    """The frames of a case, in the order of its options."""
+    from tests.calibration.simulators import RATIO, exposed, random_scene
+
+    generator = np.random.default_rng(0)
+    if name.startswith("pair"):
+        scene = random_scene(generator, int(name.split()[1]))
+        return [exposed(generator, times * scene) for times in (1, RATIO)]
+    scene = random_scene(generator, 52)[:44]
+    light = np.full((100, 44, 52), 200.0) if name == "flats" else np.broadcast_to(scene, (100, 44, 52))
+    return [exposed(generator, electrons) for electrons in (light, 0 * light)]
+
+
+def measured(name: str) -> dict[str, Any]:
+    """Processor seconds of the command on a case, and the gain it reports (2 counts per electron are true)."""
+    from noiseflow.io import write
+    from recon.benchmarks.provenance import origin
+
+    with tempfile.TemporaryDirectory() as folder:
+        words: list[str] = []
+        for option, frames in zip(CASES[name][1], exposures(name), strict=False):
+            words += [option, f"{folder}/{option[2:]}.tif"]
+            write(Path(words[-1]), frames.astype(np.uint16))
+        words += ["-o", f"{folder}/model.safetensors", "--report", f"{folder}/report", "--json"]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run(
+            [sys.executable, "-m", "noiseflow", "calibrate", *words],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"seconds": seconds, "gain": gain_of(json.loads(done.stdout))} | origin()
+
+
+def gain_of(found: dict[str, Any]) -> float:
+    """The gain in the command's JSON: of a detector, or of flats and darks."""
+    gain = found["detector"]["gain"] if "detector" in found else found["camera"]["gain"]
+    return float(gain["median"] if isinstance(gain, dict) else gain)
+
+
+def page(found: dict[str, Any]) -> str:
+    """The page as Markdown."""
+    from recon.benchmarks.provenance import measured_on
+
+    lines = [
+        "# Calibration: processor time\n",
+        f"Written by `{COMMAND}`: `noiseflow calibrate` from files to model and report, on one thread, the start of Python "
+        "included. Simulated detectors of gain 2 counts per electron, offset 100 counts and read noise 3 e⁻. Pixels enter the "
+        "posterior as histograms at levels of the signal, of all frames of a burst together; noise models are fitted to 32 768 "
+        "pixels and judged by 262 144 (`calibration/detector/models.py` has the reason).\n",
+        "| exposures | processor time | goal | gain |\n|---|---|---|---|",
+    ]
+    for name, row in found["cells"].items():
+        title, _, goal = CASES[name]
+        lines.append(f"| {title} | {row['seconds']:.1f} s | {f'{goal:g} s' if goal else '–'} | {row['gain']:.3f} |")
+    return "\n".join(lines) + f"\n\n{measured_on([found])}\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="cases whose name holds this")
+    arguments = parser.parse_args()
+    from recon.benchmarks.provenance import machine
+
+    rows = json.loads(RESULTS.read_text(encoding="utf-8"))["cells"] if RESULTS.exists() else {}
+    for name in CASES:
+        if arguments.only in name:
+            rows[name] = measured(name)
+            print(name, rows[name], flush=True)
+    found = {"cells": {name: rows[name] for name in CASES if name in rows}, "machines": [machine()]}
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(page(found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

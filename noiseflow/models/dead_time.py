@@ -1,0 +1,53 @@
+"""Counting detectors, which are blind for a dead time after each event."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.dead_time import DeadTimeDistribution
+from noiseflow.models.base import NoiseModelBase
+
+
+class DeadTimeCounter(NoiseModelBase):
+    """Counts of single events by a detector that is blind for a fixed time after each (not prolonged by further events).
+
+    The signal is the expected *count*; events come at the higher rate signal/(1 − signal·dead_time). The variance is about
+    signal·(1 − signal·dead_time)², below that of Poisson counts.
+
+    Args:
+        dead_time: as a share of the exposure, above 0 and below 1.
+
+    Raises:
+        ValueError: `dead_time` outside this range.
+    """
+
+    describes_single_readings = True
+    learning_rate = 0.05
+
+    def __init__(self, dead_time: float = 1e-3) -> None:
+        super().__init__()
+        if not 0 < dead_time < 1:
+            raise ValueError(f"dead_time is {dead_time}; give a share of the exposure between 0 and 1")
+        self.raw_dead_time = nn.Parameter(torch.logit(torch.tensor(float(dead_time))))
+
+    @property
+    def dead_time(self) -> Tensor:
+        """Share of the exposure."""
+        return torch.sigmoid(self.raw_dead_time)
+
+    def forward(self, signal: Tensor) -> DeadTimeDistribution:
+        """The distribution of counts of pixels with the given expected counts, any shape."""
+        return DeadTimeDistribution(signal, self.dead_time)
+
+    @torch.no_grad()
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Start at the dead time that (N,) signals and counts show by their variance, signal·(1 − signal·dead_time)²."""
+        signal, observation = signal.double(), observation.double()
+        lack = signal - (observation - signal) ** 2  # its expectation is 2·signal²·dead_time, to first order
+        weight = 1 / signal.clamp(min=1e-3)
+        share = (weight * lack).sum() / (2 * weight * signal**2).sum()
+        self.raw_dead_time.copy_(torch.logit(share.clamp(1e-5, 0.5 / signal.max().clamp(min=1.0))))
+
+    def extra_repr(self) -> str:
+        return f"dead_time={self.dead_time.item():.4g}"
