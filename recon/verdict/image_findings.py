@@ -38,7 +38,7 @@ def image_findings(
         "noise over contrast": residuals.noise / max(residuals.contrast, 1e-30),
         "distortions": {name: _as_dict(one) for name, one in found.items()},
     }
-    findings = [*_shifts(found), *_geometry(found, edge), *_turned(found, edge), *_beam(found)]
+    findings = [*_shifts(found, edge), *_geometry(found, edge), *_turned(found, edge), *_beam(found)]
     if share - 3 * error > _RESIDUAL:
         words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
         findings.append(
@@ -60,11 +60,11 @@ def _strength(one: Distortion, least: float, smooth: float) -> float:
     return max(whole, curve)
 
 
-def _shifts(found: dict[str, Distortion]) -> list[Finding]:
-    across, along = found["shift across"], found["shift along y"]
+def _shifts(found: dict[str, Distortion], edge: float) -> list[Finding]:
+    across, along, smooth = found["shift across"], found["shift along y"], _at_edge(_SMOOTH_PIXELS, edge)
     strengths = {
-        "across the axis": _strength(across, _PIXELS, _SMOOTH_PIXELS),
-        "along the axis": _strength(along, _PIXELS, _SMOOTH_PIXELS),
+        "across the axis": _strength(across, _PIXELS, smooth),
+        "along the axis": _strength(along, _PIXELS, smooth),
     }
     if abs(across.offset) > _OFFSET and abs(across.mean) > _TURN:
         strengths["across the axis"] = max(strengths["across the axis"], abs(across.mean) / _TURN)
@@ -77,7 +77,8 @@ def _shifts(found: dict[str, Distortion]) -> list[Finding]:
 
 
 def _at_edge(pixels: float, edge: float) -> float:
-    """A limit on turns and magnifications, pixels at the edge: the same share of a wider image, up to what blurs it visibly."""
+    """A limit on turns, magnifications and smooth shifts, pixels: the same share of a wider image, whose tilts sample its edge
+    more coarsely alike, up to what blurs it visibly."""
     return max(pixels, min(_BLURRED, pixels * edge / _USUAL_EDGE))
 
 
@@ -104,7 +105,7 @@ def _geometry(found: dict[str, Distortion], edge: float) -> list[Finding]:
 def _turned(found: dict[str, Distortion], edge: float) -> list[Finding]:
     turn = found["rotation"]
     strength = max(
-        _strength(turn, 2 * _PIXELS, _at_edge(2 * _SMOOTH_PIXELS, edge)),
+        _strength(turn, 2 * _PIXELS, _at_edge(_SMOOTH_PIXELS, edge)),
         abs(turn.mean) / _at_edge(_TURN, edge) if abs(turn.offset) > _TURN_OFFSET else 0.0,
     )
     if strength < 1:

@@ -29,6 +29,8 @@ _STEADY_CHANCE, _STEADY_PART = (
     0.3,
 )  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
 _SIGNALS = 16  # bins of equal counts: finer than any smooth misfit
+_STREAK = 8.0  # usual deviations of a line's mean residual from those beside it: chance gives four among thousands
+_STREAKS = 0.002  # of all lines: one in five hundred spoils nothing
 _BORDERS = 0.1  # of the images: fewer are single faults, which the screening throws out
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
@@ -38,7 +40,7 @@ def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[
     images = residuals.images
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
-    for check in (_saturation, _spikes, _lines, _borders, _pattern, _uneven):
+    for check in (_saturation, _spikes, _lines, _streaks, _borders, _pattern, _uneven):
         found, finding = check(tilt_series, images, residuals)
         evidence |= found
         findings += finding
@@ -87,6 +89,23 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
             sentence = f"{count} of {size} {name} hold one value in all tilts, unlike their neighbours"
             findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
     return {"dead lines": dead}, findings
+
+
+def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Rows or columns of single images whose mean residual is off from those beside it by as much as the projections vary."""
+    counts = {}
+    for name, axis in (("rows", 2), ("columns", 1)):
+        means = residuals.residual.mean(axis)
+        apart = np.abs(means - ndimage.median_filter(means, (1, 5), mode="nearest"))
+        usual = 1.4826 * float(np.median(apart))
+        counts[name] = int((apart > np.maximum(_STREAK * usual, residuals.contrast)).sum())
+    name = max(counts, key=lambda each: counts[each])
+    share = counts[name] / residuals.residual[..., 0].size
+    if share < _STREAKS:
+        return {"streaks": counts}, []
+    sentence = f"{counts[name]} {name} of single images stand apart from those beside them"
+    advice = "mask them with --mask FILE, or leave these images out"
+    return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
 
 def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:

@@ -150,6 +150,7 @@ def test_a_good_reconstruction_is_good() -> None:
         "missing rows",
         "one image repeated over a third of the tilts",
         "ten neighbouring tilts in reversed order",
+        "hot rows that come and go",
     ],
 )
 @pytest.mark.usefixtures("one_thread")
