@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 from drawing import main, new_figure, show
-from recon.projection.defocused_projector import DefocusedProjector
 
 import noiseflow
 import recon
+from recon.projection.defocused_projector import DefocusedProjector
 from recon.simulate.phantoms import make_phantom
 
 BLUR = 0.06  # pixels per voxel out of the plane of focus
@@ -16,7 +16,8 @@ def draw():
     """Blur by depth, add noise, and reconstruct twice."""
     truth = make_phantom("particles", 48, generator=np.random.default_rng(5)).astype(np.float32)
     angles = np.arange(-70, 70, 2.0)
-    projector = DefocusedProjector(tilt_angles=angles, depth=48, width=48, defocus=BLUR)
+    focused = recon.SliceProjector(tilt_angles=angles, depth=48, width=48)
+    projector = DefocusedProjector(focused, BLUR)
     images = projector(torch.from_numpy(truth)).numpy()
     noise = noiseflow.Gaussian(0.02 * float(images.max()))
     series = recon.add_noise(recon.TiltSeries(images, angles, mode="linear"), noise, seed=1)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 import noiseflow
 from noiseflow.io import atomic_path
@@ -35,9 +38,11 @@ def show(axis: Any, image: Any, title: str, *, bar: tuple[float, str], unit: str
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write the picture, white behind, small enough for a page."""
+    """Write the picture, white behind, in 256 colours: half of the size, and no difference to the eye."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=80, facecolor="white")
     with atomic_path(path) as partial:
-        figure.savefig(partial, dpi=80, facecolor="white")
+        Image.open(drawn).convert("RGB").quantize(256).save(partial, format="png", optimize=True)
 
 
 def main(draw: Callable[[], Any]) -> None:

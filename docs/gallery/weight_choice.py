@@ -28,9 +28,11 @@ def draw():
     axes[0, 0].set(ylabel="held-out NLL (nats per pixel)", title="what the choice sees")
     axes[0, 1].plot(errors.keys(), errors.values(), "o-", color=ORANGE)
     axes[0, 1].set(ylabel="PSNR of the volume (dB)", title="what only the truth shows")
-    for axis in axes[0]:
+    for axis, weights in zip(axes[0], (tried, errors), strict=True):
         axis.axvline(joint.weight, color="black", lw=1, ls="--", label=f"chosen: {joint.weight:.2g}")
         axis.set(xscale="log", xlabel="weight of total variation (nats)")
+        axis.set_xticks(list(weights), [f"{weight:.2g}" for weight in weights])
+        axis.minorticks_off()
         axis.legend(fontsize=8)
     return figure
 
