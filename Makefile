@@ -42,6 +42,7 @@ check: docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 
 docs: .venv/test-ready
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html

@@ -1,40 +1,39 @@
-"""A real HAADF tilt series of a needle with half of its tilts left out: weighted back-projection with two windows, and SIRT.
+"""One slice of a real needle by five methods, every second tilt left out: back-projection, SIRT, least squares, joint fit."""
 
-python docs/gallery/classical_methods.py docs/images/classical_methods.png
-"""
-
-from __future__ import annotations
-
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-import noiseflow
-from noiseflow.io import atomic_path
-from noiseflow.report import new_figure, show_image
-from recon import VolumeGrid, read_tilt_series
-from recon.methods._registry import reconstruct
+from drawing import DATA, main, new_figure, show
 
-NEEDLE = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
+import recon
 
 
-def draw(path: Path) -> None:
-    """Reconstruct and draw."""
-    whole = read_tilt_series(NEEDLE, mode="linear")
-    few = replace(whole, images=whole.images[::2], tilt_angles=whole.tilt_angles[::2])
-    grid = VolumeGrid.of(few)
+def draw():
+    """Reconstruct eight slices and draw the middle one."""
+    whole = recon.read_tilt_series(DATA / "tilt_needle" / "needle_aligned.mrc", mode="linear")
+    few = replace(whole, images=whole.images[::2, 24:32], tilt_angles=whole.tilt_angles[::2])
     methods = {
         "back-projection, ramp": {"method": "wbp", "window": "ramp"},
         "back-projection, hann": {"method": "wbp", "window": "hann"},
         "SIRT, 50 iterations": {"method": "sirt", "num_steps": 50},
+        "least squares + total variation": {"method": "l2", "num_steps": 60},
+        "joint fit": {"method": "joint", "num_steps": 60},
     }
-    figure, axes = new_figure(len(methods), width=12, height=3.6)
-    for axis, (name, settings) in zip(axes[0], methods.items(), strict=True):
-        volume = reconstruct(few, grid, **settings).volume.attenuation
-        show_image(axis, volume[:, grid.height // 2], f"{name}: slice (z, x)")
-    with atomic_path(path) as partial:
-        figure.savefig(partial, dpi=80, facecolor="white")
+    figure, axes = new_figure(3, 2, width=12, height=3.5)
+    for axis, (name, settings) in zip(axes.flat, methods.items(), strict=False):
+        volume = recon.reconstruct(few, recon.VolumeGrid.of(few), **settings).volume.attenuation
+        show(
+            axis,
+            volume[:, 4],
+            f"{name}: slice (z, x)",
+            bar=(11.1, "200 nm"),
+            unit="counts per voxel",
+            vmin=0,
+            vmax=2500,
+        )
+    image = whole.images[45]
+    show(axes[1, 2], image, "the tilt at 0° (y, x)", bar=(11.1, "200 nm"), unit="counts")
+    return figure
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1] if len(sys.argv) > 1 else "classical_methods.png"))
+    main(draw)

@@ -1,0 +1,64 @@
+"""The words of the pages are the field's own, not an idiom of ours."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# Pages in docs/benchmarks are written by scripts, and change with the next measurement.
+PAGES = sorted(
+    [
+        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+        *(page for page in (ROOT / "docs").rglob("*.md") if not {"benchmarks", "generated"} & set(page.parts)),
+    ]
+)
+
+# A pattern of what not to write, and what to write in its place.
+WORDS = {
+    r"readings|(?:a|an|each|every|noisy|clipped|mean|stored) reading\b(?! of (?:a |the )?file)": "pixel value, measured value",
+    r"rails?|rail's": "clipping limit, saturation",
+    r"told": "reported, stated",
+    r"rivals?": "baseline, other methods",
+    r"lattices?|lattice's": "voxel grid",
+    r"best for the truth": "tuned against the ground truth",
+    r"none beats": "whose held-out likelihood is within one standard error of the best",
+    r"goes on where it was|go on where it was": "interrupted runs resume",
+    r"must tell": "required inputs",
+    r"skipping (?:nothing|everything)": "all accelerations off / on",
+    r"asks nothing of a network": "works offline",
+}
+# What the patterns find and the field says itself.
+ALLOWED = re.compile(r"(?:crystal|atomic|Bravais|reciprocal) lattices?|on a lattice of spacing", re.IGNORECASE)
+
+
+def without_code(text: str) -> str:
+    """Markdown without its code, addresses and directives."""
+    text = re.sub(r"^(`{3,})[^\n]*\n.*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
+    return re.sub(r"``[^`]*``|`[^`]*`|\]\([^)]*\)", "", text)
+
+
+def misused(text: str) -> list[str]:
+    """The words to replace, with the better ones."""
+    text = ALLOWED.sub("", text)
+    return [
+        f"{found.group()!r} (write: {better})"
+        for pattern, better in WORDS.items()
+        for found in re.finditer(rf"\b(?:{pattern})\b", text, flags=re.IGNORECASE)
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+def test_pages_use_the_words_of_the_field(page: Path) -> None:
+    assert misused(without_code(page.read_text(encoding="utf-8"))) == []
+
+
+def test_the_check_finds_and_forgives() -> None:
+    assert misused("The readings lie on the rails; what was told holds.") != []
+    assert len(misused("clipped readings are at a rail")) == 2
+    assert not misused("reading a file of a crystal lattice; the stage's reading of the angle; threefold")
+    assert not misused(
+        without_code("run `rivals` and see [the page](rivals.md)\n```sh\nnoiseflow benchmark rivals\n```\n")
+    )
