@@ -262,7 +262,9 @@ def pooled(readings: Sequence[Readings]) -> list[Readings]:
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)
         groups.setdefault(number if one.scale or one.dark else constants, []).append(one)
-    return [
-        replace(group[0], **{name: np.concatenate([getattr(one, name) for one in group]) for name in COLUMNS})
-        for group in groups.values()
-    ]
+    return [_concatenated(group) for group in groups.values()]
+
+
+def _concatenated(group: list[Readings]) -> Readings:
+    columns: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in group]) for name in COLUMNS}
+    return replace(group[0], **columns)

@@ -130,7 +130,7 @@ def _thinned(pixels: Pixels, seed: int) -> Pixels:
         return pixels
     generator = np.random.default_rng([seed, 1])  # not the one that chose the blocks kept apart
     kept = np.isin(pixels.block, generator.permutation(blocks)[:MOST_BLOCKS])
-    return Pixels(*(values[kept] for values in (pixels.signal, pixels.observation, pixels.held_out, pixels.block)))
+    return Pixels(pixels.signal[kept], pixels.observation[kept], pixels.held_out[kept], pixels.block[kept])
 
 
 def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:

@@ -57,7 +57,7 @@ class DeadTimeDistribution(PoissonDistribution):
     def _differences(self, count: Tensor, weights: tuple[float, ...], *, early: bool) -> Tensor:
         """Weighted sum of the excesses of count − 1, count, …, times the mean."""
         parts = [weight * self._excess(count - 1 + step, early=early) for step, weight in enumerate(weights) if weight]
-        return (self.rate.double() * torch.stack(torch.broadcast_tensors(*parts)).sum(0)).clamp(min=0)
+        return (self.rate.double() * sum(parts, torch.zeros_like(parts[0]))).clamp(min=0)
 
     def _log_mass(self, count: Tensor) -> Tensor:
         mean = self.rate.double()

@@ -47,7 +47,7 @@ class DeadTimeCounter(NoiseModelBase):
         lack = signal - (observation - signal) ** 2  # its expectation is 2·signal²·dead_time, to first order
         weight = 1 / signal.clamp(min=1e-3)
         share = (weight * lack).sum() / (2 * weight * signal**2).sum()
-        self.raw_dead_time.copy_(torch.logit(share.clamp(1e-5, 0.5 / signal.max().clamp(min=1.0))))
+        self.raw_dead_time.copy_(torch.logit(share.clamp(1e-5, 0.5 / max(1.0, float(signal.max())))))
 
     def extra_repr(self) -> str:
         return f"dead_time={self.dead_time.item():.4g}"
