@@ -225,7 +225,7 @@ class JointReconstructor:
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and (noise_share(tilt_series.images) if share is None else share) < _QUIET
         described = quiet and given is None  # by a noise model that no fit of the volume sees
-        rows = contrast_slab(tilt_series, self._num_slices(whole.field))
+        rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
         facts = Facts(
             choose_noise=given is None and not described,
             learn_noise=given is None or learns(given),
@@ -314,11 +314,12 @@ class JointReconstructor:
     def _can_halve(self, model: TomographySignal) -> bool:
         return self.coarse_to_fine and HalfResolution.possible(model)
 
-    def _num_slices(self, made: Field | VolumeGrid) -> int:
-        """Of the slab: a few cannot tell weights apart where each of them has few pixels."""
+    def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
+        """Of the slab: a few cannot tell weights apart where each of them has few pixels, and gaps of tilts need twice as many."""
         if self.slab is not None:
             return self.slab
-        return _SLAB if self.weight is not None else max(_SLAB, -(-_SLAB_VOXELS // (made.depth * made.width)))
+        voxels = _SLAB_VOXELS * (2 if quiet else 1)
+        return _SLAB if self.weight is not None else max(_SLAB, -(-voxels // (made.depth * made.width)))
 
     def _finish(self, run: PlannedRun, tilt_series: TiltSeries, grid: VolumeGrid) -> Reconstruction:
         """The volume, under what is chosen."""
