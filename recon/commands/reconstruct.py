@@ -223,7 +223,7 @@ def reconstruct(
         with stoppable(journal, context), scratch_beside(out) as scratch, client_of(workers, scheduler) as client:
             if slices_at_once is not None:
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
-                options["keep"] = journal.keep
+                options |= {"keep": journal.keep, "forget": journal.forget}
             with step_report(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
             verdict = targets.write(

@@ -178,6 +178,11 @@ class Journal:
             self._start()
         return self.folder / f"{_BLOCKS}{hashlib.blake2b(prefix.encode(), digest_size=4).hexdigest()}"
 
+    def forget(self, prefix: str) -> None:
+        """Remove what fits of this prefix have reached: their block is kept, and their states are larger than it."""
+        for file in self.folder.glob(f"{_slug(prefix)}*.safetensors"):
+            file.unlink()
+
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
         for blocks in self.folder.glob(f"{_BLOCKS}*"):
@@ -191,7 +196,7 @@ class Journal:
 
     def _finished(self, name: str) -> Path:
         digest = hashlib.blake2b(name.encode(), digest_size=4).hexdigest()
-        return self.folder / f"{re.sub('[^a-z0-9.]+', '-', name.lower())[:60]}-{digest}.safetensors"
+        return self.folder / f"{_slug(name)}-{digest}.safetensors"
 
     def _current(self, name: str) -> dict[str, Any] | None:
         if self._fresh or not (self.folder / _CURRENT).exists():
@@ -233,6 +238,10 @@ class Journal:
         if names:
             changes = ", ".join(f"{name} was {settings.get(name)}, now {self.settings.get(name)}" for name in names)
             raise ValueError(f"the checkpoint is of another run: {changes}; {advice}")
+
+
+def _slug(name: str) -> str:
+    return re.sub("[^a-z0-9.]+", "-", name.lower())[:60]
 
 
 def _replay(

@@ -61,7 +61,11 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
             slabs = ", ".join(f"{slab.start} to {slab.stop - 1}" for slab in settled.slabs if slab.stop > slab.start)
             return replace(result, choices=_choices(result, settings, tilt_series) | {"settled on slices": slabs})
 
-        return Blockwise(solve, finish, HALO)
+        def forget(block: Block) -> None:
+            if settings.forget is not None:
+                settings.forget(solve.prefix_of(block))
+
+        return Blockwise(solve, finish, HALO, forget)
 
     return Method(
         name,
@@ -94,11 +98,15 @@ class FittedBlock:
     near: TomographySignal | None = None
 
     def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, Images]:
-        fit = replace(self.fit, prefix=f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: ")
+        fit = replace(self.fit, prefix=self.prefix_of(block))
         grid = replace(self.grid, height=block.wide.stop - block.wide.start)
         projector = None if self.near is None else self.near.projector
         found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)
         return found.volume.attenuation, found.projections
+
+    def prefix_of(self, block: Block) -> str:
+        """Of the names of a block's fits."""
+        return f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: "
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what belongs to this process: progress bar, journal and matrices."""

@@ -52,6 +52,7 @@ class Settings:
         prefix: of the names of fits, where one run makes several volumes.
         keep: gives the folder in which finished blocks are kept for a run that resumes; by default they are kept until the volume
             is whole. It is called with the prefix.
+        forget: removes what fits of a prefix have reached, called when their block is kept.
         run_fit, run_stage: run every fit and every other long piece of work; a `recon.joint.checkpoint.Journal` keeps what each
             has reached.
 
@@ -72,6 +73,7 @@ class Settings:
     progress: Progress | None = None
     prefix: str = ""
     keep: Callable[[str], Path] | None = None
+    forget: Callable[[str], None] | None = None
     run_fit: RunFit = run_fit
     run_stage: RunStage = run_stage
 

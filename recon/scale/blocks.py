@@ -60,11 +60,13 @@ class Blockwise:
             (tilt, y, u).
         finish: makes the result of the whole volume and its projections.
         halo: slices that a block sees beyond its own.
+        forget: called with every block that is kept, for what only an unfinished one wants.
     """
 
     solve: Callable[[TiltSeries, Block], tuple[Images, Images]]
     finish: Callable[[Volume, Images], Reconstruction]
     halo: int = 0
+    forget: Callable[[Block], None] | None = None
 
 
 def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
@@ -111,6 +113,8 @@ def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files:
     if not files.finished(block):
         hand_back()  # after other blocks, or what was settled, whose arrays have other sizes: they would add up
         files.write(block, *method.solve(tilt_series.rows(block.wide), block))
+        if method.forget is not None:
+            method.forget(block)
 
 
 def assemble(

@@ -121,7 +121,7 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
     source = StoredSeries.of(tilt_series, files.folder.absolute())
     files = BlockFiles(files.folder.absolute())
     left = [part for part in parts if not files.finished(part)]
-    shared = client.scatter(replace(method, finish=_no_result), broadcast=True, hash=False)
+    shared = client.scatter(replace(method, finish=_no_result, forget=None), broadcast=True, hash=False)
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
     library: Any = dask.distributed  # it has no types
     try:

@@ -100,6 +100,16 @@ def test_what_is_the_same_is_taken_over_from_other_tiles(mask):
     torch.testing.assert_close(tiles.project(values), expected.project(values), rtol=0, atol=0)
 
 
+def test_parts_of_a_projector_need_one_of_its_two_matrices(mask):
+    projector = SliceProjector(tilt_angles=[0.0, 40.0], depth=SHAPE[0], width=SHAPE[1])
+    tiles = Tiles(mask, projector)
+    rays = tiles.project(torch.ones(tiles.filled.numel()))
+    projector.backproject(rays)
+    assert "matrix" not in vars(projector)
+    assert projector.project(torch.ones(SHAPE[0] * SHAPE[1], 1)).shape[0] == rays.shape[0]
+    assert "matrix" in vars(projector)
+
+
 def test_nothing_occupied_projects_to_nothing():
     projector = SliceProjector(tilt_angles=[0.0, 40.0], depth=9, width=11)
     tiles = Tiles(torch.zeros(SHAPE, dtype=torch.bool), projector)

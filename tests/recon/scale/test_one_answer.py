@@ -16,7 +16,7 @@ from recon.joint.run import run_fit
 from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.scale.blocks import BlockFiles, block_memory, blocks
+from recon.scale.blocks import HALO, BlockFiles, block_memory, blocks
 from recon.scale.memory import choose_slices, needed_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
@@ -35,8 +35,8 @@ def test_blocks_are_as_good_as_a_whole_fit_and_show_no_seam(phantom, tmp_path):
     truth, noisy = scene(phantom, 48)
     whole = reconstruct(noisy, method="joint").volume.attenuation
     found = reconstruct(noisy, method="joint", slices_at_once=16, scratch=tmp_path / "v.npy").volume.attenuation
-    if phantom == "shells":  # of the slab, which leaves no vacuum, three blocks lose 0.1 dB
-        assert compare(found, truth).psnr > compare(whole, truth).psnr - 0.02
+    # of the slab, which leaves no vacuum, blocks as low as these lose a little; blocks of 64 slices have fewer borders
+    assert compare(found, truth).psnr > compare(whole, truth).psnr - (0.02 if phantom == "shells" else 0.04)
     jumps = [np.abs(np.diff(volume, axis=1)).mean((0, 2)) for volume in (truth, whole, found)]
     for border in (15, 31):
         near = [index for index in range(border - 8, border + 9) if index != border]
@@ -60,18 +60,23 @@ def test_blocks_cover_every_slice_once():
 
 
 def test_a_finished_block_is_not_computed_again(tmp_path):
-    _, noisy = scene("shells", 20, 12.0)
-    options = {"method": "l2", "weight": 0.5, "num_steps": 8, "slices_at_once": 10}
+    _, noisy = scene("shells", 28, 12.0)
+    options = {"method": "l2", "weight": 0.5, "num_steps": 8, "slices_at_once": 14}
     journal = Journal(tmp_path / "kept", {})
+    options |= {"run_fit": journal.fit, "forget": journal.forget}
     first = reconstruct(noisy, scratch=tmp_path / "a.npy", keep=journal.keep, **options).volume.attenuation
-    (part,) = [part for part in blocks(20, 10, 8) if part.rows.start == 0]
+    states = [file.name for file in (tmp_path / "kept").glob("*.safetensors")]
+    assert states  # of what is settled for all blocks, and none of a finished block
+    assert not [name for name in states if name.startswith("slices")]
+    (part,) = [part for part in blocks(28, 14, HALO) if part.rows.start == 0]
     files = BlockFiles(journal.keep())
     volume, projections = (np.array(array) for array in files.read(part))
     files.write(part, volume + 1, projections)
     again = Journal(tmp_path / "kept", {}, resume=True)
+    options |= {"run_fit": again.fit, "forget": again.forget}
     second = reconstruct(noisy, scratch=tmp_path / "b.npy", keep=again.keep, **options).volume.attenuation
-    np.testing.assert_allclose(second[:, :6], first[:, :6] + 1, atol=1e-5)
-    np.testing.assert_array_equal(second[:, 14:], first[:, 14:])
+    np.testing.assert_allclose(second[:, :10], first[:, :10] + 1, atol=1e-5)
+    np.testing.assert_array_equal(second[:, 18:], first[:, 18:])
     again.discard()
     assert not (tmp_path / "kept").exists()
 
