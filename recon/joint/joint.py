@@ -37,7 +37,10 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
 _HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2  # of the pixels: those of a slab are few to tell weights apart
-_SLAB, _SLAB_VOXELS = 24, 16 * 96**2  # slices; more where they are small: so many voxels tell weights apart as well as more do
+_SLAB, _SLAB_VOXELS = (
+    24,
+    16 * 96**2,
+)  # slices; more where they are small: so many voxels tell weights apart as well as more do
 _QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 _WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
 

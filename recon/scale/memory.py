@@ -18,7 +18,9 @@ _STEP = 8  # slices: blocks of a few more or fewer cost as much
 PLENTY = 4 * 2**30
 """Bytes: a whole volume that needs more is reconstructed in blocks, as good and hardly slower (at 256³, 55 s of processor time in
 four blocks, 48 s whole), so that 512³ leaves room for other programs."""
-_TALL = 64  # slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
+_TALL = (
+    64  # slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
+)
 
 
 def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
