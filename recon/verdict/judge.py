@@ -28,6 +28,7 @@ from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
 _TALL = 4  # widths: of a taller series so many slices are judged, because the rest may not fit into memory
+_FULL = 1.3  # times the mean: sections that fill their volume reach 0.85, objects cut off 1.66 and more
 _CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
 
 
@@ -70,6 +71,7 @@ def judge(
         pixel_findings(tilt_series, residuals),
         fit_findings(result, alignment),
         _contrast(tilt_series),
+        _faces(result.volume.attenuation),
     ]
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
@@ -104,6 +106,20 @@ def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
     return evidence, [
         Finding("mode", 3.0 + (swapped - as_given) / _CONTRAST, words, f"give {other}, or --invert-contrast")
     ]
+
+
+def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
+    """Whether what lies beyond the top or bottom of a thin volume was pushed into its outer layers."""
+    depth, height, width = volume.shape
+    if depth >= width:
+        return {}, []
+    layers = np.abs(volume[:, :: max(1, height // 64)]).mean((1, 2), dtype=np.float64)
+    densest = float(max(layers[0], layers[-1]) / max(float(layers.mean()), 1e-30))
+    if densest < _FULL:
+        return {"densest face": densest}, []
+    words = f"the volume is {densest:.1f} times as dense at its top or bottom as on average: the object goes on beyond"
+    advice = "leave out --thickness, or give a larger one"
+    return {"densest face": densest}, [Finding("thickness", min(2.9, densest / _FULL), words, advice)]
 
 
 def _good(gap: Unexplained, residuals: Residuals) -> str:

@@ -162,6 +162,12 @@ def test_what_spoils_a_series_is_named(name: str) -> None:
 
 
 @pytest.mark.usefixtures("one_thread")
+def test_a_section_fills_its_thickness_and_a_cut_object_its_outer_layers() -> None:
+    assert judged(scene("slab", "low-dose").noisy, 16).grade == "good"
+    assert "thickness" in judged(scene("shells", "clipped").noisy, 16).subjects[:2]
+
+
+@pytest.mark.usefixtures("one_thread")
 def test_borders_that_an_alignment_filled_are_seen_until_they_are_masked() -> None:
     name = "borders of zeros after an alignment"
     series = spoil(scene("shells", "clipped"), name, other=scene(seed=9), seed=5).series
