@@ -30,9 +30,7 @@ def draw():
     axes[0, 2].plot(x, volume[line], color=BLUE, label="volume")
     axes[0, 2].plot(x, truth[line] * unit, color=ORANGE, label="truth")
     axes[0, 2].set(xlabel="x (voxels)", ylabel="attenuation per voxel")
-    axes[0, 2].set_title(
-        f"intervals that hold the truth: {held.mean():.0%}, inside the object {inside.mean():.0%}", fontsize=10
-    )
+    axes[0, 2].set_title(f"hold the truth: {held.mean():.0%} of all, {inside.mean():.0%} of the object", fontsize=10)
     axes[0, 2].legend(fontsize=8)
     return figure
 

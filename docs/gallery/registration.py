@@ -15,14 +15,15 @@ def draw():
     moved = warp(long, EuclideanTransform(rotation=np.deg2rad(2), translation=(9, -6)), mode="edge")
     pair = calibration.ExposurePair(short, moved)
     aligned = calibration.align_pair(pair)
-    registration, bar = aligned.registration, (50, "50 pixels")
+    registration, bar = aligned.registration, (25, "25 pixels")
+    part = (slice(200, 350), slice(50, 200))
     turn = np.rad2deg(np.arctan2(registration.matrix[1, 0], registration.matrix[0, 0]))
     residual = np.where(aligned.mask, aligned.short - aligned.signal, 0)
     figure, axes = new_figure(3, width=12, height=3.6)
-    show(axes[0, 0], short, "short exposure", bar=bar, unit="counts", vmax=np.quantile(short, 0.995))
-    show(axes[0, 1], moved, "long exposure, turned by 2°", bar=bar, unit="counts", vmax=np.quantile(moved, 0.995))
+    show(axes[0, 0], short[part], "short exposure", bar=bar, unit="counts", vmax=np.quantile(short, 0.995))
+    show(axes[0, 1], moved[part], "long exposure, turned by 2°", bar=bar, unit="counts", vmax=np.quantile(moved, 0.995))
     title = f"short − aligned long: found {abs(turn):.2f}° ± {registration.error_px:.2f} px"
-    show(axes[0, 2], residual, title, bar=bar, unit="counts", cmap="PuOr", vmin=-60, vmax=60)
+    show(axes[0, 2], residual[part], title, bar=bar, unit="counts", cmap="PuOr", vmin=-60, vmax=60)
     return figure
 
 

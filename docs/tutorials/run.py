@@ -9,8 +9,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-from PIL import Image
-
 HERE = Path(__file__).resolve().parent
 PICTURES = HERE.parent / "images" / "tutorials"
 
@@ -29,6 +27,6 @@ if __name__ == "__main__":
             os.chdir(folder)
             run(HERE / f"{name}.md")
             for picture in Path().glob("*.png"):
-                Image.open(picture).convert("RGB").quantize(256).save(PICTURES / picture.name, optimize=True)
+                (PICTURES / picture.name).write_bytes(picture.read_bytes())
                 print(f"wrote {PICTURES / picture.name}")
             os.chdir(HERE)
