@@ -19,6 +19,7 @@ import pytest
 from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
 from recon.methods._registry import reconstruct
 from recon.report.page import even_odd, reconstruction_report
+from recon.report.uncertainty import error_bar_figure
 from recon.series.tilt_series import Volume, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
@@ -149,7 +150,7 @@ def scene():
     acquisition = ACQUISITIONS["clipped"]
     clean, _ = clean_tilt_series(volume.astype(np.float32), np.arange(-60.0, 61, 6), acquisition=acquisition)
     noisy = add_noise(clean, acquisition.noise(), seed=0)
-    return noisy, reconstruct(noisy, VolumeGrid.of(noisy), weight=0.4, num_steps=10)
+    return noisy, reconstruct(noisy, VolumeGrid.of(noisy), weight=0.4, num_steps=10, uncertainty=2)
 
 
 @pytest.fixture(scope="module")
@@ -269,6 +270,20 @@ def test_a_click_in_one_slice_moves_the_others(open_page):
     assert page.get_by_label("y", exact=True).first.input_value() == str(int(0.8 * SIZE))
 
 
+def test_error_bars_stand_beside_the_volume_and_name_what_no_tilt_saw(open_page, scene):
+    page = open_page()
+    picture = page.get_by_alt_text("standard deviation and bias from 2 samples")
+    assert picture.evaluate("image => image.complete && image.naturalWidth") > 800
+    assert "No tilt between 60° and 120° was recorded (33 % of half a turn)" in page.locator("main").inner_text()
+    noisy, outcome = scene
+    figure = error_bar_figure(outcome.volume, outcome.uncertainty, "attenuation per voxel")
+    *panels, bar = (axis for axis in figure.axes if axis.get_ylabel() != "")
+    drawn = {axis.get_title(): axis.images[0] for axis in panels if axis.get_title() in ("standard deviation", "bias")}
+    assert drawn["standard deviation"].get_clim() == drawn["bias"].get_clim()
+    assert bar.get_ylabel() == "attenuation per voxel"
+    np.testing.assert_array_equal(drawn["bias"].get_array(), outcome.uncertainty.bias.attenuation[SIZE // 2])
+
+
 def test_tilts_play_and_the_swipe_uncovers_the_prediction(open_page, scene):
     page = open_page()
     outcome = scene[1]
@@ -317,6 +332,7 @@ def test_page_names_its_contents_and_its_file_as_text(open_page):
     links = page.locator(".contents a").all_inner_texts()
     assert links == [
         "Volume",
+        "Error bars",
         "Tilt series",
         "Noise",
         "Convergence",

@@ -26,9 +26,10 @@ from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.benchmarks.scenes import Results, make_scene
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.uncertainty import error_bars, left_out_ranks, share_within, voxel_coverage
+from recon.uncertainty import error_bars, left_out_ranks, share_within, unseen_share, voxel_coverage
 
 HERE = Path(__file__).parent
+_SECTIONS = HERE / "results" / "uncertainty_sections"  # (volume, std, truth), z by x through the middle
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
 _HEAD = """# Error bars: do they hold the truth?
 
@@ -44,15 +45,20 @@ Row = dict[str, Any]
 def coverage(phantom: str, noise: str, *, size: int, tilts: str, samples: int) -> Row:
     """One row: the joint fit as a user gets it, its error bars, and the share of voxels whose interval holds the truth."""
     scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts)
-    started = time.perf_counter()
+    started = time.process_time()
     result = reconstruct(scene.noisy, scene.grid, method="joint")
-    fitted = time.perf_counter()
+    fitted = time.process_time()
     bars = error_bars(result, scene.noisy, samples)
-    done = time.perf_counter()
+    done = time.process_time()
     volume, truth = result.volume.attenuation, scene.truth
     occupied = truth > _OCCUPIED * truth.max()
     covered = voxel_coverage(volume, bars, truth)
     inside = (truth[occupied] - volume[occupied]) / np.maximum(bars.half_width()[occupied], 1e-12)
+    if noise == "clipped":
+        middle = truth.shape[1] // 2
+        planes = {"volume": volume[:, middle], "std": bars.std.attenuation[:, middle], "truth": truth[:, middle]}
+        _SECTIONS.mkdir(parents=True, exist_ok=True)
+        io.write(_SECTIONS / f"{phantom}.npy", np.stack(list(planes.values())).astype(np.float32))
     return {
         "phantom": phantom,
         "noise": noise,
@@ -62,6 +68,8 @@ def coverage(phantom: str, noise: str, *, size: int, tilts: str, samples: int) -
         "vacuum covered": covered[~occupied].mean(),
         "too low": (inside > 1).mean(),
         "too high": (inside < -1).mean(),
+        "widening": np.quantile(np.abs(inside), 0.9),
+        "error unseen": unseen_share(volume - truth, scene.noisy.tilt_angles),
         "seconds, fit": fitted - started,
         "seconds, error bars": done - fitted,
     }

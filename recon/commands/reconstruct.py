@@ -174,8 +174,6 @@ def reconstruct(
         raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --workers and --scheduler")
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler has workers of its own; leave out --workers")
-    if uncertainty and slices_at_once is not None:
-        raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
@@ -214,7 +212,7 @@ def reconstruct(
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
         output.line(memory)
         if slices_at_once is not None:
-            output.line(disk_line(tilt_series, grid, slices_at_once))
+            output.line(disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0))
         if dry_run:
             _show_plan(tilt_series, grid, options, memory, output)
             return

@@ -20,6 +20,7 @@ from recon.joint.plan import FitStage
 from recon.joint.run import Progress, run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
+from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
 from recon.projection.defocused_projector import DefocusedProjector
 from recon.projection.image_formation import Linear
@@ -53,7 +54,9 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
     def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
         fit = reconstructor(settings, options)
         settled = fit.settle(tilt_series, grid, progress=settings.progress)
-        solve = FittedBlock(fit, settled.portable(), grid, settings.progress, settled.signal_model)
+        solve = FittedBlock(
+            fit, settled.portable(), grid, settings.progress, settled.signal_model, settings.uncertainty, settings.run_stage
+        )
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
@@ -65,7 +68,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
             if settings.forget is not None:
                 settings.forget(solve.prefix_of(block))
 
-        return Blockwise(solve, finish, HALO, forget)
+        return Blockwise(solve, finish, HALO, forget, settings.uncertainty)
 
     return Method(
         name,
@@ -89,6 +92,8 @@ class FittedBlock:
         grid: of the whole volume.
         progress: called with the steps done, those expected, and a note; None on another machine.
         near: a signal model whose projector can be used again; None on another machine.
+        num_samples: that error bars come from; 0 for none.
+        run_stage: carries them out; another machine keeps nothing of a block that is not done.
     """
 
     fit: JointReconstructor
@@ -96,13 +101,22 @@ class FittedBlock:
     grid: VolumeGrid
     progress: Progress | None = None
     near: TomographySignal | None = None
+    num_samples: int = 0
+    run_stage: RunStage = run_stage
 
-    def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, Images]:
+    def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, ...]:
         fit = replace(self.fit, prefix=self.prefix_of(block))
         grid = replace(self.grid, height=block.wide.stop - block.wide.start)
         projector = None if self.near is None else self.near.projector
         found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)
-        return found.volume.attenuation, found.projections
+        arrays = found.volume.attenuation, found.projections
+        if not self.num_samples:
+            return arrays
+        from recon.uncertainty.posterior import error_bars
+
+        options: dict[str, Any] = {"seed": fit.seed, "run_stage": self.run_stage, "prefix": fit.prefix}
+        bars = error_bars(found, tilt_series, self.num_samples, place=(block.wide, block.height), **options)
+        return *arrays, bars.std.attenuation, bars.bias.attenuation
 
     def prefix_of(self, block: Block) -> str:
         """Of the names of a block's fits."""
@@ -110,7 +124,8 @@ class FittedBlock:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what belongs to this process: progress bar, journal and matrices."""
-        return self.__dict__ | {"progress": None, "near": None, "fit": replace(self.fit, run_fit=run_fit)}
+        fit = replace(self.fit, run_fit=run_fit)
+        return self.__dict__ | {"progress": None, "near": None, "fit": fit, "run_stage": run_stage}
 
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:

@@ -209,8 +209,6 @@ def reconstruct(
     chosen, found = settings_of(method, **settings), find_method(method)
     if slices_at_once is None:
         return _run_oriented(found, tilt_series, grid, chosen)
-    if chosen.uncertainty:
-        raise ValueError("--uncertainty needs the whole volume in memory; leave it out, or leave out --slices-at-once")
     if slices_at_once < 1:
         raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
     if found.blockwise is None:

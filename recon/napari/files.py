@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from noiseflow import io
+from recon.uncertainty.result import error_bar_paths
 
 LayerData = tuple[Any, dict[str, Any], str]
 
@@ -21,7 +22,7 @@ def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerD
 
 
 def read_layers(path: str | list[str]) -> list[LayerData]:
-    """Read an image, tilt series or volume as one layer, with its voxel size in Å.
+    """Read an image, tilt series or volume as one layer, with its voxel size in Å; error bars beside it become hidden layers.
 
     A stack with tilt angles in or beside the file keeps them in the layer's metadata as ``tilt_angles``, degrees. Its first
     axis has no length; it steps by a pixel, so that one slider moves through it and through its volume.
@@ -42,7 +43,16 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
             scale[0] = scale[-1]
     if image.voxel_size is not None:
         metadata["voxel_size"] = image.voxel_size
-    return [(image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")]
+    own = (image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")
+    beside = [path for path in error_bar_paths(source).values() if path.exists()]
+    return [own, *(error_bar_layer(io.read(path).data, path.stem, own[1]) for path in beside)]
+
+
+def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerData:
+    """A hidden layer of standard deviations or biases in the place of its volume's layer, with colours for either side of zero."""
+    reach = float(np.abs(values).max()) or 1.0
+    look = {"name": name, "visible": False, "colormap": "PiYG", "contrast_limits": (-reach, reach)}
+    return values, {**look, "scale": volume["scale"], "metadata": dict(volume["metadata"])}, "image"
 
 
 def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:

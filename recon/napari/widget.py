@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow import io
-from recon.napari.files import LayerData
+from recon.napari.files import LayerData, error_bar_layer
 
 if TYPE_CHECKING:
     from recon.joint.run import Progress
@@ -18,7 +18,12 @@ _BUTTON = "Reconstruct"
 _SHARES = 100
 
 
-def reconstruct_layer(
+def reconstruct_layer(images: Any, metadata: dict[str, Any], **settings: Any) -> LayerData:
+    """The volume alone, (z, y, x); arguments and errors as `reconstruct_layers`."""
+    return reconstruct_layers(images, metadata, **settings)[0]
+
+
+def reconstruct_layers(
     images: Any,
     metadata: dict[str, Any],
     *,
@@ -28,9 +33,10 @@ def reconstruct_layer(
     thickness: int = 0,
     num_steps: int = _STEPS,
     invert_tilt: bool = False,
+    uncertainty: int = 0,
     progress: "Progress | None" = None,
-) -> LayerData:
-    """Reconstruct a tilt series to a layer (z, y, x).
+) -> list[LayerData]:
+    """Reconstruct a tilt series to a layer (z, y, x); with error bars, their standard deviation and bias become hidden layers.
 
     Args:
         images: (tilt, y, x), tilt axis along y.
@@ -41,6 +47,7 @@ def reconstruct_layer(
         thickness: voxels along the beam; 0 for the image width.
         num_steps: of the fit; 0 for as many as the method plans.
         invert_tilt: flip the sign of the angles.
+        uncertainty: samples that error bars come from; 0 for none.
         progress: called with the steps done, those expected, and a note.
 
     Raises:
@@ -61,14 +68,17 @@ def reconstruct_layer(
     series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, mode)  # type: ignore[arg-type]
     series = prepare(series).tilt_series
     grid = VolumeGrid.of(series, thickness or None)
-    outcome = reconstruct(series, grid, method=method, num_steps=num_steps or None, progress=progress)
+    options: dict[str, Any] = {"num_steps": num_steps or None, "uncertainty": uncertainty, "progress": progress}
+    outcome = reconstruct(series, grid, method=method, **options)
     scale = [pixel_size or 1.0] * 3
     result = {"voxel_size": tuple(scale)} if pixel_size else {}
-    return (
-        outcome.volume.attenuation,
-        {"name": f"volume ({outcome.method})", "scale": scale, "metadata": result},
-        "image",
-    )
+    look = {"name": f"volume ({outcome.method})", "scale": scale, "metadata": result}
+    bars = outcome.uncertainty
+    beside = {} if bars is None else {"standard deviation": bars.std, "bias": bars.bias}
+    return [
+        (outcome.volume.attenuation, look, "image"),
+        *(error_bar_layer(each.attenuation, name, look) for name, each in beside.items()),
+    ]
 
 
 def reconstruct_widget() -> Any:
@@ -88,13 +98,15 @@ def reconstruct_widget() -> Any:
         thickness: int = 0,
         num_steps: int = _STEPS,
         invert_tilt: bool = False,
+        uncertainty: int = 0,
     ) -> None:
         options = {"angles": angles, "mode": mode, "method": method, "thickness": thickness, "invert_tilt": invert_tilt}
+        options["uncertainty"] = uncertainty
         worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
         button = form.call_button
         button.enabled, button.text = False, "Reconstructing …"
         worker.yielded.connect(lambda done: setattr(button, "text", f"Reconstructing: {done} %"))
-        worker.returned.connect(lambda layer: _show(viewer, tilts, layer))
+        worker.returned.connect(lambda layers: _show(viewer, tilts, layers))
         worker.finished.connect(lambda: setattr(button, "text", _BUTTON))
         worker.finished.connect(lambda: setattr(button, "enabled", True))
         worker.start()
@@ -107,15 +119,18 @@ def reconstruct_widget() -> Any:
         method={"choices": [name for name in method_names() if name != "joint-supervised"]},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
         num_steps={"min": 0, "max": 10_000, "label": "steps (0: as planned)"},
+        uncertainty={"min": 0, "max": 1000, "label": "samples of error bars (0: none)"},
     )
     return form
 
 
-def _show(viewer: Any, tilts: Any, layer: LayerData) -> None:
-    """Add the volume in place of the tilts, and go to its middle."""
-    viewer.add_image(layer[0], **layer[1])
+def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
+    """Add the volume, and its error bars, in place of the tilts, and go to its middle."""
+    for values, look, _ in layers:
+        viewer.add_image(values, **look)
     tilts.visible = False
-    viewer.dims.set_point(0, layer[1]["scale"][0] * (len(layer[0]) // 2))
+    values, look, _ = layers[0]
+    viewer.dims.set_point(0, look["scale"][0] * (len(values) // 2))
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:
@@ -125,9 +140,9 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
 
     from napari.qt.threading import create_worker
 
-    def run() -> Generator[int, None, LayerData]:
+    def run() -> Generator[int, None, list[LayerData]]:
         steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-        found: list[LayerData | Exception] = []
+        found: list[list[LayerData] | Exception] = []
 
         def report(done: int, total: int, note: str) -> None:
             steps.put(round(_SHARES * done / total))
@@ -135,7 +150,7 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
         def fit() -> None:
             try:
                 found.append(
-                    reconstruct_layer(
+                    reconstruct_layers(
                         images,
                         metadata,
                         num_steps=num_steps,

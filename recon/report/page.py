@@ -18,6 +18,7 @@ from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_char
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.noise import noise_charts
+from recon.report.uncertainty import add_error_bars
 from recon.report.verdict import add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -66,6 +67,8 @@ def reconstruction_report(
         add_verdict(report, verdict, tilt_series, outcome)
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
     _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
+    if outcome.uncertainty is not None:
+        add_error_bars(report, tilt_series, outcome.volume, outcome.uncertainty, _UNITS[tilt_series.mode])
     _add_tilts(report, tilt_series, outcome)
     _add_response(report, tilt_series, outcome)
     _add_noise(report, tilt_series, outcome)

@@ -21,6 +21,7 @@ from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_
 from noiseflow.io.numpy_files import write as write_npy
 from noiseflow.kept_memory import hand_back
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.uncertainty.result import error_bar_paths
 
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction
@@ -57,16 +58,18 @@ class Blockwise:
 
     Attributes:
         solve: from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
-            (tilt, y, u).
+            (tilt, y, u), and of standard deviation and bias where `num_samples` says so.
         finish: makes the result of the whole volume and its projections.
         halo: slices that a block sees beyond its own.
         forget: called with every block that is kept, for what only an unfinished one wants.
+        num_samples: that error bars come from; 0 for none.
     """
 
-    solve: Callable[[TiltSeries, Block], tuple[Images, Images]]
+    solve: Callable[[TiltSeries, Block], tuple[Images, ...]]
     finish: Callable[[Volume, Images], Reconstruction]
     halo: int = 0
     forget: Callable[[Block], None] | None = None
+    num_samples: int = 0
 
 
 def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
@@ -85,24 +88,30 @@ class BlockFiles:
 
     Attributes:
         folder: theirs alone.
+        error_bars: whether each has them.
     """
 
     folder: Path
+    error_bars: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What a block gives, one file each."""
+        return ("volume", "projections", "std", "bias") if self.error_bars else ("volume", "projections")
 
     def finished(self, block: Block) -> bool:
         """Whether a block need not be computed again."""
         return self._path("projections", block).is_file()  # which is written last
 
-    def write(self, block: Block, volume: Images, projections: Images) -> None:
-        """Keep what a block gave; each file is whole or not there."""
-        for name, array in (("volume", volume), ("projections", projections)):
+    def write(self, block: Block, *arrays: Images) -> None:
+        """Keep what a block gave, in the order of `names`; each file is whole or not there."""
+        for name, array in sorted(zip(self.names, arrays, strict=True), key=lambda pair: pair[0] == "projections"):
             with atomic_path(self._path(name, block)) as partial:
                 write_npy(partial, np.asarray(array, dtype=np.float32))
 
-    def read(self, block: Block) -> tuple[Images, Images]:
+    def read(self, block: Block) -> list[Images]:
         """The same, mapped to memory."""
-        volume, projections = (np.load(self._path(name, block), mmap_mode="r") for name in ("volume", "projections"))
-        return volume, projections
+        return [np.load(self._path(name, block), mmap_mode="r") for name in self.names]
 
     def _path(self, name: str, block: Block) -> Path:
         return self.folder / f"{name}-{block.wide.start:07d}-{block.wide.stop:07d}.npy"
@@ -119,29 +128,33 @@ def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files:
 
 def assemble(
     parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
-) -> tuple[Volume, Images]:
-    """The volume, in a new file, and the projections (tilt, y, u), in one that is gone when they are let go of.
+) -> tuple[Images, list[Volume]]:
+    """The projections (tilt, y, u), in a file that is gone when they are let go of, and the volume in a new one; where blocks have
+    error bars, standard deviation and bias follow in files beside it.
 
     Raises:
         OSError: the disk has no room for them.
     """
     size = grid.voxel_size
-    volume = create_volume(scratch, grid.shape, None if size is None else (size, size, size))
+    voxel = None if size is None else (size, size, size)
+    paths = [scratch, *(error_bar_paths(scratch).values() if files.error_bars else ())]
+    volumes = [create_volume(path, grid.shape, voxel) for path in paths]
     projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent)
     overlaps = (
         min(below.wide.stop - below.rows.stop, above.rows.start - above.wide.start) for below, above in pairwise(parts)
     )
     fade = min([_FADE, *overlaps, min(part.rows.stop - part.rows.start for part in parts) // 2])
     for number, part in enumerate(parts):
-        for target, found in zip((volume, projections), files.read(part), strict=True):
+        for target, found in zip((volumes[0], projections, *volumes[1:]), files.read(part), strict=True):
             first = part.rows.start + (fade if number else 0)
             stop = part.rows.stop + (fade if number < len(parts) - 1 else 0)
             if number and fade:
                 _fade_in(target, found, part, fade)
             target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
             let_go(target)
-    finish_volume(scratch, volume)
-    return Volume(volume, size), projections
+    for path, volume in zip(paths, volumes, strict=True):
+        finish_volume(path, volume)
+    return projections, [Volume(volume, size) for volume in volumes]
 
 
 def _fade_in(target: Images, found: Images, block: Block, fade: int) -> None:

@@ -19,6 +19,7 @@ from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
 from recon.scale.cluster import all_threads_of_worker
 from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.uncertainty.result import Uncertainty
 
 
 def reconstruct_in_blocks(
@@ -37,7 +38,7 @@ def reconstruct_in_blocks(
         method: what reconstructs a block.
         tilt_series: the images; a memory-mapped array will do.
         grid: of the whole volume.
-        scratch: a new ``.npy`` or MRC file that holds the volume, which the result maps to memory.
+        scratch: a new ``.npy`` or MRC file that holds the volume, which the result maps to memory; error bars lie beside it.
         folder: keeps the finished blocks, and those of a former run are taken from there; None keeps none.
         slices_at_once: slices of a block, at most.
         client: a Dask client whose workers see `folder`; None computes here.
@@ -47,15 +48,15 @@ def reconstruct_in_blocks(
     """
     parts = blocks(grid.height, slices_at_once, method.halo)
     with _folder(folder, scratch.parent) as kept:
-        files = BlockFiles(kept)
+        files = BlockFiles(kept, error_bars=method.num_samples > 0)
         if client is None:
             for part in parts:
                 solve_block(method, tilt_series, part, files)
         else:
             _on_cluster(client, method, tilt_series, parts, files)
-        return replace(
-            method.finish(*assemble(parts, files, tilt_series, grid, scratch)), slices_at_once=slices_at_once
-        )
+        projections, (volume, *bars) = assemble(parts, files, tilt_series, grid, scratch)
+        result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
+        return result if not bars else replace(result, uncertainty=Uncertainty(bars[0], bars[1], method.num_samples))
 
 
 @contextmanager
@@ -119,7 +120,7 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
     import dask.distributed
 
     source = StoredSeries.of(tilt_series, files.folder.absolute())
-    files = BlockFiles(files.folder.absolute())
+    files = replace(files, folder=files.folder.absolute())
     left = [part for part in parts if not files.finished(part)]
     shared = client.scatter(replace(method, finish=_no_result, forget=None), broadcast=True, hash=False)
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]

@@ -9,3 +9,5 @@ from .measure import volume_above as volume_above
 from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
 from .result import Uncertainty as Uncertainty
+from .unseen import unseen_range as unseen_range
+from .unseen import unseen_share as unseen_share

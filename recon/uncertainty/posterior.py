@@ -34,6 +34,7 @@ class Posterior:
         tilt_series: what it was made of, tilts in the same order.
         num_samples: how many.
         seed: of the fit and of the chain.
+        place: rows of a block among all, and how many these are: they say which pixels its fit left out.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
     Raises:
@@ -47,6 +48,7 @@ class Posterior:
         num_samples: int,
         *,
         seed: int = 0,
+        place: tuple[slice, int] | None = None,
         visit: Callable[[Tensor], None] | None = None,
     ) -> None:
         model, noise_model = outcome.signal_model, outcome.likelihood or outcome.noise_model
@@ -60,12 +62,15 @@ class Posterior:
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
         generator = torch.Generator().manual_seed(seed)
-        train = ~block_mask(tuple(observation.shape), share=_SHARE, generator=generator).to(device)
+        rows, height = (None, observation.shape[2]) if place is None else place
+        shape = (*observation.shape[:2], height)
+        train = ~block_mask(shape, share=_SHARE, rows=rows, generator=generator).to(device)
         if tilt_series.mask is not None:
             train &= _native(tilt_series.mask).to(device)
         self.energy = Energy(model, noise_model, observation, train)
-        self.step_size = 1 / self.energy.stiffness()
-        self.generator = torch.Generator(device).manual_seed(seed + 1)
+        self.step_size = 1 / (self.energy.stiffness() or 1.0)  # a block of vacuum has none, and nothing moves
+        first = 0 if rows is None else rows.start
+        self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # blocks must not share their noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
 
     @torch.no_grad()
@@ -114,6 +119,7 @@ def error_bars(
     num_samples: int = 16,
     *,
     seed: int = 0,
+    place: tuple[slice, int] | None = None,
     run_stage: RunStage = run_stage,
     prefix: str = "",
 ) -> Uncertainty:
@@ -128,13 +134,14 @@ def error_bars(
         tilt_series: what it was made of, tilts in the same order.
         num_samples: how many; they are thirty steps of the chain apart.
         seed: of the fit; it leaves the same pixels out.
+        place: rows of a block among all, and how many these are.
         run_stage: carries the stage out; `recon.joint.checkpoint.Journal.run_stage` keeps what it has reached.
         prefix: of the name under which it does.
 
     Raises:
         ValueError: a reconstruction that no fit made, or fewer than two samples.
     """
-    posterior = Posterior(outcome, tilt_series, num_samples, seed=seed)
+    posterior = Posterior(outcome, tilt_series, num_samples, seed=seed, place=place)
     run_stage(f"{prefix}error bars", posterior)
     return posterior.result()
 

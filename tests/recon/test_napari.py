@@ -7,7 +7,7 @@ import pytest
 
 from noiseflow import io
 from recon.napari import get_reader, write_image
-from recon.napari.widget import reconstruct_layer
+from recon.napari.widget import reconstruct_layer, reconstruct_layers
 
 
 @pytest.fixture
@@ -72,6 +72,23 @@ def test_layer_is_reconstructed_with_progress(needle):
     assert result["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][-1]] * 3)
     assert steps[-1][0] == steps[-1][1]
     assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+
+
+def test_error_bars_come_as_hidden_layers_from_the_widget_and_from_files(needle, tmp_path):
+    ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
+    options = {"method": "tv", "thickness": 16, "num_steps": 4, "uncertainty": 2}
+    volume, *bars = reconstruct_layers(pixels, attributes["metadata"], **options)
+    assert [look["name"] for _, look, _ in bars] == ["standard deviation", "bias"]
+    assert all(values.shape == volume[0].shape and not look["visible"] for values, look, _ in bars)
+    assert bars[0][0].min() >= 0 < bars[0][0].max()
+    path = tmp_path / "volume.mrc"
+    for name, values in (("volume", volume[0]), ("volume_std", bars[0][0]), ("volume_bias", bars[1][0])):
+        io.write(tmp_path / f"{name}.mrc", values)
+    read = get_reader(str(path))(str(path))
+    assert [look["name"] for _, look, _ in read] == ["volume", "volume_std", "volume_bias"]
+    np.testing.assert_array_equal(read[1][0], bars[0][0])
+    low, high = read[2][1]["contrast_limits"]
+    assert low == -high
 
 
 def test_layer_without_angles_is_refused_with_the_fix():

@@ -160,3 +160,40 @@ def test_a_volume_that_is_filled_part_by_part_is_a_whole_file(tmp_path, name):
     np.testing.assert_array_equal(found.data, part)
     assert is_own(tmp_path / name)
     assert found.voxel_size == ((2.0, 2.0, 2.0) if name == "v.mrc" else None)
+
+
+def test_error_bars_of_blocks_share_what_is_settled_and_fade_like_the_volume(scene, tmp_path):
+    _, noisy = scene
+    options = {"method": "l2", "weight": 0.5, "num_steps": 6, "uncertainty": 2, "slices_at_once": 14}
+    kept = tmp_path / "blocks"
+    found = reconstruct(noisy, scratch=tmp_path / "v.mrc", keep=lambda prefix: kept, **options)
+    assert {path.name for path in tmp_path.glob("v*")} == {"v.mrc", "v_std.mrc", "v_bias.mrc"}
+    assert found.uncertainty.num_samples == 2
+    share = ((np.arange(8) + 0.5) / 8)[:, None]  # four slices on either side of the border at 14
+    for name, part in (("std", found.uncertainty.std), ("bias", found.uncertainty.bias), ("volume", found.volume)):
+        assert is_mapped(part.attenuation)
+        below, above = (np.load(path) for path in sorted(kept.glob(f"{name}-*")))
+        assert below.shape[1] == above.shape[1] == 14 + 8  # with the halo
+        values = part.attenuation
+        np.testing.assert_array_equal(values[:, :10], below[:, :10])
+        np.testing.assert_array_equal(values[:, 18:], above[:, 12:])
+        mixed = (1 - share) * below[:, 10:18] + share * above[:, 4:12]
+        np.testing.assert_allclose(values[:, 10:18], mixed, atol=1e-6)
+        assert below.any()
+        assert above.any()
+    assert not np.array_equal(np.load(kept / "std-0000000-0000022.npy"), np.load(kept / "std-0000006-0000028.npy"))
+    resumed = reconstruct(noisy, scratch=tmp_path / "w.mrc", keep=lambda prefix: kept, **options)  # finished blocks are taken
+    np.testing.assert_array_equal(resumed.uncertainty.std.attenuation, found.uncertainty.std.attenuation)
+
+
+def test_workers_make_the_error_bars_of_one_process(scene, tmp_path, run):
+    pytest.importorskip("dask.distributed", reason="needs the extra [distributed]")
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    command = ["reconstruct", tmp_path / "tilts.mrc", "--method", "l2", "--weight", 0.5, "--steps", 4, "--uncertainty", 2]
+    run(*command, "--slices-at-once", 14, "-o", tmp_path / "alone.mrc")
+    run(*command, "--slices-at-once", 14, "--workers", 1, "-o", tmp_path / "dask.mrc")
+    for name in ("", "_std", "_bias"):
+        found, expected = (mrcfile.read(tmp_path / f"{run}{name}.mrc") for run in ("dask", "alone"))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert expected.any()

@@ -31,6 +31,8 @@ from recon.uncertainty import (
     mean_of_region,
     predictive_ranks,
     share_within,
+    unseen_range,
+    unseen_share,
     volume_above,
 )
 from recon.uncertainty.measure import parse_region
@@ -103,14 +105,12 @@ def test_samples_repeat_themselves_and_go_on_where_they_were(scene):
     assert (bars.std.attenuation >= 0).all()
 
 
-def test_error_bars_that_cannot_be_made_are_refused(scene, tmp_path):
+def test_error_bars_that_cannot_be_made_are_refused(scene):
     grid = VolumeGrid.of(scene)
     with pytest.raises(ValueError, match="fits no volume"):
         reconstruct(scene, grid, method="wbp", uncertainty=4)
     with pytest.raises(ValueError, match="at least 2"):
         reconstruct(scene, grid, uncertainty=1)
-    with pytest.raises(ValueError, match="whole volume"):
-        reconstruct(scene, grid, uncertainty=4, slices_at_once=8, scratch=tmp_path / "a.npy")
 
 
 def test_wrong_noise_model_is_found_out_on_left_out_pixels(scene):
@@ -129,6 +129,16 @@ def test_ranks_of_what_a_detector_clips_are_uniform():
     ranks = predictive_ranks(noise, signal[None], noise(signal).sample(generator=torch.Generator().manual_seed(0)))
     assert share_within(ranks) == pytest.approx(0.9, abs=0.01)
     assert float(np.abs(np.sort(ranks) - np.linspace(0, 1, ranks.size)).max()) < 1.6 / math.sqrt(ranks.size)
+
+
+def test_waves_that_no_tilt_saw_are_told_from_those_that_one_did():
+    angles = np.arange(-40.0, 61, 5)
+    assert unseen_range(angles) == (60, 140)
+    z, x = np.indices((32, 32)) - 16
+    for degrees, share in ((90, 1), (75, 1), (0, 0), (50, 0), (-35, 0), (130, 1)):
+        towards = 6 * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+        wave = np.cos(2 * np.pi / 32 * (x * round(towards[0]) + z * round(towards[1])))
+        assert unseen_share(np.repeat(wave[:, None], 4, 1), angles) == pytest.approx(share, abs=1e-9)
 
 
 def test_figures_of_a_volume_carry_intervals(tmp_path):

@@ -1,0 +1,64 @@
+"""Error bars in the report: standard deviation and bias beside the volume, on one colour scale."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.report.charts import new_figure, show_image
+from recon.series.tilt_series import TiltSeries, Volume
+from recon.uncertainty.unseen import in_words
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from noiseflow.report import Report
+    from recon.uncertainty.result import Uncertainty
+
+_REACH = 99.8  # percentile: a few voxels of the edge must not set the scale
+
+
+def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars: Uncertainty, unit: str) -> None:
+    """A section with slices across y and z, and the directions that no tilt saw."""
+    report.heading("Error bars")
+    words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
+    report.figure(error_bar_figure(volume, bars, unit), caption=words)
+    report.text(in_words(tilt_series.tilt_angles))
+
+
+def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
+    """Volume, standard deviation and bias, (z, x) through the middle above (y, x); the last two share colours and their bar."""
+    parts = [each.attenuation for each in (volume, bars.std, bars.bias)]
+    reach = max(float(np.percentile(np.abs(part), _REACH)) for part in parts[1:])
+    reach = reach or max(float(np.abs(part).max()) for part in parts[1:]) or 1.0
+    figure, axes = new_figure(3, 2, width=10.5, height=3.3)
+    spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
+    length = "voxels" if volume.voxel_size is None else "nm"
+    for row, (names, down, pick) in zip(axes, (("slice across y", "z", _across_y), ("slice across z", "y", _across_z)), strict=True):
+        show_image(row[0], pick(parts[0]), f"volume, {names}", limits=_limits(parts[0]))
+        for axis, part, name in zip(row[1:], parts[1:], ("standard deviation", "bias"), strict=True):
+            drawn = axis.imshow(pick(part), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
+            axis.set_title(name, fontsize=10)
+        for axis, part in zip(row, parts, strict=True):
+            height, width = pick(part).shape
+            axis.images[0].set_extent((0, width * spacing, height * spacing, 0))
+            axis.set_xlabel(f"x, {length}", fontsize=8)
+            axis.set_ylabel(f"{down}, {length}", fontsize=8)
+            axis.tick_params(labelsize=7)
+    figure.colorbar(drawn, ax=list(axes[:, 1:].ravel()), shrink=0.8, label=unit)
+    return figure
+
+
+def _limits(values: NDArray[np.float32]) -> tuple[float, float]:
+    low, high = np.percentile(values, (0.5, _REACH))
+    return float(low), float(max(high, low + 0.05 * (values.max() - low)))
+
+
+def _across_y(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return values[:, values.shape[1] // 2]
+
+
+def _across_z(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return values[values.shape[0] // 2]
