@@ -59,13 +59,13 @@ class Reconstruction:
         """The same for the series flipped back, whose tilts stand in reverse where their angles were negated."""
         if orientation == Orientation():
             return self
-        bars, images = self.uncertainty, orientation.images(self.projections)
+        bars = self.uncertainty
         if bars is not None:
             bars = replace(bars, std=_turned(bars.std, orientation), bias=_turned(bars.bias, orientation))
         return replace(
             self,
             volume=_turned(self.volume, orientation),
-            projections=np.ascontiguousarray(images[::-1]) if orientation.negated else images,
+            projections=orientation.projections(self.projections),
             uncertainty=bars,
             orientation=orientation,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,9 @@ class Method:
     blockwise: SettleBlocks | None = None
 
 
+_Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
+
+
 @cache
 def find_method(name: str) -> Method:
     """The method of a name.
@@ -207,47 +210,48 @@ def reconstruct(
         )
         return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
-    if slices_at_once is None:
-        return _run_oriented(found, tilt_series, grid, chosen)
-    if slices_at_once < 1:
-        raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
-    if found.blockwise is None:
-        able = [name for name in method_names() if find_method(name).blockwise is not None]
-        raise ValueError(f"--slices-at-once does not know --method {method}: choose {', '.join(able)}")
-    if scratch is None:
-        raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
-    method_in_blocks = found.blockwise(tilt_series, grid, chosen)
-    return reconstruct_in_blocks(
-        method_in_blocks,
-        tilt_series,
-        grid,
-        scratch=Path(scratch),
-        folder=None if chosen.keep is None else chosen.keep(chosen.prefix),
-        slices_at_once=slices_at_once,
-        client=client,
-    )
-
-
-def _run_oriented(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
-    """Run a method on a series by rising angle in the one orientation that its mirror images share, and flip the result back."""
-    if settings.noise_model is not None and needs_image(settings.noise_model):
-        return _run(method, tilt_series, grid, settings)  # maps of the detector's pixels stay where they are
+    run: _Run = partial(_at_once, found)
+    if slices_at_once is not None:
+        if slices_at_once < 1:
+            raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
+        if found.blockwise is None:
+            able = [name for name in method_names() if find_method(name).blockwise is not None]
+            raise ValueError(f"--slices-at-once does not know --method {method}: choose {', '.join(able)}")
+        if scratch is None:
+            raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
+        blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
+        run = partial(_in_blocks, found.blockwise, blocks)
+    if chosen.noise_model is not None and needs_image(chosen.noise_model):
+        return _of_distinct_tilts(run, found, tilt_series, grid, chosen)  # maps of the detector's pixels stay where they are
     orientation = Orientation.of(tilt_series)
-    turned = orientation.series(tilt_series)
-    if orientation.negated:
-        turned = turned.select(np.arange(turned.num_tilts)[::-1])
-    return _run(method, turned, grid, settings).turned(orientation)
+    return _of_distinct_tilts(run, found, orientation.series(tilt_series), grid, chosen).turned(orientation)
 
 
-def _run(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+def _of_distinct_tilts(
+    run: _Run, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+) -> Reconstruction:
     """Run a method on a series by rising angle; a fit sees copies once, or their noise would count as signal."""
     first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)
     kept, place = np.unique(first, return_inverse=True)
     seen = tilt_series if len(kept) == len(first) else tilt_series.select(kept)
-    result = method.run(seen, grid, settings)
-    if settings.uncertainty:
-        result = _with_error_bars(result, seen, settings)
+    result = run(seen, grid, settings)
     return result if seen is tilt_series else replace(result, projections=result.projections[place])
+
+
+def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+    result = method.run(tilt_series, grid, settings)
+    return _with_error_bars(result, tilt_series, settings) if settings.uncertainty else result
+
+
+def _in_blocks(
+    blockwise: SettleBlocks,
+    blocks: dict[str, Any],
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    settings: Settings,
+) -> Reconstruction:
+    folder = None if settings.keep is None else settings.keep(settings.prefix)
+    return reconstruct_in_blocks(blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks)
 
 
 def _with_error_bars(result: Reconstruction, tilt_series: TiltSeries, settings: Settings) -> Reconstruction:

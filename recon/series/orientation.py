@@ -45,32 +45,31 @@ class Orientation:
         return cls(*(bool(moment < 0) for moment in moments))
 
     def series(self, tilt_series: TiltSeries) -> TiltSeries:
-        """A series in this orientation, its tilts in their order."""
+        """A series in this orientation; where angles are negated, its tilts stand in reverse, so that those that rose still do."""
         if self == Orientation():
             return tilt_series
-        images, mask = tilt_series.images, tilt_series.mask
-        if is_mapped(images) and images.nbytes > mapped.IN_MEMORY:
+        turned = tilt_series.select(slice(None, None, -1)) if self.negated else tilt_series
+        images, mask = turned.images, turned.mask
+        if is_mapped(images):
             images = mapped.mapped_copy((self.images(image) for image in images), images.shape, images.dtype)
         else:
             images = self.images(images)
-        angles = -tilt_series.tilt_angles if self.negated else tilt_series.tilt_angles
-        flipped = tilt_series.with_images(images, None if mask is None else self.images(mask))
+        angles = -turned.tilt_angles if self.negated else turned.tilt_angles
+        flipped = turned.with_images(images, None if mask is None else self.images(mask))
         return replace(flipped, tilt_angles=angles)
 
     def images(self, images: NDArray[Any]) -> NDArray[Any]:
         """Images (..., y, u), there or back."""
-        return _flipped(images, {-2: self.upside_down, -1: self.mirrored})
+        axes = [axis for axis, flip in ((-2, self.upside_down), (-1, self.mirrored)) if flip]
+        return np.ascontiguousarray(np.flip(images, tuple(axes)))
+
+    def projections(self, images: NDArray[Any]) -> NDArray[Any]:
+        """Images (tilt, y, u) by rising angle, there or back. Those in a file are flipped there."""
+        return _flipped(images, {0: self.negated, 1: self.upside_down, 2: self.mirrored})
 
     def volume(self, volume: NDArray[Any]) -> NDArray[Any]:
         """A volume (z, y, x), there or back: u = x cos θ + z sin θ. One that lies in a file is flipped there."""
-        axes = {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored}
-        if not is_mapped(volume):
-            return _flipped(volume, axes)
-        for z in range((len(volume) + 1) // 2 if axes[0] else len(volume)):
-            other = len(volume) - 1 - z if axes[0] else z
-            lower, upper = (_flipped(np.array(volume[place]), {0: axes[1], 1: axes[2]}) for place in (z, other))
-            volume[other], volume[z] = lower, upper
-        return volume
+        return _flipped(volume, {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored})
 
 
 def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
@@ -81,4 +80,11 @@ def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArra
 
 
 def _flipped(array: NDArray[Any], axes: dict[int, bool]) -> NDArray[Any]:
-    return np.ascontiguousarray(np.flip(array, tuple(axis for axis, flip in axes.items() if flip)))
+    flips = tuple(axis for axis, flip in axes.items() if flip)
+    if array.ndim < 3 or not (is_mapped(array) and array.flags.writeable):
+        return np.ascontiguousarray(np.flip(array, flips))
+    inner = tuple(axis - 1 for axis in flips if axis)
+    for place in range((len(array) + 1) // 2 if axes[0] else len(array)) if flips else ():
+        other = len(array) - 1 - place if axes[0] else place
+        array[other], array[place] = (np.flip(array[section], inner).copy() for section in (place, other))
+    return array
