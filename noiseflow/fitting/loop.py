@@ -183,9 +183,10 @@ class FitLoop:
             return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
 
     def _never_improves(self, schedule: Schedule) -> bool:
-        """Whether the start is still the best after 40 % of the steps: there is nothing left to learn."""
+        """Whether the start is still the best of several looks after 40 % of the steps: there is nothing left to learn."""
         history = self.result.history
-        return self.done >= 0.4 * schedule.num_steps and history.get(0, math.inf) <= min(history.values(), default=0.0)
+        late = self.done >= 0.4 * schedule.num_steps and len(history) > 1
+        return late and history.get(0, math.inf) <= min(history.values())
 
     def _check_table(self, *, rarely: bool) -> None:
         """Signals may leave the table; a model that learns may outgrow it, but slowly: seen in every fifth look."""

@@ -221,3 +221,33 @@ def test_selection_asks_for_candidates_that_can_explain_the_data() -> None:
         select(signal, observation[:-1])
     with pytest.raises(ValueError, match="held_out leaves"):
         select(signal, observation, held_out=1.0)
+
+
+class _Wide(noiseflow.NoiseModelBase):
+    """Student's distribution that starts thirty times too narrow and has no rate of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.log_width = torch.nn.Parameter(torch.tensor(0.0))
+
+    def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:  # type: ignore[override]
+        return torch.distributions.StudentT(2.5, signal, self.log_width.exp(), validate_args=False)
+
+
+def _student() -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    signal = 100 + 50 * torch.rand(8000)
+    return signal, signal + 30 * torch.distributions.StudentT(2.5).sample(signal.shape)
+
+
+@pytest.mark.parametrize("num_steps", [1, 12, 24])
+def test_a_fit_of_few_steps_takes_them(num_steps: int) -> None:
+    model = _Wide()
+    result = noiseflow.fit(model, *_student(), num_steps=num_steps)
+    assert result.num_steps == num_steps
+    assert model.log_width.item() > 0
+
+
+def test_users_model_far_from_its_start_is_chosen_within_few_steps() -> None:
+    candidates = {"Gaussian": noiseflow.Gaussian(), "Student": _Wide()}
+    assert noiseflow.select(*_student(), candidates=candidates, num_steps=60).chosen.name == "Student"
