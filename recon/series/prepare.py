@@ -15,6 +15,7 @@ from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
+from recon.series.orientation import Orientation
 from recon.series.screening import Screening, screen
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
@@ -86,7 +87,7 @@ def prepare(
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
     check_contrast(tilt_series)
-    found = screen(tilt_series)
+    found = screen(Orientation.of(tilt_series).series(tilt_series))  # mirror images are screened alike, to the last bit
     _require_axis(tilt_series, found, tilt_axis)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
