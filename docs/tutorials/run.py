@@ -22,7 +22,8 @@ def run(page: Path) -> None:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:] or sorted(page.stem for page in HERE.glob("*.md") if page.stem != "index"):
+    with_code = [page for page in HERE.glob("*.md") if "```python" in page.read_text(encoding="utf-8")]
+    for name in sys.argv[1:] or sorted(page.stem for page in with_code):
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
             run(HERE / f"{name}.md")

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 # Pages in docs/benchmarks are written by scripts, and change with the next measurement.
 PAGES = sorted(
     [
-        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
         *(page for page in (ROOT / "docs").rglob("*.md") if not {"benchmarks", "generated"} & set(page.parts)),
     ]
 )
