@@ -17,6 +17,9 @@ Array = NDArray[np.float32]
 _VIRION_VOXELS = 32  # across; the atoms' density is known to 15 Å, and a coarser voxel would not show it
 
 
+_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about a voxel of 64 and four: neighbours are told apart
+
+
 class Canvas:
     """The y-slices `rows` of a cube [-1, 1]³ of `size` voxels along each edge.
 
@@ -176,6 +179,57 @@ def slab(size: int, *, generator: np.random.Generator, count: int = 120, rows: s
     return np.asarray(canvas.volume * inside)
 
 
+def atoms(size: int, *, generator: np.random.Generator, count: int = 300, rows: slice | None = None) -> Array:
+    """A particle at atomic resolution: Gaussians at random sites that keep their distance. Arguments and result as `shells`."""
+    canvas = Canvas(size, rows)
+    sites: list[NDArray[Any]] = []
+    for _ in range(20 * count):
+        site = 0.75 * _place(generator, 0.05)
+        if len(sites) < count and all(np.linalg.norm(site - other) > _ATOMS_APART for other in sites):
+            sites.append(site)
+    for site in sites:
+        height, width = generator.uniform(0.5, 1.0), _ATOM_WIDTH
+        box, (z, y, x) = canvas.window(site, 4 * width)
+        canvas.volume[box] += (height * np.exp(-(z**2 + y**2 + x**2) / (2 * width**2))).astype(np.float32)
+    return canvas.volume
+
+
+def texture(size: int, *, generator: np.random.Generator, count: int = 40, rows: slice | None = None) -> Array:
+    """One body whose density rises from side to side under a texture of `count` waves, without any edge inside. As `shells`."""
+    canvas = Canvas(size, rows)
+    box, places = canvas.window(np.zeros(3), 0.9)
+    body = canvas.covered(places, np.array([0.55, 0.85, 0.8]), np.eye(3))
+    shade = 0.5 + 0.3 * places[2] + 0.3 * _waves(places, generator, count, longest=0.5, shortest=0.15)
+    canvas.volume[box] = body * np.clip(shade, 0.05, 1).astype(np.float32)
+    return canvas.volume
+
+
+def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows: slice | None = None) -> Array:
+    """A porous support of curved walls with `count` small dense particles on it. Arguments and result as `shells`."""
+    canvas = Canvas(size, rows)
+    box, places = canvas.window(np.zeros(3), 0.9)
+    body = canvas.covered(places, np.array([0.7, 0.85, 0.8]), np.eye(3))
+    waves = _waves(places, generator, 60, longest=0.8, shortest=0.5)
+    walls = np.clip(0.5 + (0.3 - np.abs(waves)) * 3, 0, 1)  # about the waves' zero: a sponge of one connected wall
+    canvas.volume[box] = (0.4 * body * walls).astype(np.float32)
+    for _ in range(count):
+        radius = generator.uniform(0.03, 0.06)
+        canvas.ball(1.0, 0.75 * _place(generator, radius), radius)
+    return canvas.volume
+
+
+def _waves(
+    places: tuple[NDArray[Any], ...], generator: np.random.Generator, count: int, *, longest: float, shortest: float
+) -> NDArray[Any]:
+    """Plane waves of random direction and phase, of variance one together; lengths in half-edges of the cube."""
+    z, y, x = places
+    total = np.zeros(np.broadcast_shapes(z.shape, y.shape, x.shape))
+    for _ in range(count):
+        kz, ky, kx = 2 * np.pi / generator.uniform(shortest, longest) * _direction(generator)
+        total += np.cos(z * kz + y * ky + x * kx + generator.uniform(0, 2 * np.pi))
+    return total * np.sqrt(2 / count)
+
+
 PHANTOMS: dict[str, Callable[..., Array]] = {
     "shells": shells,
     "virions": virions,
@@ -183,6 +237,9 @@ PHANTOMS: dict[str, Callable[..., Array]] = {
     "filaments": filaments,
     "particles": particles,
     "slab": slab,
+    "atoms": atoms,
+    "texture": texture,
+    "catalyst": catalyst,
 }
 
 

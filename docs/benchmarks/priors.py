@@ -1,0 +1,154 @@
+"""What a volume is expected to look like: regularisers against total variation, on phantoms that suit it and that do not.
+
+    python docs/benchmarks/priors.py oracle [--phantom atoms] [--noise clipped] [--size 64]   # true noise, best of the weights
+    python docs/benchmarks/priors.py joint                                                    # as a user gets them
+    python docs/benchmarks/priors.py page                                                     # priors.md from the JSON
+
+Each row is saved when it is done, in results/priors.json beside this file, and is not computed again without --again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from joint_accuracy import NOISES, true_noise
+from prior_candidates import CANDIDATES
+
+from noiseflow import io
+from noiseflow.commands.console import Output
+from recon.benchmarks.scenes import Results, Scene, make_scene
+from recon.joint.joint import JointReconstructor
+from recon.metrics.metrics import compare
+
+HERE = Path(__file__).parent
+PHANTOMS = ("shells", "virions", "filaments", "particles", "slab", "atoms", "texture", "catalyst")
+WEIGHTS = (0.2, 0.4, 0.8, 1.6)
+_TIED = 0.002  # nats per pixel: about the standard error of a difference at 64³
+_HEAD = """# Regularisers
+
+Written by `python docs/benchmarks/priors.py page` from `results/priors.json`; each row is one command. Figures are volume PSNR in dB:
+total variation in full, the others as gain over it; in brackets processor time as a ratio to total variation's."""
+Row = dict[str, Any]
+
+
+def fitted(scene: Scene, make: Callable[[], JointReconstructor]) -> Row:
+    """One fit: volume PSNR, held-out likelihood and processor time."""
+    started = time.process_time()
+    result = make()(scene.noisy)
+    seconds = time.process_time() - started
+    psnr = compare(result.volume.attenuation, scene.truth).psnr
+    judged = None if result.fit_result is None else result.fit_result.held_out_nll
+    return {"volume": psnr, "weight": result.weight, "held-out": judged, "seconds": seconds}
+
+
+def oracle(scene: Scene, noise: str, name: str) -> Row:
+    """The true noise and the best of the weights."""
+
+    def fit(weight: float) -> Row:
+        return fitted(
+            scene,
+            lambda: JointReconstructor(
+                noise_model=lambda: true_noise(noise), weight=weight, regulariser=CANDIDATES[name]
+            ),
+        )
+
+    fits = [fit(weight) for weight in WEIGHTS]
+    best = max(fits, key=lambda found: float(found["volume"]))
+    return best | {"seconds": sum(found["seconds"] for found in fits) / len(fits)}
+
+
+def joint(scene: Scene, noise: str, name: str) -> Row:
+    """Noise and weight as the fit chooses them."""
+    del noise
+    return fitted(scene, lambda: JointReconstructor(regulariser=CANDIDATES[name]))
+
+
+def page(cells: dict[str, Row]) -> str:
+    """The page as Markdown."""
+    runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
+    lines = [_HEAD, "", "Computed " + ", ".join(f"{date} at commit {commit}" for date, commit in runs) + ".", ""]
+    for part, words in (("oracle", "True noise, best of four weights"), ("joint", "Noise and weight as the fit chooses them")):
+        scenes: dict[str, dict[str, Row]] = {}
+        for key, row in cells.items():
+            kind, where, name = key.split("/", 2)
+            if kind == part:
+                scenes.setdefault(where, {})[name] = row
+        names = [name for name in CANDIDATES if any(name in found for found in scenes.values())]
+        if not names:
+            continue
+        lines += [f"## {words}", "", f"| scene | {' | '.join(names)} |", "|---" * (1 + len(names)) + "|"]
+        lines += [f"| {where} | {' | '.join(_text(found, name) for name in names)} |" for where, found in scenes.items()]
+        whole = [found for found in scenes.values() if all(name in found for name in names)]
+        means = [sum(found[name]["volume"] - found[names[0]]["volume"] for found in whole) / max(1, len(whole)) for name in names]
+        lines += [f"| mean gain of {len(whole)} | {' | '.join(f'{mean:+.2f}' for mean in means)} |", ""]
+        lines += _chosen(scenes) if part == "joint" else []
+    return "\n".join(lines)
+
+
+def _text(found: dict[str, Row], name: str) -> str:
+    row, first = found.get(name), found.get("total-variation")
+    if row is None or first is None:
+        return ""
+    if row is first:
+        return f"{row['volume']:.2f}"
+    return f"{row['volume'] - first['volume']:+.2f} ({row['seconds'] / first['seconds']:.1f})"
+
+
+def _chosen(scenes: dict[str, dict[str, Row]]) -> list[str]:
+    """What choosing between two by held-out likelihood would gain, and the best that any choice could."""
+    pairs = [(found["total-variation"], found["second-order"]) for found in scenes.values() if "second-order" in found]
+    if not pairs:
+        return []
+    picked = [second if second["held-out"] < first["held-out"] - _TIED else first for first, second in pairs]
+    gain = sum(row["volume"] - first["volume"] for row, (first, _) in zip(picked, pairs, strict=True)) / len(pairs)
+    most = sum(max(0.0, second["volume"] - first["volume"]) for first, second in pairs) / len(pairs)
+    cost = sum(first["seconds"] + second["seconds"] for first, second in pairs) / sum(first["seconds"] for first, _ in pairs)
+    return [
+        f"Choosing total variation or second order per series by held-out likelihood gains {gain:+.2f} dB in the mean of "
+        f"{len(pairs)} scenes at {cost:.1f} times the time; the best choice of the two would gain {most:+.2f} dB.",
+        "",
+    ]
+
+
+def main() -> None:
+    """Run the chosen rows, save each, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("oracle", "joint", "page"))
+    parser.add_argument("--phantom", action="append", choices=PHANTOMS)
+    parser.add_argument("--noise", action="append", choices=NOISES)
+    parser.add_argument("--regulariser", action="append", choices=list(CANDIDATES))
+    parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--tilts", default="-59.5:57.5:1.5", help="START:STOP:STEP in degrees; 79 tilts by default")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "priors.json", help="JSON file")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    results, output = Results(options.out, "priors"), Output(json_mode=False)
+    if options.part == "page":
+        with io.atomic_path(HERE / "priors.md") as partial:
+            partial.write_text(page(results.cells), encoding="utf-8")
+        return
+    compute = {"oracle": oracle, "joint": joint}[options.part]
+    for noise in options.noise or NOISES:
+        for phantom in options.phantom or PHANTOMS:
+            for name in options.regulariser or CANDIDATES:
+                key = f"{options.part}/{phantom}, {noise}, {options.size}³/{name}"
+                if options.again:
+                    results.cells.pop(key, None)
+                scene = make_scene(options.size, phantom=phantom, noise=noise, tilts=options.tilts)
+                row = results.cell(key, lambda s=scene, n=noise, r=name: compute(s, n, r))  # type: ignore[misc]
+                output.line(f"{key}: {row}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"priors.py: {error}")
