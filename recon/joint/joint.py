@@ -115,7 +115,7 @@ class JointReconstructor:
         model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
         run = self._slab(part, model, progress, share=noise_share(tilt_series.images))
         run.fit_whole()
-        return run.settled(slabs, start)
+        return run.settled(start)
 
     @kept_memory()
     def fit(

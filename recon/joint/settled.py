@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor, nn
@@ -29,7 +28,6 @@ class Settled:
         scale: of the field.
         facts: what was known of the series.
         start: the coarse volume that every block begins with.
-        slabs: the runs of slices that it was settled on.
         signal_model: of these slices, as fitted; None where it was left behind.
         fit_result: of the last fit of them.
     """
@@ -42,7 +40,6 @@ class Settled:
     scale: float
     facts: Facts
     start: Start
-    slabs: Sequence[slice]
     signal_model: TomographySignal | None
     fit_result: FitResult
 
@@ -82,7 +79,7 @@ class PlannedRun:
         self.runner.run([stage for stage in self.stages if stage.where == "whole"])
         return self.runner.result
 
-    def settled(self, slabs: Sequence[slice], start: Start) -> Settled:
+    def settled(self, start: Start) -> Settled:
         """What some slabs have settled, which were the whole of this run."""
         model = self.runner.tasks["whole"].signal_model
         return Settled(
@@ -94,7 +91,6 @@ class PlannedRun:
             scale=float(model.field.scale),
             facts=self.facts,
             start=start,
-            slabs=slabs,
             signal_model=model,
             fit_result=self.runner.result,
         )

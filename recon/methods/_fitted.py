@@ -61,8 +61,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
             result = Reconstruction(volume, projections, name, *known)
-            slabs = ", ".join(f"{slab.start} to {slab.stop - 1}" for slab in settled.slabs if slab.stop > slab.start)
-            return replace(result, choices=_choices(result, settings, tilt_series) | {"settled on slices": slabs})
+            return replace(result, choices=_choices(result, settings, tilt_series))
 
         def forget(block: Block) -> None:
             if settings.forget is not None:

@@ -87,8 +87,9 @@ def tall(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["v.npy", "v.mrc"])
-def test_command_holds_one_block_in_memory(tall, tmp_path, run, name):
+def test_command_holds_one_block_in_memory(tall, tmp_path, run, name, monkeypatch):
     """Neither images nor volume nor projections, of 14, 27 and 14 MiB, are ever whole in memory."""
+    monkeypatch.setattr("noiseflow.io.mapped.IN_MEMORY", 2**20)  # of the size from which copies go to files
     command = ["reconstruct", tall, "-o", tmp_path / name, "--method", "sirt", "--steps", 2]
     command += ["--slices-at-once", 7000 // 4]
     peaks = []
