@@ -32,7 +32,8 @@ WEIGHTS = (0.2, 0.4, 0.8, 1.6)
 _TIED = 0.002  # nats per pixel: about the standard error of a difference at 64³
 _HEAD = """# Regularisers
 
-Written by `python docs/benchmarks/priors.py page` from `results/priors.json`; each row is one command. Figures are volume PSNR in dB:
+Written by `python docs/benchmarks/priors.py page` from `results/priors.json`; each row is one command. Figures are
+volume PSNR in dB:
 total variation in full, the others as gain over it; in brackets processor time as a ratio to total variation's."""
 Row = dict[str, Any]
 

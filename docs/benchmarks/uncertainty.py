@@ -22,7 +22,7 @@ import torch
 from joint_accuracy import NOISES, PHANTOMS, true_noise
 from matplotlib.figure import Figure
 
-from noiseflow import Gaussian, io
+from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from noiseflow.report.charts import new_figure, show_image
@@ -44,10 +44,10 @@ interval is the volume ± 1.645·√(std² + bias²). What the missing wedge hid
 count as vacuum have no spread. Of tilts left out, the table shows the share of pixels inside the 90 % interval and, in brackets,
 the largest distance of the ranks' distribution from the uniform one."""
 _WHY = """Where coverage is lower, the truth lies above the interval: the regulariser takes contrast off thin walls and fine
-detail, and half of the error or more is in directions that no tilt saw (column "error unseen"), where nothing in the images can say
-so. Column "wider by" is the factor on the half-width at which 90 % of the occupied voxels would be covered."""
-_LEFT_OUT = """Clipping makes a Gaussian's intervals hold the right share by chance; the ranks show what is wrong. A correct model leaves
-a distance below 0.02; a wrong one 0.17 and more."""
+detail, and half of the error or more is in directions that no tilt saw (column "error unseen"), where nothing in the images
+can say so. Column "wider by" is the factor on the half-width at which 90 % of the occupied voxels would be covered."""
+_LEFT_OUT = """Clipping makes a Gaussian's intervals hold the right share by chance; the ranks show what is wrong. A correct model
+leaves a distance below 0.02; a wrong one 0.17 and more."""
 _LOW, _HIGH = 0.85, 0.95
 _GAP = 8  # every eighth tilt is left out
 Row = dict[str, Any]

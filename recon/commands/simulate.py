@@ -24,7 +24,9 @@ def simulate(
     ],
     size: Annotated[int, typer.Option(help="Voxels along each edge, up to 1000 and beyond.")] = 64,
     tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees, both ends included.")] = "-59.5:57.5:1.5",
-    phantom: Annotated[str, typer.Option(help="shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")] = "shells",
+    phantom: Annotated[
+        str, typer.Option(help="shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")
+    ] = "shells",
     noise: Annotated[
         str,
         typer.Option(

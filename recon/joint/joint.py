@@ -318,7 +318,7 @@ class JointReconstructor:
         return self.coarse_to_fine and HalfResolution.possible(model)
 
     def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
-        """Of the slab: a few cannot tell weights apart where each of them has few pixels, and gaps of tilts need twice as many."""
+        """Of the slab: a few cannot tell weights apart where each has few pixels, and gaps of tilts need twice as many."""
         if self.slab is not None:
             return self.slab
         voxels = _SLAB_VOXELS * (2 if quiet else 1)

@@ -49,7 +49,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
 
 
 def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerData:
-    """A hidden layer of standard deviations or biases in the place of its volume's layer, with colours for either side of zero."""
+    """A hidden layer of standard deviations or biases in the place of its volume's, with colours for either side of zero."""
     reach = float(np.abs(values).max()) or 1.0
     look = {"name": name, "visible": False, "colormap": "PiYG", "contrast_limits": (-reach, reach)}
     return values, {**look, "scale": volume["scale"], "metadata": dict(volume["metadata"])}, "image"

@@ -36,7 +36,8 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     figure, axes = new_figure(3, 2, width=10.5, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"
-    for row, (names, down, pick) in zip(axes, (("slice across y", "z", _across_y), ("slice across z", "y", _across_z)), strict=True):
+    sections = ("slice across y", "z", _across_y), ("slice across z", "y", _across_z)
+    for row, (names, down, pick) in zip(axes, sections, strict=True):
         show_image(row[0], pick(parts[0]), f"volume, {names}", limits=_limits(parts[0]))
         for axis, part, name in zip(row[1:], parts[1:], ("standard deviation", "bias"), strict=True):
             drawn = axis.imshow(pick(part), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
@@ -57,8 +58,10 @@ def _limits(values: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _across_y(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return values[:, values.shape[1] // 2]
+    across: NDArray[np.float32] = values[:, values.shape[1] // 2]
+    return across
 
 
 def _across_z(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return values[values.shape[0] // 2]
+    across: NDArray[np.float32] = values[values.shape[0] // 2]
+    return across

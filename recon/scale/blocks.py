@@ -129,8 +129,8 @@ def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files:
 def assemble(
     parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
 ) -> tuple[Images, list[Volume]]:
-    """The projections (tilt, y, u), in a file that is gone when they are let go of, and the volume in a new one; where blocks have
-    error bars, standard deviation and bias follow in files beside it.
+    """The projections (tilt, y, u), in a file that is gone when they are let go of, and the volume in a new one; where blocks
+    have error bars, standard deviation and bias follow in files beside it.
 
     Raises:
         OSError: the disk has no room for them.

@@ -45,7 +45,7 @@ class Orientation:
         return cls(*(bool(moment < 0) for moment in moments))
 
     def series(self, tilt_series: TiltSeries) -> TiltSeries:
-        """A series in this orientation; where angles are negated, its tilts stand in reverse, so that those that rose still do."""
+        """A series in this orientation; where angles are negated, its tilts stand in reverse: those that rose still do."""
         if self == Orientation():
             return tilt_series
         turned = tilt_series.select(slice(None, None, -1)) if self.negated else tilt_series

@@ -227,7 +227,8 @@ def _waves(
     for _ in range(count):
         kz, ky, kx = 2 * np.pi / generator.uniform(shortest, longest) * _direction(generator)
         total += np.cos(z * kz + y * ky + x * kx + generator.uniform(0, 2 * np.pi))
-    return total * np.sqrt(2 / count)
+    waves: NDArray[Any] = total * np.sqrt(2 / count)
+    return waves
 
 
 PHANTOMS: dict[str, Callable[..., Array]] = {
