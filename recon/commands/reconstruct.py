@@ -206,7 +206,7 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        if slices_at_once is None and not fsc and not uncertainty:
+        if slices_at_once is None and not fsc:
             many = workers if scheduler is None else 2
             slices_at_once = slices_for(tilt_series, grid, method, chosen_device, many)
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
