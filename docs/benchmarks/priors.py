@@ -74,7 +74,10 @@ def page(cells: dict[str, Row]) -> str:
     """The page as Markdown."""
     runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
     lines = [_HEAD, "", "Computed " + ", ".join(f"{date} at commit {commit}" for date, commit in runs) + ".", ""]
-    for part, words in (("oracle", "True noise, best of four weights"), ("joint", "Noise and weight as the fit chooses them")):
+    for part, words in (
+        ("oracle", "True noise, best of four weights"),
+        ("joint", "Noise and weight as the fit chooses them"),
+    ):
         scenes: dict[str, dict[str, Row]] = {}
         for key, row in cells.items():
             kind, where, name = key.split("/", 2)
@@ -84,9 +87,14 @@ def page(cells: dict[str, Row]) -> str:
         if not names:
             continue
         lines += [f"## {words}", "", f"| scene | {' | '.join(names)} |", "|---" * (1 + len(names)) + "|"]
-        lines += [f"| {where} | {' | '.join(_text(found, name) for name in names)} |" for where, found in scenes.items()]
+        lines += [
+            f"| {where} | {' | '.join(_text(found, name) for name in names)} |" for where, found in scenes.items()
+        ]
         whole = [found for found in scenes.values() if all(name in found for name in names)]
-        means = [sum(found[name]["volume"] - found[names[0]]["volume"] for found in whole) / max(1, len(whole)) for name in names]
+        means = [
+            sum(found[name]["volume"] - found[names[0]]["volume"] for found in whole) / max(1, len(whole))
+            for name in names
+        ]
         lines += [f"| mean gain of {len(whole)} | {' | '.join(f'{mean:+.2f}' for mean in means)} |", ""]
         lines += _chosen(scenes) if part == "joint" else []
     return "\n".join(lines)
@@ -109,7 +117,9 @@ def _chosen(scenes: dict[str, dict[str, Row]]) -> list[str]:
     picked = [second if second["held-out"] < first["held-out"] - _TIED else first for first, second in pairs]
     gain = sum(row["volume"] - first["volume"] for row, (first, _) in zip(picked, pairs, strict=True)) / len(pairs)
     most = sum(max(0.0, second["volume"] - first["volume"]) for first, second in pairs) / len(pairs)
-    cost = sum(first["seconds"] + second["seconds"] for first, second in pairs) / sum(first["seconds"] for first, _ in pairs)
+    cost = sum(first["seconds"] + second["seconds"] for first, second in pairs) / sum(
+        first["seconds"] for first, _ in pairs
+    )
     return [
         f"Choosing total variation or second order per series by held-out likelihood gains {gain:+.2f} dB in the mean of "
         f"{len(pairs)} scenes at {cost:.1f} times the time; the best choice of the two would gain {most:+.2f} dB.",

@@ -55,7 +55,13 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         fit = reconstructor(settings, options)
         settled = fit.settle(tilt_series, grid, progress=settings.progress)
         solve = FittedBlock(
-            fit, settled.portable(), grid, settings.progress, settled.signal_model, settings.uncertainty, settings.run_stage
+            fit,
+            settled.portable(),
+            grid,
+            settings.progress,
+            settled.signal_model,
+            settings.uncertainty,
+            settings.run_stage,
         )
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:

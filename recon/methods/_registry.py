@@ -222,7 +222,9 @@ def reconstruct(
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found.blockwise, blocks)
     if chosen.noise_model is not None and needs_image(chosen.noise_model):
-        return _of_distinct_tilts(run, found, tilt_series, grid, chosen)  # maps of the detector's pixels stay where they are
+        return _of_distinct_tilts(
+            run, found, tilt_series, grid, chosen
+        )  # maps of the detector's pixels stay where they are
     orientation = Orientation.of(tilt_series)
     return _of_distinct_tilts(run, found, orientation.series(tilt_series), grid, chosen).turned(orientation)
 

@@ -186,7 +186,9 @@ def test_error_bars_of_blocks_share_what_is_settled_and_fade_like_the_volume(sce
         np.testing.assert_allclose(values[:, 10:18], mixed, atol=1e-6)
         assert below.any()
         assert above.any()
-    resumed = reconstruct(noisy, scratch=tmp_path / "w.mrc", keep=lambda prefix: kept, **options)  # finished blocks are taken
+    resumed = reconstruct(
+        noisy, scratch=tmp_path / "w.mrc", keep=lambda prefix: kept, **options
+    )  # finished blocks are taken
     np.testing.assert_array_equal(resumed.uncertainty.std.attenuation, found.uncertainty.std.attenuation)
 
 
@@ -194,7 +196,18 @@ def test_workers_make_the_error_bars_of_one_process(scene, tmp_path, run):
     pytest.importorskip("dask.distributed", reason="needs the extra [distributed]")
     _, noisy = scene
     write_tilt_series(tmp_path / "tilts.mrc", noisy)
-    command = ["reconstruct", tmp_path / "tilts.mrc", "--method", "l2", "--weight", 0.5, "--steps", 4, "--uncertainty", 2]
+    command = [
+        "reconstruct",
+        tmp_path / "tilts.mrc",
+        "--method",
+        "l2",
+        "--weight",
+        0.5,
+        "--steps",
+        4,
+        "--uncertainty",
+        2,
+    ]
     run(*command, "--slices-at-once", 14, "-o", tmp_path / "alone.mrc")
     run(*command, "--slices-at-once", 14, "--workers", 1, "-o", tmp_path / "dask.mrc")
     for name in ("", "_std", "_bias"):
