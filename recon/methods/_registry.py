@@ -226,7 +226,8 @@ def reconstruct(
             run, found, tilt_series, grid, chosen
         )  # maps of the detector's pixels stay where they are
     orientation = Orientation.of(tilt_series)
-    return _of_distinct_tilts(run, found, orientation.series(tilt_series), grid, chosen).turned(orientation)
+    rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
+    return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
 
 
 def _of_distinct_tilts(

@@ -45,17 +45,16 @@ class Orientation:
         return cls(*(bool(moment < 0) for moment in moments))
 
     def series(self, tilt_series: TiltSeries) -> TiltSeries:
-        """A series in this orientation; where angles are negated, its tilts stand in reverse: those that rose still do."""
+        """A series in this orientation, its tilts in their order."""
         if self == Orientation():
             return tilt_series
-        turned = tilt_series.select(slice(None, None, -1)) if self.negated else tilt_series
-        images, mask = turned.images, turned.mask
+        images, mask = tilt_series.images, tilt_series.mask
         if is_mapped(images):
             images = mapped.mapped_copy((self.images(image) for image in images), images.shape, images.dtype)
         else:
             images = self.images(images)
-        angles = -turned.tilt_angles if self.negated else turned.tilt_angles
-        flipped = turned.with_images(images, None if mask is None else self.images(mask))
+        angles = -tilt_series.tilt_angles if self.negated else tilt_series.tilt_angles
+        flipped = tilt_series.with_images(images, None if mask is None else self.images(mask))
         return replace(flipped, tilt_angles=angles)
 
     def images(self, images: NDArray[Any]) -> NDArray[Any]:
