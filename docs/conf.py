@@ -9,6 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 project = "noiseflow"
 author = "The noiseflow developers"
+copyright = f"2026, {author}"
 version = release = installed_version("noiseflow")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]

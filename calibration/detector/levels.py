@@ -195,14 +195,14 @@ class Levels:
 
 
 def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS) -> Levels:
-    """Sort readings into levels of like signal and count their residuals.
+    """Sort pixel values into levels of like signal and count their residuals.
 
-    The neighbours sort the pixels, so that no pixel's own noise does. Rounded readings are dithered by one step, so that their
-    lattice does not beat with the bins; the likelihood knows.
+    The neighbours sort the pixels, so that no pixel's own noise does. Rounded values are dithered by one step, so that their
+    steps do not beat with the bins; the likelihood knows.
 
     Args:
         readings: of one detector setting; each is sorted into levels of its own.
-        num_levels: at most, per exposure; fewer where a level would hold under 200 readings.
+        num_levels: at most, per exposure; fewer where a level would hold under 200 pixel values.
     """
     rows = []
     generator = np.random.default_rng(0)

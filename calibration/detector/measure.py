@@ -92,7 +92,7 @@ def measure_detector(
         progress: called with the sampler's steps.
 
     Raises:
-        NotMeasurable: the noise does not grow with the signal, or nearly all readings are clipped.
+        NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.
         ValueError: the posterior does not converge.
     """
     plain, cells = [], []
@@ -111,7 +111,7 @@ def measure_detector(
     noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))
     if posterior.gain.median < LEAST_GAIN * noise:
         raise NotMeasurable(
-            "the noise grows so little with the signal that the gain cannot be told from none; give the exposure ratio, "
+            "the noise grows so little with the signal that no gain can be measured; give the exposure ratio, "
             "dark frames, or exposures of more electrons"
         )
     line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
@@ -183,7 +183,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
     if not found[0] and not found[1]:
         raise NotMeasurable(
-            f"of {int(pair.mask.sum())} pixels none lie clear of the converter's rails, so that their noise is cut off; raise "
+            f"of {int(pair.mask.sum())} pixels none lie clear of the converter's limits, so that their noise is cut off; raise "
             "the detector's offset, or expose for longer"
         )
     return found

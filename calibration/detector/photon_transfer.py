@@ -38,7 +38,7 @@ class PhotonTransfer:
         signal: (L,) counts.
         variance: (L,) of the exposure alone, counts².
         variance_error: (L,) standard error.
-        clipped: (L,) share of the readings at a rail; levels with any are left out of the line where others suffice.
+        clipped: (L,) share of the values at a clipping limit; levels with any are left out of the line where others suffice.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.

@@ -167,6 +167,13 @@ def read_pairs(
     Raises:
         FileNotFoundError: a file does not exist.
         ValueError: the lists do not match, a file cannot be read, or `ExposurePair` refuses a pair.
+
+    Example:
+        >>> import calibration, noiseflow, pathlib
+        >>> folder = pathlib.Path(noiseflow.__file__).parent / "data" / "exposures_miro"
+        >>> pairs = calibration.read_pairs([folder / "channel1_050ms.tif"], [folder / "channel1_long.tif"])
+        >>> pairs[0].short.shape
+        (400, 400)
     """
     if len(long) not in (1, len(short)) or not short:
         raise ValueError(

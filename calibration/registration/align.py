@@ -141,6 +141,14 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
 
     Raises:
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from scipy.ndimage import gaussian_filter
+        >>> scene = gaussian_filter(np.random.default_rng(0).random((128, 128)), 2) * 1000
+        >>> found = calibration.register(scene, np.roll(scene, (3, 5), axis=(0, 1)))
+        >>> found.matrix[:, 2].round().tolist()  # (x, y), pixels
+        [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
     tried = _Tried()

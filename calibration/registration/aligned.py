@@ -84,6 +84,14 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
     Raises:
         ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier
             one, or it is a copy of the short one.
+
+    Example:
+        >>> import calibration, noiseflow, pathlib
+        >>> folder = pathlib.Path(noiseflow.__file__).parent / "data" / "exposures_miro"
+        >>> pairs = calibration.read_pairs([folder / "channel1_050ms.tif"], [folder / "channel1_long.tif"])
+        >>> aligned = calibration.align_pair(pairs[0])
+        >>> aligned.registration.motion, bool(aligned.mask.mean() > 0.9)
+        ('translation', True)
     """
     return align_with(pair, register(pair.short, pair.long, names=(pair.short_name, pair.long_name)))
 

@@ -67,8 +67,8 @@ def fit(
             beyond single pixels, images (..., y, x).
         mask: pixels to use, shaped like `observation`; all by default. What a masked array masks is left out besides.
         skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
-        digitise: look for rounding and rails (`detect_digitisation`), and where there are any put a `Digitised` around a
-            model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
+        digitise: look for rounding and clipping limits (`detect_digitisation`), and where there are any put a `Digitised` around
+            a model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
         held_out: fraction of the pixels, or those, boolean, that judge the fit and never train it.
         num_steps: optimisation steps; by default as many as the noise model asks for (its ``num_steps``, 500 by default).
         batch_size: pixels per noise-model step.
@@ -94,6 +94,14 @@ def fit(
     Raises:
         ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, a signal model that gives other
             shapes than `SignalModel` says, or no finite step could be made.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> signal = torch.linspace(10.0, 100.0, 10_000)
+        >>> observation = signal + 3 * torch.randn(10_000, generator=torch.Generator().manual_seed(0))
+        >>> result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, generator=torch.Generator().manual_seed(1))
+        >>> round(result.noise_model.log_scale.exp().item(), 1)
+        3.0
     """
     if not 0 <= warm_up < 1:
         raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")

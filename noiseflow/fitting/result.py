@@ -17,8 +17,8 @@ class FitResult:
     """What a fit reached.
 
     Attributes:
-        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or rails were found.
-        digitisation: the rounding and rails it was put behind; none where it was left as it is.
+        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or clipping limits were found.
+        digitisation: the rounding and clipping limits it was put behind; none where it was left as it is.
         held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
         num_steps: steps taken.
         seconds: wall time.

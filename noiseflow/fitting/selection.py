@@ -160,6 +160,14 @@ def select(
 
     Raises:
         ValueError: as `fit`; no candidates; or all of them call some pixel impossible.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> signal = torch.linspace(10.0, 100.0, 5000)
+        >>> observation = signal + 3 * torch.randn(5000, generator=torch.Generator().manual_seed(0))
+        >>> candidates = {"Gaussian": noiseflow.Gaussian(), "SignalDependentGaussian": noiseflow.SignalDependentGaussian()}
+        >>> noiseflow.select(signal, observation, candidates=candidates, num_steps=60).chosen.name
+        'Gaussian'
     """
     models = dict(default_candidates() if candidates is None else candidates)
     if not models:

@@ -19,6 +19,11 @@ class KnownSignal(Described):
 
     Args:
         signal: clean image, any shape, detector units.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noiseflow.KnownSignal(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))(torch.tensor([2]))
+        tensor([3.])
     """
 
     flat: Tensor
@@ -57,6 +62,12 @@ class StaticScene(Described):
 
     Raises:
         ValueError: fewer than two exposures.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> exposures = 5 + torch.randn(8, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> noiseflow.StaticScene(exposures).image().shape
+        torch.Size([32, 32])
     """
 
     exposures: Tensor

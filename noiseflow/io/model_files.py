@@ -77,6 +77,13 @@ def save(
 
     Raises:
         ValueError: unknown kind of model, or a path that cannot be written.
+
+    Example:
+        >>> import noiseflow, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors"
+        >>> _ = noiseflow.save(noiseflow.PoissonGaussian(gain=2.0), path, units="counts")
+        >>> type(noiseflow.load(path)).__name__
+        'PoissonGaussian'
     """
     path = check_output(path, suffixes=MODEL_SUFFIXES)
     metadata = {
@@ -98,6 +105,13 @@ def load(path: str | Path) -> nn.Module:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: not a noise-model file, damaged, of an unknown kind or from a newer version of the library.
+
+    Example:
+        >>> import noiseflow, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors"
+        >>> _ = noiseflow.save(noiseflow.Gaussian(3.0), path, units="counts")
+        >>> type(noiseflow.load(path)).__name__
+        'Gaussian'
     """
     metadata, tensors = _open(Path(path))
     try:

@@ -23,6 +23,12 @@ class AtLevel(ModelAround):
 
     Raises:
         ValueError: a model that needs images, or that rounds or clips.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.AtLevel(noiseflow.Gaussian(2.0), level=1000.0)
+        >>> noise(torch.tensor(1005.0)).mean.item()
+        1005.0
     """
 
     level: float = 0.0

@@ -17,6 +17,12 @@ class Gaussian(NoiseModelBase):
 
     Args:
         scale: standard deviation, detector units.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.Gaussian(0.1)
+        >>> noise(torch.tensor([0.5, 0.7])).mean
+        tensor([0.5000, 0.7000])
     """
 
     def __init__(self, scale: float = 0.1) -> None:
@@ -44,6 +50,12 @@ class Poisson(NoiseModelBase):
     Args:
         gain: counts per electron.
         offset: counts at zero dose.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.Poisson(gain=2.0)
+        >>> noise(torch.tensor(100.0)).variance.item()
+        200.0
     """
 
     describes_single_readings = True

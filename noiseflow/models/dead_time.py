@@ -20,6 +20,12 @@ class DeadTimeCounter(NoiseModelBase):
 
     Raises:
         ValueError: `dead_time` outside this range.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> counter = noiseflow.DeadTimeCounter(dead_time=0.01)
+        >>> bool(counter(torch.tensor(20.0)).variance < 20)  # scatters less than Poisson counts
+        True
     """
 
     describes_single_readings = True

@@ -18,8 +18,8 @@ class Digitisation(NamedTuple):
     """Rounding and clipping of a detector.
 
     Attributes:
-        step: rounding step, detector units; 0 where readings are not rounded.
-        low, high: rails, detector units; infinite where there is none.
+        step: rounding step, detector units; 0 where pixel values are not rounded.
+        low, high: clipping limits, detector units; infinite where there is none.
     """
 
     step: float = 0.0
@@ -39,17 +39,23 @@ class Digitisation(NamedTuple):
 
 
 def detect_digitisation(readings: ArrayLike) -> Digitisation:
-    """The rounding and the rails that readings show.
+    """The rounding and the clipping limits that pixel values show.
 
-    Readings are rounded where all of them are whole multiples of a step, counted from the least one: integers always are, and
+    Pixel values are rounded where all of them are whole multiples of a step, counted from the least one: integers always are, and
     other numbers where they repeat. What the number format itself rounds does not count.
 
-    A rail is an extreme reading that piles up: at least ten readings share it, and more than the two levels beside it foretell
-    if the histogram is log-concave there, as the tails of noise and the counts of electrons are. The largest value of an integer
-    type is one wherever it is reached. That readings end at 0 makes no rail: counts do so too.
+    A clipping limit is an extreme pixel value that piles up: at least ten pixels share it, and more than the two levels beside it
+    foretell if the histogram is log-concave there, as the tails of noise and the counts of electrons are. The largest value of
+    an integer type is one wherever it is reached. That values end at 0 makes no clipping limit: counts do so too.
 
     Args:
         readings: any shape and real type, detector units; NaN and infinite ones are left out.
+
+    Example:
+        >>> import noiseflow, numpy as np
+        >>> values = np.random.default_rng(0).normal(200, 40, 10_000).round().clip(0, 255)
+        >>> noiseflow.detect_digitisation(values).high
+        255.0
     """
     values = np.asarray(readings.detach().cpu() if hasattr(readings, "detach") else readings)
     if isinstance(readings, np.ma.MaskedArray):

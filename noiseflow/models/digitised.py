@@ -17,17 +17,24 @@ _LEAST_KEPT, _RAILED = 256, 0.02
 
 
 class Digitised(ModelAround):
-    """A detector that rounds to steps and clips at rails, in front of any noise model.
+    """A detector that rounds to steps and clips at limits, in front of any noise model.
 
-    An observation k stands for every reading in (k − step/2, k + step/2]; the rails stand for everything beyond them too.
+    An observation k stands for every pixel value in (k − step/2, k + step/2]; the limits stand for everything beyond.
 
     Args:
         model: the noise model before digitisation.
-        step: rounding step, detector units; 0 for readings that are clipped but not rounded.
-        low, high: rails, detector units; infinite where there is none.
+        step: rounding step, detector units; 0 for pixel values that are clipped but not rounded.
+        low, high: clipping limits, detector units; infinite where there is none.
 
     Raises:
-        ValueError: negative step, or rails in the wrong order, or a model with offsets of rows or columns.
+        ValueError: negative step, or clipping limits in the wrong order, or a model with offsets of rows or columns.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> camera = noiseflow.Digitised(noiseflow.Gaussian(3.0), step=1.0, low=0.0, high=255.0)
+        >>> frame = camera(torch.full((4, 4), 254.0)).sample(generator=torch.Generator().manual_seed(0))
+        >>> frame.max().item(), bool((frame == frame.round()).all())
+        (255.0, True)
     """
 
     describes_single_readings = True
@@ -40,7 +47,7 @@ class Digitised(ModelAround):
         if step < 0:
             raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
         if not low < high:
-            raise ValueError(f"low is {low} and high is {high}; the low rail must lie below the high one")
+            raise ValueError(f"low is {low} and high is {high}; the low clipping limit must lie below the high one")
         if self.model.shared_axis is not None:
             raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
         self.step, self.low, self.high = float(step), float(low), float(high)

@@ -41,6 +41,13 @@ class ExcessNoise(ElectronCounter):
 
     Raises:
         ValueError: gain or read noise not positive, or F² not above 1.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> emccd = noiseflow.ExcessNoise(gain=10.0, offset=100.0, read_noise=0.1, excess_factor=2.0)
+        >>> sample = emccd(torch.full((1000,), 600.0)).sample(generator=torch.Generator().manual_seed(0))
+        >>> bool(80 < sample.std() < 120)  # √2 times the shot noise of 50 electrons
+        True
     """
 
     origin: Tensor

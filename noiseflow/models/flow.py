@@ -233,6 +233,12 @@ class RadialFlow(ConditionalFlow):
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.RadialFlow()
+        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
+        torch.Size([2])
     """
 
     def __init__(
@@ -263,6 +269,12 @@ class SplineFlow(ConditionalFlow):
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.SplineFlow(mean_preserving=True)
+        >>> torch.allclose(noise(torch.tensor([0.2, 0.8])).mean, torch.tensor([0.2, 0.8]), atol=1e-3)
+        True
     """
 
     joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
@@ -284,6 +296,16 @@ class SignalDependentGaussian(ConditionalFlow):
     Args:
         width: hidden units of the network that gives the standard deviation.
         neighbourhood: see `ConditionalFlow`.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> signal = torch.linspace(0.2, 1.0, 5000)
+        >>> observation = signal + 0.1 * signal * torch.randn(5000, generator=torch.Generator().manual_seed(0))
+        >>> noise = noiseflow.SignalDependentGaussian()
+        >>> _ = noiseflow.fit(noise, signal, observation, num_steps=100, generator=torch.Generator().manual_seed(1))
+        >>> narrow, wide = noise(torch.tensor([0.3, 0.9])).variance.sqrt()
+        >>> bool(2 < wide / narrow < 4)
+        True
     """
 
     starts_anew = (

@@ -42,7 +42,7 @@ class PoissonGaussian(ElectronCounter):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
     The rate of k is (signal − offset)/gain. Below the offset it is 0, and read noise is spread about the signal: no clean image
-    lies there, but an estimate may, and the readings pull it back. The likelihood is exact at any dose, single electrons
+    lies there, but an estimate may, and the pixel values pull it back. The likelihood is exact at any dose, single electrons
     included. The second moments, variance = gain·(signal − offset) + (gain·read_noise)², identify only the gain and
     gain²·read_noise² − gain·offset; the offset itself is known only as far as the shape of the noise tells it: well where
     single electrons are resolved or the dose is low, hardly where noise is Gaussian. It is a parameter all the same.
@@ -54,6 +54,12 @@ class PoissonGaussian(ElectronCounter):
 
     Raises:
         ValueError: gain or read noise not positive.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.5)
+        >>> round(camera(torch.tensor(150.0)).variance.item(), 3)  # 2² · (25 electrons + 1.5²)
+        109.0
     """
 
     starts_most_likely = True  # `standardise` leaves little to climb

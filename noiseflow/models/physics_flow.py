@@ -33,6 +33,12 @@ class PhysicsFlow(NoiseModelBase):
             correction leaves up to 1e-2, and 1e-1 near the offset.
         width: hidden units of the conditioning network.
         detector: the physical part; a default `PoissonGaussian` where none is given.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.PhysicsFlow()
+        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
+        torch.Size([2])
     """
 
     most_joint_steps = PoissonGaussian.most_joint_steps

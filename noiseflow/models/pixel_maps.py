@@ -30,6 +30,13 @@ class WithMaps(ModelAround):
 
     Raises:
         ValueError: no map, maps of different sizes, not finite, or gains that are not positive.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> gain = torch.tensor([[1.0, 2.0]])
+        >>> camera = noiseflow.WithMaps(noiseflow.Gaussian(0.1), gain=gain)
+        >>> camera(torch.full((1, 2), 3.0)).mean
+        tensor([[3., 6.]])
     """
 
     needs_image = True

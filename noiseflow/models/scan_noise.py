@@ -21,11 +21,11 @@ _FINE, _COARSE = 0.1, 0.25
 class ScanNoise(ModelAround):
     """A noise model plus one Gaussian offset for every row (or column) of an image, as scanning adds it.
 
-    The readings of a row are no longer independent: given the offset b they are, so the likelihood of a row is
+    The pixel values of a row are no longer independent: given the offset b they are, so the likelihood of a row is
     ∫ N(b; 0, scale²) ∏ p(oᵢ − b | sᵢ) db, one integral along each row, done by quadrature (to 1e-6 nats per row for smooth
     noise, to 1e-3 nats per pixel for densities with kinks). ``log_prob`` of a pixel
     is that of its reading given those before it in its row, so that the sum over a row is the row's log-likelihood; ``cdf``,
-    ``icdf``, ``mean`` and ``variance`` are of single readings.
+    ``icdf``, ``mean`` and ``variance`` are of single pixel values.
 
     Args:
         model: the noise model of each pixel; a `Digitised` one rounds and clips after the offset is added.
@@ -34,6 +34,13 @@ class ScanNoise(ModelAround):
 
     Raises:
         ValueError: scale not positive, or a model inside that holds offsets already.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> scanned = noiseflow.ScanNoise(noiseflow.Gaussian(0.01), scale=0.1)
+        >>> image = scanned(torch.zeros(64, 64)).sample(generator=torch.Generator().manual_seed(0))
+        >>> bool(image.mean(dim=1).std() > 5 * image.mean(dim=0).std())  # rows differ, columns do not
+        True
     """
 
     needs_image = True

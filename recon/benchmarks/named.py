@@ -134,7 +134,7 @@ def even_odd(options: Options) -> dict[str, Any]:
 def paper_table(options: Options) -> dict[str, Any]:
     """The main table of Kniesel et al. (CVPR 2022) beside the published figures."""
     scene, results = make_scene(options.size, **options.scene), options.results("paper-table")
-    options.output.line(f"{scene.name}: rivals' settings are searched by looking at the truth")
+    options.output.line(f"{scene.name}: settings of the other methods are tuned against the ground truth")
     benchmark_paper.run(scene, results, options.output.line)
     return _told(options, results, benchmark_paper.table(results.cells))
 

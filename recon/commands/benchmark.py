@@ -23,17 +23,17 @@ def benchmark(
     quick: Annotated[
         bool, typer.Option("--quick", help="A small scene and few settings: under three minutes.")
     ] = False,
-    repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are told.")] = 3,
-    budget: Annotated[float, typer.Option(help="Seconds for each of the slow rivals.")] = 600.0,
+    repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are reported.")] = 3,
+    budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
     again: Annotated[str, typer.Option(help="Compute anew the kept results whose name contains this.")] = "",
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for results and figures; a stopped run goes on there.")
+        Path, typer.Option("--out", help="Folder for results and figures; an interrupted run resumes there.")
     ] = Path("noiseflow-benchmark"),
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Measure run time against error of every method, on this machine. Stopped, it goes on where it was."""
+    """Measure run time against error of every method, on this machine. Interrupted runs resume."""
     from dataclasses import replace
 
     from recon.benchmarks.named import BENCHMARKS, Options, check_figures

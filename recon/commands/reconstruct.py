@@ -123,7 +123,7 @@ def reconstruct(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the blocks.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted run.")] = False,
     checkpoint_interval: Annotated[float, typer.Option(min=0, help="Seconds between checkpoints.")] = 60.0,
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
     fsc: Annotated[

@@ -34,7 +34,8 @@ def simulate(
         ),
     ] = "clipped",
     clip: Annotated[
-        bool, typer.Option("--clip", help="Clip readings to the range from zero to the brightest signal there can be.")
+        bool,
+        typer.Option("--clip", help="Clip pixel values to the range from zero to the brightest signal there can be."),
     ] = False,
     defocus: Annotated[
         float,
@@ -115,7 +116,7 @@ def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:
     from noiseflow import Digitised
 
     if noise_model is None:
-        raise ValueError("--clip clips noisy readings; choose a --noise, too")
+        raise ValueError("--clip clips noisy pixel values; choose a --noise, too")
     if isinstance(noise_model, Digitised):
-        raise ValueError("--clip: this noise model has rails of its own; leave --clip out")
+        raise ValueError("--clip: this noise model has clipping limits of its own; leave --clip out")
     return Digitised(noise_model, step=0.0, low=0.0, high=high)

@@ -21,7 +21,7 @@ class CoordinateNetwork(Field):
     Gradients are computed anew block by block of points, so that memory holds the activations of one block only.
 
     Args:
-        shape: (depth, height, width) of the lattice, voxels along (z, y, x).
+        shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
         scale: see `Field`.
         width: of the hidden layers.
         layers: hidden layers.

@@ -24,7 +24,7 @@ class Field(Described, ABC):
     """A trainable volume of non-negative attenuation.
 
     Args:
-        shape: (depth, height, width) of the lattice, voxels along (z, y, x).
+        shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
         scale: attenuation per voxel that counts as one unit; a guess within a factor of ten serves.
     """
 

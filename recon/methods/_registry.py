@@ -195,6 +195,15 @@ def reconstruct(
 
     Raises:
         ValueError: an unknown method, settings that make no sense, or a grid that does not match the images.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> result = recon.reconstruct(series, recon.VolumeGrid.of(series, 16), method="sirt", num_steps=30)
+        >>> bool(recon.compare(result.volume.attenuation, density * unit).psnr > 25)
+        True
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
     order = np.argsort(tilt_series.tilt_angles, kind="stable")

@@ -116,7 +116,7 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
     if first.shape != second.shape:
         sizes = [" x ".join(map(str, array.shape)) for array in (first, second)]
         raise ValueError(
-            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one of them to the other's lattice"
+            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one of them to the other's grid"
         )
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(

@@ -37,6 +37,14 @@ class SliceProjector(Projector):
 
     Raises:
         ValueError: no angles, angles that are not finite, sizes below one, or offsets that match no tilt.
+
+    Example:
+        >>> import recon, torch
+        >>> A = recon.SliceProjector(tilt_angles=[-45.0, 0.0, 45.0], depth=8, width=8)
+        >>> A(torch.ones(8, 4, 8)).shape  # (tilt, y, u)
+        torch.Size([3, 4, 8])
+        >>> A.T(torch.ones(3, 4, 8)).shape  # (z, y, x)
+        torch.Size([8, 4, 8])
     """
 
     def __init__(

@@ -28,6 +28,15 @@ def sirt(
 
     Returns:
         (z, y, x) attenuation per voxel, of the kind given.
+
+    Example:
+        >>> import recon, torch
+        >>> A = recon.SliceProjector(tilt_angles=range(-90, 90, 10), depth=8, width=8)
+        >>> volume = torch.zeros(8, 2, 8)
+        >>> volume[3:5, :, 3:5] = 1.0
+        >>> found = recon.sirt(A(volume), A, num_iterations=30)
+        >>> bool((found - volume).abs().mean() < 0.1)
+        True
     """
     A = projector
     y = as_tensor(line_integrals, like=A)

@@ -39,6 +39,12 @@ def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp
 
     Raises:
         ValueError: an unknown window, or a cutoff outside (0, 1].
+
+    Example:
+        >>> import recon, torch
+        >>> A = recon.SliceProjector(tilt_angles=range(-90, 90, 10), depth=8, width=8)
+        >>> recon.wbp(A(torch.ones(8, 2, 8)), A).shape
+        torch.Size([8, 2, 8])
     """
     if window not in WINDOWS:
         raise ValueError(f"window '{window}': choose one of {', '.join(WINDOWS)}")

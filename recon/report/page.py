@@ -130,9 +130,7 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
     if name == "weight" and tried:
         return f"highest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
     if name == "noise model" and outcome.method == "joint":
-        return (
-            "rails and rounding as the readings show them; of the candidates the one that predicts held-out pixels best"
-        )
+        return "clipping and rounding as the pixel values show them; of the candidates the one that predicts held-out pixels best"
     if name in ("intensity", "offset"):
         return "estimated from the images, then learnt in the fit"
     if name in ("tilts left out", "beam drift"):

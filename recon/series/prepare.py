@@ -78,6 +78,14 @@ def prepare(
     Raises:
         ValueError: a tilt axis that is no number, too few tilts to align, or images moved out of view entirely; or the images
             contradict each other about y, and their file states another tilt axis.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, _ = recon.clean_tilt_series(density, np.arange(60, -61, -5.0))
+        >>> recon.prepare(series).tilt_series.tilt_angles[0].item()  # by rising angle
+        -60.0
     """
     if tilt_axis is not None and not np.isfinite(tilt_axis):
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")

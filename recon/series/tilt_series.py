@@ -37,6 +37,12 @@ class TiltSeries:
 
     Raises:
         ValueError: not a stack, angles, mask or beam that do not match it, pixels or angles that are not finite, a flat stack.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> series = recon.TiltSeries(np.random.default_rng(0).random((3, 8, 8)), [-30.0, 0.0, 30.0], mode="linear")
+        >>> series.images.shape
+        (3, 8, 8)
     """
 
     images: NDArray[Any]
@@ -122,11 +128,16 @@ class TiltSeries:
 @described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")
 @dataclass(frozen=True)
 class VolumeGrid:
-    """The lattice to reconstruct on, centred on the tilt axis.
+    """The voxel grid to reconstruct on, centred on the tilt axis.
 
     Attributes:
         depth, height, width: voxels along z (the beam at zero tilt), y (the tilt axis) and x.
         voxel_size: Å, or None where unknown.
+
+    Example:
+        >>> import recon
+        >>> recon.VolumeGrid(depth=32, height=64, width=64, voxel_size=2.5).depth
+        32
     """
 
     depth: int
@@ -205,6 +216,12 @@ def read_tilt_series(
     Raises:
         FileNotFoundError: no such file, or no angles beside or inside the stack.
         ValueError: a file cannot be read, the mask does not match, or `TiltSeries` refuses what the stack holds.
+
+    Example:
+        >>> import noiseflow, pathlib, recon
+        >>> needle = pathlib.Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
+        >>> recon.read_tilt_series(needle, mode="linear").images.shape
+        (91, 64, 64)
     """
     image_file = io.read(path, mapped=mapped)
     if image_file.data.ndim != 3:

@@ -82,6 +82,14 @@ def clean_tilt_series(
 
     Raises:
         ValueError: an empty volume.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, [-60.0, 0.0, 60.0])
+        >>> series.images.shape, bool(series.images.max() <= 1)  # transmission of an incident intensity of 1
+        ((3, 16, 16), True)
     """
     projector = SliceProjector(tilt_angles=tilt_angles, depth=volume.shape[0], width=volume.shape[2])
     line_integrals = projector(torch.from_numpy(np.asarray(io.as_array(volume), dtype=np.float32)))
@@ -95,7 +103,16 @@ def clean_tilt_series(
 
 
 def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
-    """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers."""
+    """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers.
+
+    Example:
+        >>> import noiseflow, numpy as np, recon
+        >>> density = np.random.default_rng(0).random((8, 8, 8))
+        >>> clean, _ = recon.clean_tilt_series(density, [0.0, 30.0])
+        >>> noisy = recon.add_noise(clean, noiseflow.Gaussian(0.1), seed=1)
+        >>> noisy.images.shape
+        (2, 8, 8)
+    """
     noisy = np.stack(list(draw_noise(tilt_series.images, noise_model, seed=seed))).astype(stored_type(noise_model))
     return TiltSeries(noisy, tilt_series.tilt_angles, tilt_series.pixel_size, tilt_series.mode)
 

@@ -126,5 +126,5 @@ def _good(gap: Unexplained, residuals: Residuals) -> str:
     white = max(abs(value) for value in residuals.whiteness().values())
     return (
         f"tilts left out in gaps are explained to {min(1.0, 1 - gap.share):.1%} of their structure, and neighbouring residuals "
-        f"correlate by {white:.2f} at most; the sign of the tilt angles and their zero cannot be told from images"
+        f"correlate by {white:.2f} at most; the sign of the tilt angles and their zero cannot be seen in images"
     )

@@ -1,8 +1,11 @@
-"""The words of the pages are the field's own, not an idiom of ours."""
+"""The words of the pages, the help texts and the messages are the field's own, not an idiom of ours."""
 
 from __future__ import annotations
 
+import ast
 import re
+import runpy
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,7 @@ PAGES = sorted(
         *(page for page in (ROOT / "docs").rglob("*.md") if not {"benchmarks", "generated"} & set(page.parts)),
     ]
 )
+SOURCES = sorted(path for package in ("noiseflow", "calibration", "recon") for path in (ROOT / package).rglob("*.py"))
 
 # A pattern of what not to write, and what to write in its place.
 WORDS = {
@@ -31,7 +35,7 @@ WORDS = {
     r"asks nothing of a network": "works offline",
 }
 # What the patterns find and the field says itself.
-ALLOWED = re.compile(r"(?:crystal|atomic|Bravais|reciprocal) lattices?|on a lattice of spacing", re.IGNORECASE)
+ALLOWED = re.compile(r"(?:crystal|atomic|Bravais|reciprocal) lattices?|rivals, slow-rivals", re.IGNORECASE)
 
 
 def without_code(text: str) -> str:
@@ -50,9 +54,34 @@ def misused(text: str) -> list[str]:
     ]
 
 
+def messages(source: str) -> Iterator[tuple[int, str]]:
+    """(line, text) of the sentences in a program that are not docstrings: errors, help texts, labels."""
+    tree = ast.parse(source)
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        sentence = isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value.strip()
+        if sentence and id(node) not in docstrings:
+            yield node.lineno, node.value
+
+
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 def test_pages_use_the_words_of_the_field(page: Path) -> None:
     assert misused(without_code(page.read_text(encoding="utf-8"))) == []
+
+
+def test_help_texts_use_the_words_of_the_field() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "command_reference.py"))["page"]()
+    assert misused(without_code(page)) == []
+
+
+def test_messages_use_the_words_of_the_field() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {word}"
+        for path in SOURCES
+        for line, text in messages(path.read_text(encoding="utf-8"))
+        for word in misused(text)
+    ]
+    assert not found, "\n".join(found)
 
 
 def test_the_check_finds_and_forgives() -> None:
@@ -62,3 +91,4 @@ def test_the_check_finds_and_forgives() -> None:
     assert not misused(
         without_code("run `rivals` and see [the page](rivals.md)\n```sh\nnoiseflow benchmark rivals\n```\n")
     )
+    assert [text for _, text in messages('"""told"""\nraise ValueError(f"{a} was told")')] == [" was told"]

@@ -48,6 +48,13 @@ def total_variation(volume: Given, *, smoothing: float) -> Given:
 
     Raises:
         ValueError: `smoothing` is not positive.
+
+    Example:
+        >>> import recon, torch
+        >>> step = torch.zeros(4, 4, 4)
+        >>> step[2:] = 1.0  # one face of 16 voxels
+        >>> bool(abs(recon.total_variation(step, smoothing=1e-3) - 16) < 0.5)
+        True
     """
     if not smoothing > 0:
         raise ValueError(f"smoothing {smoothing} must be positive, in the units of the volume")
