@@ -60,6 +60,8 @@ class Posterior:
             raise ValueError(f"--uncertainty {num_samples}: a spread needs at least 2 samples; 16 are usual")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
+        self.orientation = outcome.orientation  # the fit saw the series so
+        tilt_series = self.orientation.series(tilt_series)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
         generator = torch.Generator().manual_seed(seed)
         rows, height = (None, observation.shape[2]) if place is None else place
@@ -87,13 +89,16 @@ class Posterior:
             raise ValueError("the error bars diverged: a voxel is no longer finite; check the data's scale")
         self.done += 1
         if self.visit is not None:
-            self.visit(self.energy.volume(self.units))
+            self.visit(torch.from_numpy(self._volume(self.units)))
         return f"sample {self.done}"
 
     def _move(self) -> None:
         noise = torch.randn(self.units.shape, generator=self.generator, device=self.units.device)
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
         self.units.add_(noise, alpha=(2 * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
+
+    def _volume(self, units: Tensor) -> np.ndarray:
+        return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
         """The chain where it is, and its moments so far."""
@@ -109,7 +114,7 @@ class Posterior:
     def result(self) -> Uncertainty:
         """Standard deviation and bias from the samples so far."""
         parts = self.moments.std, self.moments.mean - self.energy.start
-        std, bias = (Volume(self.energy.volume(part).cpu().numpy(), self.voxel_size) for part in parts)
+        std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
         return Uncertainty(std, bias, self.done)
 
 

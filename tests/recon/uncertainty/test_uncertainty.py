@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,15 @@ def test_samples_repeat_themselves_and_go_on_where_they_were(scene):
     bars = error_bars(outcome, scene, 2)
     np.testing.assert_array_equal(bars.std.attenuation, whole.result().std.attenuation)
     assert (bars.std.attenuation >= 0).all()
+
+
+@pytest.mark.parametrize("flip", [(), (1,), (2,), (1, 2)])
+def test_error_bars_of_a_flipped_series_are_those_of_its_reconstruction(scene, flip):
+    flipped = scene.with_images(np.ascontiguousarray(np.flip(scene.images, flip)), None)
+    outcome = reconstruct(flipped, weight=0.4, num_steps=5, uncertainty=2)
+    bars = error_bars(replace(outcome, uncertainty=None), flipped, 2)
+    np.testing.assert_array_equal(bars.std.attenuation, outcome.uncertainty.std.attenuation)
+    assert not bars.std.attenuation[outcome.volume.attenuation > 0].min() == 0
 
 
 def test_error_bars_that_cannot_be_made_are_refused(scene):
