@@ -15,6 +15,7 @@ _JUMP = 0.1  # nats per pixel that a fit ends above its best: later steps change
 def fit_findings(result: Any, alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings about the held-out likelihood and the axis."""
     evidence, findings = _history(getattr(result, "fit_result", None))
+    findings += _weight(getattr(result, "weights_tried", None) or {})
     if alignment is None or alignment.margin is None:
         return evidence, findings
     evidence["axis margin"] = alignment.margin
@@ -38,3 +39,11 @@ def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
         return evidence, []
     words = f"the held-out likelihood ended {jump:.2g} nats per pixel worse than it had been"
     return evidence, [Finding("fit", min(3.5, 1 + jump / (5 * _JUMP)), words, "compare with --method l2 or sirt")]
+
+
+def _weight(tried: dict[float, float]) -> list[Finding]:
+    """Weights, and their held-out likelihoods, of which the lowest is the best: the fit follows something that is no noise."""
+    if len(tried) < 2 or min(tried, key=lambda weight: tried[weight]) > min(tried):
+        return []
+    words = f"held-out pixels want less of the regulariser than the lowest weight tried, {min(tried):.2g}"
+    return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]

@@ -32,6 +32,7 @@ class Told:
     projections: np.ndarray[Any, Any]
     fit_result: Any = None
     noise_model: Any = None
+    weights_tried: Any = None
 
 
 @dataclass(frozen=True)
@@ -203,6 +204,18 @@ def test_a_fit_that_got_worse_is_doubtful() -> None:
     verdict = judge(series, replace(told, fit_result=History({0: 6.0, 10: 5.5, 20: 8.7})))
     assert "fit" in verdict.subjects
     assert judge(series, replace(told, fit_result=History({0: 6.0, 10: 5.6, 20: 5.5}))).grade == "good"
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(
+    ("tried", "grade"),
+    [({0.4: 1.0, 0.2: 0.9, 0.1: 0.8}, "doubtful"), ({0.4: 1.0, 0.2: 0.9, 0.1: 1.1}, "good"), ({}, "good")],
+)
+def test_a_weight_that_is_the_lowest_of_those_tried_is_doubtful(tried: dict[float, float], grade: str) -> None:
+    series, told = oracle()
+    verdict = judge(series, replace(told, weights_tried=tried))
+    assert verdict.grade == grade
+    assert ("regulariser" in verdict.reasons[0]) == (grade == "doubtful")
 
 
 @pytest.mark.usefixtures("one_thread")
