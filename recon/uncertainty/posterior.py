@@ -61,7 +61,8 @@ class Posterior:
         self.done, self.num_steps, self.visit = 0, num_samples, visit
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         self.orientation = outcome.orientation  # the fit saw the series so
-        tilt_series = self.orientation.series(tilt_series)
+        rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
+        tilt_series = self.orientation.series(rising)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
         generator = torch.Generator().manual_seed(seed)
         rows, height = (None, observation.shape[2]) if place is None else place

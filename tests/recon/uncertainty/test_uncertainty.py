@@ -112,7 +112,7 @@ def test_error_bars_of_a_flipped_series_are_those_of_its_reconstruction(scene, f
     outcome = reconstruct(flipped, weight=0.4, num_steps=5, uncertainty=2)
     bars = error_bars(replace(outcome, uncertainty=None), flipped, 2)
     np.testing.assert_array_equal(bars.std.attenuation, outcome.uncertainty.std.attenuation)
-    assert bars.std.attenuation[outcome.volume.attenuation > 0].min() != 0
+    assert bars.std.attenuation[outcome.volume.attenuation > 0].min() > 0
 
 
 def test_error_bars_that_cannot_be_made_are_refused(scene):
