@@ -12,7 +12,7 @@ from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, tilt_range
 
 
-def draw(size=64, num_samples=8):
+def draw(size=192, num_samples=8):
     """Simulate, reconstruct and draw."""
     acquisition = ACQUISITIONS["clipped"]
     truth = make_phantom("shells", size, generator=np.random.default_rng(3))
