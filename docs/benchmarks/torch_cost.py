@@ -1,7 +1,7 @@
 """Seconds and GB per 10⁶ pixels of likelihoods, gradients and draws; writes results/torch_cost.json and torch.md.
 
 OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py                        all rows, some ten minutes
-OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py --only "Gaussian"      one model, printed and not written
+OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py --only "Gaussian"      one model; the rows of the others are kept
 OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py --quick                a few minutes
 """
 
@@ -175,7 +175,12 @@ def main() -> None:
         for row, cell in rows_of(name, count, threads, repeats):
             result["cells"][row] = cell
             print(line_of(row, cell), flush=True)
-    if not given.only:
+    if given.only and not given.quick and RESULTS.exists():
+        kept = json.loads(RESULTS.read_text(encoding="utf-8"))
+        cells = kept["cells"] | result["cells"]
+        order = {name: place for place, name in enumerate(MODELS)}
+        result = kept | {"cells": dict(sorted(cells.items(), key=lambda cell: order[cell[0].rpartition(" | ")[0]]))}
+    if not (given.only and given.quick):
         RESULTS.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         (FOLDER / "torch.md").write_text(page_of(result), encoding="utf-8")
 
