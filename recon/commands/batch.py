@@ -47,13 +47,15 @@ def batch(
     """Reconstruct many tilt series, and write one table of verdicts and figures. One that fails does not stop the others."""
     from noiseflow import io
     from recon.scale.cluster import client_of
-    from recon.scale.many import jobs_of, read_table, reconstruct_all, write_table
+    from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, write_table
 
     output, table = Output(json), out / "batch.csv" if table is None else table
     if table.suffix.lower() not in (".csv", ".json"):
         raise ValueError(f"--table {table}: name a .csv or a .json file")
     words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
-    jobs = jobs_of(source, out, words)
+    jobs, skipped = jobs_of(source, out, words), left_out(source)
+    if skipped:
+        output.line(f"left out, without tilt angles beside them or in them: {', '.join(skipped)}")
     out.mkdir(parents=True, exist_ok=True)
     with io.locked(table):
         rows = [row for row in read_table(table) if row["status"] == "done"] if resume else []
@@ -74,7 +76,7 @@ def batch(
         write_table(table, rows := _in_order(rows, jobs))
     failed = [row for row in rows if row["status"] != "done"]
     output.line(f"{len(rows) - len(failed)} of {len(jobs)} series reconstructed; table: {table}")
-    output.result({"table": table, "series": rows})
+    output.result({"table": table, "series": rows, "left_out": skipped})
     if failed:
         raise ValueError(f"{len(failed)} of {len(jobs)} series failed; {table} says why, and --resume tries them again")
 

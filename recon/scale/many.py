@@ -125,6 +125,13 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
             writer.writerows(rows)
 
 
+def left_out(source: Path) -> list[str]:
+    """Names of the images of a folder that are no series, since no tilt angles lie beside them or in them."""
+    if not source.is_dir():
+        return []
+    return [path.name for path in sorted(source.iterdir()) if path.suffix.lower() in SUFFIXES and not _is_series(path)]
+
+
 def _is_series(path: Path) -> bool:
     """Whether a file is a stack whose angles are known: they lie beside it, or in it."""
     if path.suffix.lower() not in SUFFIXES:

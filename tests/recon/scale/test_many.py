@@ -43,6 +43,7 @@ def test_a_series_that_fails_stops_no_other_and_is_tried_again(folder, tmp_path)
     (series / "b.mrc").write_bytes(whole)
     found = run_command(*words, "--resume")
     assert [row["status"] for row in found["series"]] == ["done"] * 3
+    assert found["left_out"] == ["truth.mrc"]
     assert (tmp_path / "out" / "a.mrc").stat().st_mtime_ns == written
 
 
