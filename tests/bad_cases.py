@@ -191,7 +191,6 @@ reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors
 reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name the output
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report
-reconstruct {good}/tilts.mrc --fsc --report {out}/r --slices-at-once 4 -o {out}/v.mrc | leave out --slices-at-once
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 1
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt --mode haadf | linear
 compare {good}/tilts.mrc {good}/tilts.mrc --report {bad}/empty.mrc | is a file

@@ -17,15 +17,23 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import scale_page
-from scale_measure import psnr, run, seams
+import torch
+from scale_measure import mapped, middle_rows, psnr, run, seams, seams_beside
 
 from noiseflow.commands.console import Output
 from recon.benchmarks.scenes import Results
+from recon.benchmarks.search import best_fit
+from recon.joint.joint import JointReconstructor
+from recon.metrics.metrics import fourier_shell_correlation, resolution
+from recon.scale.blocks import HALO
+from recon.series.tilt_series import VolumeGrid, read_tilt_series
+from recon.simulate.simulation import ACQUISITIONS
 
 RESULTS = Path(__file__).parent / "results" / "scale.json"
 TILTS = "-59.5:57.5:1.5"  # 79
@@ -40,12 +48,16 @@ class Row:
         phantom, size: of the scene.
         options: of ``noiseflow reconstruct``.
         threads: of the process; None takes those of ``--threads``.
+        beside: options of a second reconstruction, whose borders of blocks lie elsewhere: its jumps are those without a border.
+        oracle: whether, in place of the command, a fit that knows the true noise is searched for its best weight.
     """
 
     phantom: str
     size: int
     options: tuple[str, ...] = ()
     threads: int | None = None
+    beside: tuple[str, ...] | None = None
+    oracle: bool = False
 
 
 ROWS = {
@@ -61,6 +73,11 @@ LARGE = {
     "blocks-256": Row("shells", 256, ("--slices-at-once", "64")),
     "slab-128": Row("slab", 128),
     "slab-blocks-128": Row("slab", 128, ("--slices-at-once", "32")),
+    "borders-256": Row("shells", 256, ("--slices-at-once", "64"), beside=("--slices-at-once", "256")),
+    "borders-512": Row("shells", 512, beside=("--slices-at-once", "48")),
+    "borders-slab-256": Row("slab", 256, ("--slices-at-once", "64"), beside=("--slices-at-once", "256")),
+    "borders-slab-512": Row("slab", 512, beside=("--slices-at-once", "48")),
+    "oracle-512": Row("shells", 512, oracle=True),
     "processes-1": Row("shells", 256, ("--slices-at-once", "64"), threads=2),
     "processes-2": Row("shells", 256, ("--slices-at-once", "64", "--workers", "2")),
 }
@@ -95,7 +112,7 @@ def main() -> None:
         try:
             folder = scene(row, options.cache, options.threads, results)
             threads = options.threads if row.threads is None else row.threads
-            found = cell(f"scale/{name}", lambda r=row, f=folder, t=threads: measure(r, f, t))
+            found = cell(f"scale/{name}", partial(measure, row, folder, threads))
         except RuntimeError as error:  # the rows that follow do not depend on this one
             failed.append(f"{name}: {error}")
             continue
@@ -119,13 +136,37 @@ def scene(row: Row, cache: Path, threads: int, results: Results) -> Path:
 
 def measure(row: Row, folder: Path, threads: int) -> Cell:
     """Reconstruct, and judge the volume."""
-    with tempfile.TemporaryDirectory(prefix="volume-", dir=folder) as scratch:
-        out, truth = Path(scratch) / "volume.mrc", folder / "truth.mrc"
-        figures, said = run("reconstruct", folder / "tilts.mrc", "-o", out, *row.options, threads=threads)
-        judged = {"psnr": psnr(out, truth)} | seams(out, truth, said["slices_at_once"])
+    truth = mapped(folder / "truth.mrc")
     about = {"phantom": row.phantom, "size": row.size, "options": list(row.options), "threads": threads}
+    if row.oracle:
+        return about | of_oracle(folder, truth, threads)
+    with tempfile.TemporaryDirectory(prefix="volume-", dir=folder) as scratch:
+        out = Path(scratch) / "volume.mrc"
+        figures, said = run("reconstruct", folder / "tilts.mrc", "-o", out, *row.options, threads=threads)
+        volume = mapped(out)
+        if row.beside is not None:
+            run("reconstruct", folder / "tilts.mrc", "-o", Path(scratch) / "beside.mrc", *row.beside, threads=threads)
+            figures["beside"] = seams_beside(volume, mapped(Path(scratch) / "beside.mrc"), said["slices_at_once"])
+            figures["psnr beside"] = psnr(mapped(Path(scratch) / "beside.mrc"), truth)
+        judged = {"psnr": psnr(volume, truth), "psnr of the middle": psnr(volume, truth, rows=middle_rows(row.size))}
+        judged |= {"fsc 0.5": resolution(*fourier_shell_correlation(volume, truth), 0.5)}
+        judged |= seams(volume, truth, said["slices_at_once"])
     keep = {"seconds inside": said["seconds"], "choices": said["choices"], "verdict": said["verdict"]["grade"]}
     return about | figures | judged | keep
+
+
+def of_oracle(folder: Path, truth: Any, threads: int) -> Cell:
+    """A fit that knows the true noise, at the weight that the truth likes best, of the middle slices and a halo."""
+    torch.set_num_threads(threads)
+    series = read_tilt_series(folder / "tilts.mrc", mapped=True)
+    rows = middle_rows(truth.shape[1])
+    wide = slice(max(0, rows.start - HALO), min(truth.shape[1], rows.stop + HALO))
+    part = truth[:, wide]
+    inner = slice(rows.start - wide.start, rows.stop - wide.start)
+    grid = replace(VolumeGrid.of(series), height=wide.stop - wide.start)
+    oracle = JointReconstructor(noise_model=ACQUISITIONS["clipped"].noise)
+    found = best_fit(series.rows(wide), grid, oracle, lambda volume: psnr(volume, part, rows=inner))
+    return {"psnr of the middle": max(found.tried.values()), "setting": found.setting, "tried": found.tried}
 
 
 if __name__ == "__main__":

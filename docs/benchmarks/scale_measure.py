@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from noiseflow import io
 from recon.scale.blocks import HALO, blocks
 
+_MIDDLE = 64
 _NEAR = 8  # slices on either side of a border that say how much the volume jumps elsewhere
 Array = NDArray[Any]
 
@@ -50,28 +51,48 @@ def run(*words: str | Path | int, threads: int) -> tuple[dict[str, Any], dict[st
     return figures | {"peak GiB": usage.ru_maxrss * unit / 2**30}, answer
 
 
-def psnr(volume: Path, truth: Path) -> float:
-    """PSNR (dB) of a volume over the range of the truth, without any rescaling, section by section."""
-    found, known = (io.read(path, mapped=True).data for path in (volume, truth))
-    total = sum(float(np.sum((a.astype(np.float64) - b) ** 2)) for a, b in zip(found, known, strict=True))
-    span = max(float(section.max()) for section in known) - min(float(section.min()) for section in known)
-    return float(-10 * np.log10(total / known.size / span**2))
+def mapped(path: Path) -> Array:
+    """A volume (z, y, x), left in its file."""
+    return io.read(path, mapped=True).data
 
 
-def seams(volume: Path, truth: Path, slices_at_once: int | None) -> dict[str, Any]:
+def psnr(found: Array, truth: Array, *, rows: slice = slice(None)) -> float:
+    """PSNR (dB) of a volume's rows over the range of the whole truth, without any rescaling, section by section."""
+    total = sum(float(np.sum((a[rows].astype(np.float64) - b[rows]) ** 2)) for a, b in zip(found, truth, strict=True))
+    span = max(float(section.max()) for section in truth) - min(float(section.min()) for section in truth)
+    return float(-10 * np.log10(total / truth[:, rows].size / span**2))
+
+
+def middle_rows(height: int) -> slice:
+    """The slices that an oracle is judged on: 64 in the middle, or all of fewer."""
+    start = max(0, (height - _MIDDLE) // 2)
+    return slice(start, min(height, start + _MIDDLE))
+
+
+def seams(found: Array, truth: Array, slices_at_once: int | None) -> dict[str, Any]:
     """How much a volume jumps across the borders of its blocks, relative to neighbouring slices inside; and the truth there.
 
     Each is the ratio of mean absolute differences that is largest over the borders; None where there is no border.
     """
-    found, known = (io.read(path, mapped=True).data for path in (volume, truth))
-    parts = [] if slices_at_once is None else blocks(found.shape[1], slices_at_once, HALO)
-    borders = [part.rows.start - 1 for part in parts[1:]]
-    ratios = [[_ratio(array, border) for border in borders] for array in (found, known)]
+    borders = _borders(found.shape[1], slices_at_once)
+    ratios = [[_ratio(array, border) for border in borders] for array in (found, truth)]
     return {
-        "blocks": max(1, len(parts)),
+        "blocks": 1 + len(borders),
         "seam": max(ratios[0], default=None),
         "seam of the truth": max(ratios[1], default=None),
     }
+
+
+def seams_beside(found: Array, other: Array, slices_at_once: int) -> float:
+    """How much more a volume jumps across the borders of its blocks than another of the same series jumps there that has no
+    border so near: the largest quotient of the two ratios of `seams`; one where blocks leave no trace."""
+    borders = _borders(found.shape[1], slices_at_once)
+    return max(_ratio(found, border) / _ratio(other, border) for border in borders)
+
+
+def _borders(height: int, slices_at_once: int | None) -> list[int]:
+    parts = [] if slices_at_once is None else blocks(height, slices_at_once, HALO)
+    return [part.rows.start - 1 for part in parts[1:]]
 
 
 def _ratio(array: Array, border: int) -> float:

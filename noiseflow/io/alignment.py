@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io import mapped
 from noiseflow.io.checks import number, text_lines
 
 
@@ -53,9 +54,10 @@ def apply_transforms(images: NDArray[Any], transforms: NDArray[np.float64]) -> N
         transforms: (section, 2, 3) of `read_transforms`; c is the middle of the image.
 
     Returns:
-        (section, y, x).
+        (section, y, x), in a temporary file where it is large.
 
     Raises:
+        OSError: the disk has no room for that file.
         ValueError: another number of transforms than of images.
     """
     from scipy.ndimage import affine_transform
@@ -63,7 +65,7 @@ def apply_transforms(images: NDArray[Any], transforms: NDArray[np.float64]) -> N
     if len(images) != len(transforms):
         raise ValueError(f"there are {len(images)} images and {len(transforms)} transforms; give the .xf of this stack")
     centre = (np.array(images.shape[1:]) - 1) / 2
-    moved = np.empty(images.shape, np.float32)
+    moved = mapped.temporary_map(images.shape, np.float32, in_memory=mapped.IN_MEMORY)
     for image, transform, target in zip(images, transforms, moved, strict=True):
         back = np.linalg.inv(transform[::-1, 1::-1])  # (y, x), from the output to the input
         offset = centre - back @ (centre + transform[::-1, 2])

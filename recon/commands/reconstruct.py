@@ -168,10 +168,6 @@ def reconstruct(
     options |= {"regulariser": regulariser, "uncertainty": uncertainty}
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
     settings_of(**options)
-    if fsc and slices_at_once is not None:
-        raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --slices-at-once")
-    if fsc and (workers is not None or scheduler is not None):
-        raise ValueError("--fsc needs whole volumes in memory; leave it out, or leave out --workers and --scheduler")
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler has workers of its own; leave out --workers")
     if fsc and report is None:
@@ -206,13 +202,13 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
-        if slices_at_once is None and not fsc:
+        if slices_at_once is None:
             many = workers if scheduler is None else 2
             slices_at_once = slices_for(tilt_series, grid, method, chosen_device, many)
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
         output.line(memory)
         if slices_at_once is not None:
-            output.line(disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0))
+            output.line(disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0, halves=fsc))
         if dry_run:
             _show_plan(tilt_series, grid, options, memory, output)
             return
@@ -257,10 +253,13 @@ def _solve(
     outcome = reconstruct(tilt_series, grid, **options)
     if not fsc:
         return outcome, None
-    options["uncertainty"] = 0
-    halves = zip(("even tilts: ", "odd tilts: "), even_odd(tilt_series), strict=True)
-    first, second = (reconstruct(half, grid, **options, prefix=prefix).volume for prefix, half in halves)
-    return outcome, (first, second)
+    options["uncertainty"], scratch = 0, options.get("scratch")
+    halves = []
+    for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True):
+        if scratch is not None:
+            options["scratch"] = scratch.with_name(f"{name}-{scratch.name}")
+        halves.append(reconstruct(half, grid, **options, prefix=f"{name} tilts: ").volume)
+    return outcome, (halves[0], halves[1])
 
 
 def _show_plan(tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], memory: str, output: Output) -> None:

@@ -154,14 +154,19 @@ def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: A
     return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1, plenty=plenty)
 
 
-def disk_line(tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int, *, error_bars: bool = False) -> str:
-    """One line about the blocks and the room on the disk that they take until the volume is whole."""
+def disk_line(
+    tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int, *, error_bars: bool = False, halves: bool = False
+) -> str:
+    """One line about the blocks and the room on the disk that they take until the volume is whole; with `halves`, those of the
+    even and of the odd tilts, too."""
     from recon.scale.blocks import HALO, blocks
 
     parts = blocks(grid.height, slices_at_once, HALO)
     listed = sum(part.wide.stop - part.wide.start for part in parts)
-    num_bytes = 4 * ((listed + 2 * grid.height) * grid.depth * grid.width) * (3 if error_bars else 1)
-    num_bytes += 4 * tilt_series.num_tilts * tilt_series.images.shape[2] * (listed + grid.height)
+    volumes = (3 if error_bars else 1) + (2 if halves else 0)
+    num_bytes = 4 * volumes * (listed + 2 * grid.height) * grid.depth * grid.width
+    num_images = tilt_series.num_tilts * (2 if halves else 1)
+    num_bytes += 4 * num_images * tilt_series.images.shape[2] * (listed + grid.height)
     return f"blocks: {len(parts)} of {slices_at_once} slices at most; disk: about {num_bytes / 2**30:.1f} GiB meanwhile"
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from noiseflow import io
+from noiseflow.io.mapped import is_large
 from recon.uncertainty.result import error_bar_paths
 
 LayerData = tuple[Any, dict[str, Any], str]
@@ -31,7 +32,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
         FileNotFoundError, ValueError: as `noiseflow.io.read`.
     """
     source = path if isinstance(path, str) else path[0]
-    image = io.read(source)
+    image = _read(source)
     metadata: dict[str, Any] = {"source": source}
     scale = [1.0] * image.data.ndim if image.voxel_size is None else list(image.voxel_size[-image.data.ndim :])
     if image.data.ndim == 3:
@@ -45,12 +46,17 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
         metadata["voxel_size"] = image.voxel_size
     own = (image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")
     beside = [path for path in error_bar_paths(source).values() if path.exists()]
-    return [own, *(error_bar_layer(io.read(path).data, path.stem, own[1]) for path in beside)]
+    return [own, *(error_bar_layer(_read(path).data, path.stem, own[1]) for path in beside)]
+
+
+def _read(path: str | Path) -> io.ImageFile:
+    """A file whose pixels stay on the disk, where they are many, until they are looked at."""
+    return io.read(path, mapped=is_large(path))
 
 
 def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerData:
     """A hidden layer of standard deviations or biases in the place of its volume's, with colours for either side of zero."""
-    reach = float(np.abs(values).max()) or 1.0
+    reach = max(float(np.abs(section).max()) for section in values) or 1.0
     look = {"name": name, "visible": False, "colormap": "PiYG", "contrast_limits": (-reach, reach)}
     return values, {**look, "scale": volume["scale"], "metadata": dict(volume["metadata"])}, "image"
 

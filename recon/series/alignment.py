@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.described import described
+from noiseflow.io import mapped
 from recon.series.evidence import Evidence
 from recon.series.tilt_series import TiltSeries, filled
 
@@ -37,36 +38,45 @@ class Alignment:
         """The series with the axis along y through the middle; what is not in the raw images is masked.
 
         Cubic splines interpolate, once, which correlates the noise of neighbouring pixels. Within 45° of x, height and width
-        are swapped. Without rotation and fraction of a pixel, readings stay what they are.
+        are swapped. Without rotation and fraction of a pixel, readings stay what they are. Large series go to a temporary file.
 
         Raises:
+            OSError: the disk has no room for that file.
             ValueError: another number of shifts than of tilts, or nothing of an image is left in view.
         """
         if self.shifts.shape != (tilt_series.num_tilts, 2):
             raise ValueError(f"{len(self.shifts)} shifts do not belong to {tilt_series.num_tilts} tilts")
-        moved = [
-            self._moved(image, use, shift)
-            for image, use, shift in zip(tilt_series.images, tilt_series.used, self.shifts, strict=True)
-        ]
-        images, mask = (np.stack(parts) for parts in zip(*moved, strict=True))
+        shape = (tilt_series.num_tilts, *self._shape(tilt_series.images.shape[1:]))
+        images, mask = (
+            mapped.temporary_map(shape, kind, in_memory=mapped.IN_MEMORY) for kind in (np.float32, np.bool_)
+        )
+        for number, (image, shift) in enumerate(zip(tilt_series.images, self.shifts, strict=True)):
+            use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
+            images[number], mask[number] = self._moved(image, use, shift)
         if not mask.any((1, 2)).all():
             raise ValueError(
                 "an image was moved out of view entirely; give --tilt-axis, or leave out --refine-alignment"
             )
-        if not np.issubdtype(tilt_series.images.dtype, np.floating) and np.array_equal(images, np.round(images)):
-            images = images.astype(tilt_series.images.dtype)
+        given = tilt_series.images.dtype
+        if not np.issubdtype(given, np.floating) and all(np.array_equal(image, np.round(image)) for image in images):
+            images = mapped.mapped_copy(
+                (image.astype(given) for image in images), shape, given, in_memory=mapped.IN_MEMORY
+            )
         if mask.mean() < 0.98:
             warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
         return replace(tilt_series, images=images, mask=None if mask.all() else mask, tilt_axis=None)
+
+    def _shape(self, raw: tuple[int, ...]) -> tuple[int, ...]:
+        """Of aligned images."""
+        theta = np.deg2rad(self.tilt_axis)
+        return raw if abs(np.cos(theta)) >= abs(np.sin(theta)) else raw[::-1]
 
     def _moved(
         self, image: NDArray[Any], use: NDArray[np.bool_], shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         from scipy.ndimage import affine_transform
 
-        height, width = image.shape
-        theta = np.deg2rad(self.tilt_axis)
-        shape = (height, width) if abs(np.cos(theta)) >= abs(np.sin(theta)) else (width, height)
+        theta, shape = np.deg2rad(self.tilt_axis), self._shape(image.shape)
         back = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
         if self.tilt_axis % 90 == 0:
             back = np.round(back)

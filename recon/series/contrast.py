@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.io import mapped
 from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
@@ -23,9 +24,12 @@ _BRIGHTER = 1.5
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
     """Swap bright and dark: every reading becomes largest + smallest − reading, in the same number type."""
     images = tilt_series.images
-    if np.issubdtype(images.dtype, np.integer):  # largest − reading fits the type, and adding smallest keeps it there
-        return replace(tilt_series, images=(images.max() - images) + images.min())
-    return replace(tilt_series, images=images.max() + images.min() - images)
+    largest, smallest = images.max(), images.min()
+    # in this order integers stay within their type
+    swapped = ((largest - image) + smallest for image in images)
+    return replace(
+        tilt_series, images=mapped.mapped_copy(swapped, images.shape, images.dtype, in_memory=mapped.IN_MEMORY)
+    )
 
 
 def check_contrast(tilt_series: TiltSeries) -> None:

@@ -48,14 +48,16 @@ class Orientation:
         """A series in this orientation, its tilts in their order."""
         if self == Orientation():
             return tilt_series
-        images, mask = tilt_series.images, tilt_series.mask
-        if is_mapped(images):
-            images = mapped.mapped_copy((self.images(image) for image in images), images.shape, images.dtype)
-        else:
-            images = self.images(images)
+        images = self._stack(tilt_series.images)
+        mask = None if tilt_series.mask is None else self._stack(tilt_series.mask)
         angles = -tilt_series.tilt_angles if self.negated else tilt_series.tilt_angles
-        flipped = tilt_series.with_images(images, None if mask is None else self.images(mask))
+        flipped = tilt_series.with_images(images, mask)
         return replace(flipped, tilt_angles=angles)
+
+    def _stack(self, images: NDArray[Any]) -> NDArray[Any]:
+        if not is_mapped(images):
+            return self.images(images)
+        return mapped.mapped_copy((self.images(image) for image in images), images.shape, images.dtype)
 
     def images(self, images: NDArray[Any]) -> NDArray[Any]:
         """Images (..., y, u), there or back."""

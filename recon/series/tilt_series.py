@@ -251,22 +251,29 @@ def _masked(
     """Images whose unused pixels hold their nearest used neighbour's reading, and the mask of the used ones."""
     if mask is None and all(np.isfinite(image).all() for image in images):
         return images, None
-    finite = np.isfinite(images)
     if mask is not None and mask.shape not in (images.shape, images.shape[1:]):
         raise ValueError(f"the mask has shape {mask.shape}; {name} needs {images.shape}, or {images.shape[1:]} for all")
-    use = np.ones_like(finite) if mask is None else np.broadcast_to(mask, images.shape)
-    bad = ~finite & use
-    if bad.any() and not mask_nan:
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+    wanted = np.broadcast_to(True if mask is None else mask, images.shape)
+    use = mapped.temporary_map(images.shape, np.bool_, in_memory=mapped.IN_MEMORY)
+    bad, first = 0, (0, 0, 0)
+    for number, (image, part) in enumerate(zip(images, wanted, strict=True)):
+        finite = np.isfinite(image)
+        use[number] = part & finite
+        wrong = part & ~finite
+        if wrong.any() and not bad:
+            row, column = np.argwhere(wrong)[0]
+            first = (number, int(row), int(column))
+        bad += int(wrong.sum())
+    if bad and not mask_nan:
         raise ValueError(
-            f"{name} has {int(bad.sum())} NaN or infinite pixels, the first at {where}; leave them out with --mask-nan"
+            f"{name} has {bad} NaN or infinite pixels, the first at {first}; leave them out with --mask-nan"
         )
-    use = use & finite
     if use.all():
         return images, None
     if not use.any():
         raise ValueError(f"{name} has no usable pixel: all are masked, NaN or infinite")
-    return np.stack([filled(image, part) for image, part in zip(images, use, strict=True)]), use
+    whole = (filled(image, part) for image, part in zip(images, use, strict=True))
+    return mapped.mapped_copy(whole, images.shape, images.dtype, in_memory=mapped.IN_MEMORY), use
 
 
 def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:

@@ -28,23 +28,26 @@ def test_pages_agree_with_their_json() -> None:
     assert (BENCHMARKS / "scale_estimates.md").read_text(encoding="utf-8") == scale_page.estimates(content)
 
 
-def test_a_seam_is_the_jump_across_a_border(tmp_path: Path) -> None:
-    from scale_measure import psnr, seams
+def test_a_seam_is_the_jump_across_a_border() -> None:
+    from scale_measure import middle_rows, psnr, seams, seams_beside
 
     generator = np.random.default_rng(0)
     truth = generator.random((6, 64, 8), dtype=np.float32)
     found = truth + np.float32(0.01) * generator.standard_normal(truth.shape, dtype=np.float32)
+    assert seams_beside(found, truth, 20) == pytest.approx(1, abs=0.02)
     found[:, blocks(64, 20, HALO)[2].rows.start :] += 5
-    for name, array in (("found", found), ("truth", truth)):
-        io.write(tmp_path / f"{name}.mrc", array)
-    said = seams(tmp_path / "found.mrc", tmp_path / "truth.mrc", 20)
+    said = seams(found, truth, 20)
     assert said["blocks"] == 4
     assert said["seam"] > 10
     assert said["seam of the truth"] == pytest.approx(1, abs=0.3)
-    assert psnr(tmp_path / "found.mrc", tmp_path / "truth.mrc") == pytest.approx(compare(found, truth).psnr, rel=1e-5)
-    io.write(tmp_path / "empty.mrc", np.zeros_like(truth))
-    assert seams(tmp_path / "empty.mrc", tmp_path / "empty.mrc", 20)["seam"] == 1
-    assert seams(tmp_path / "found.mrc", tmp_path / "truth.mrc", None)["seam"] is None
+    assert seams_beside(found, truth, 20) > 10
+    assert psnr(found, truth) == pytest.approx(compare(found, truth).psnr, rel=1e-5)
+    assert psnr(found, truth, rows=slice(0, 20)) > 35
+    assert middle_rows(512) == slice(224, 288)
+    assert middle_rows(40) == slice(0, 40)
+    empty = np.zeros_like(truth)
+    assert seams(empty, empty, 20)["seam"] == 1
+    assert seams(found, truth, None)["seam"] is None
 
 
 def test_memory_of_a_command_is_that_of_its_own_process(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
+from noiseflow.io.mapped import is_mapped
 from recon.napari import get_reader, write_image
 from recon.napari.widget import reconstruct_layer, reconstruct_layers
 
@@ -89,6 +90,12 @@ def test_error_bars_come_as_hidden_layers_from_the_widget_and_from_files(needle,
     np.testing.assert_array_equal(read[1][0], bars[0][0])
     low, high = read[2][1]["contrast_limits"]
     assert low == -high
+
+
+def test_a_large_file_stays_on_the_disk_until_it_is_looked_at(needle, monkeypatch):
+    assert not is_mapped(get_reader(str(needle))(str(needle))[0][0])
+    monkeypatch.setattr("noiseflow.io.mapped.IN_MEMORY", 0)
+    assert is_mapped(get_reader(str(needle))(str(needle))[0][0])
 
 
 def test_layer_without_angles_is_refused_with_the_fix():

@@ -12,6 +12,8 @@ from noiseflow.io.mapped import create_volume, finish_volume, is_mapped
 from noiseflow.io.ownership import is_own
 from recon.methods import reconstruct
 from recon.scale.blocks import HALO
+from recon.series.alignment import Alignment
+from recon.series.contrast import invert_contrast
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series, write_tilt_series
 from recon.simulate.phantoms import shells
@@ -144,6 +146,58 @@ def test_tilts_of_a_large_mapped_series_in_any_order_stay_on_the_disk(scene, tmp
     assert is_mapped(found.images)
     np.testing.assert_array_equal(found.images, noisy.images[chosen])
     np.testing.assert_array_equal(found.tilt_angles, noisy.tilt_angles[chosen])
+
+
+PREPARED = {
+    "masked": lambda path, masked: read_tilt_series(path, mask=masked, mapped=True),
+    "aligned by a file": lambda path, _: read_tilt_series(path, transforms=path.with_suffix(".xf"), mapped=True),
+    "aligned": lambda path, _: Alignment(3.0, np.full((21, 2), 0.5), np.arange(-60, 61, 6.0)).apply(
+        read_tilt_series(path, mapped=True)
+    ),
+    "contrast inverted": lambda path, _: invert_contrast(read_tilt_series(path, mapped=True)),
+    "masked and flipped": lambda path, masked: Orientation(upside_down=True).series(
+        read_tilt_series(path, mask=masked, mapped=True)
+    ),
+}
+
+
+@pytest.mark.parametrize("way", PREPARED)
+def test_a_large_series_that_is_changed_before_the_fit_goes_to_a_file(scene, tmp_path, monkeypatch, way):
+    _, noisy = scene
+    path, masked = tmp_path / "tilts.mrc", np.random.default_rng(0).random(noisy.images.shape) < 0.95
+    write_tilt_series(path, noisy)
+    path.with_suffix(".xf").write_text("1 0.01 -0.01 1 0.5 2\n" * noisy.num_tilts)
+    small = PREPARED[way](path, masked)
+    assert not isinstance(small.images, np.memmap) or not small.images.flags.writeable or way == "masked and flipped"
+    monkeypatch.setattr("noiseflow.io.mapped.IN_MEMORY", 0)
+    large = PREPARED[way](path, masked)
+    assert is_mapped(large.images)
+    np.testing.assert_array_equal(large.images, small.images)
+    np.testing.assert_array_equal(large.used, small.used)
+    if small.mask is not None:
+        assert is_mapped(large.mask)
+
+
+def test_even_and_odd_tilts_are_reconstructed_in_blocks_too(scene, tmp_path, run):
+    _, noisy = scene
+    write_tilt_series(tmp_path / "tilts.mrc", noisy)
+    said = {}
+    for name, options in (("whole", ()), ("blocks", ("--slices-at-once", 9))):
+        command = [
+            "reconstruct",
+            tmp_path / "tilts.mrc",
+            "-o",
+            tmp_path / f"{name}.mrc",
+            "--method",
+            "wbp",
+            "--window",
+            "hann",
+        ]
+        run(*command, *options, "--fsc", "--report", tmp_path / name)
+        page = (tmp_path / name / "index.html").read_text(encoding="utf-8")
+        said[name] = page[page.index("Between even and odd tilts") :][:120]
+    assert said["blocks"] == said["whole"]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
 
 
 def test_indices_are_wider_where_there_are_more_than_32_bits_count():
