@@ -12,14 +12,14 @@ from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _SLICES = 4  # that are projected to see how fast this machine is
-_REPEATS = 5  # the fastest counts: the first makes room, and other work on the machine slows some
+_REPEATS = 5  # the fastest counts: the first makes room
 _REST = 2.3  # a step takes so many times as long as its projections: likelihood, regulariser, interpolation, optimiser (profiled)
 _NOISE_STEP = 0.012  # s, of a batch of 4096 pixels; it hardly depends on the series
 _START = 2.0  # s, of the coarse reconstruction before the first stage
 
 
 def expected_seconds(stages: Sequence[FitStage], tilt_series: TiltSeries, grid: VolumeGrid, slab_height: int) -> float:
-    """Seconds that stages will take, within a factor of two or so.
+    """Seconds that stages will take where nothing else runs, within a factor of two or so.
 
     Args:
         stages: of a plan.
@@ -48,13 +48,13 @@ def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
     )
     columns = torch.rand(grid.depth * grid.width, _SLICES)
     threads, seconds = torch.get_num_threads(), list[float]()
-    torch.set_num_threads(1)  # several wait for one another for long where the machine has other work
+    torch.set_num_threads(1)  # whose processor time is that of a machine that does nothing else
     try:
         with torch.no_grad():
             for _ in range(_REPEATS):
-                started = time.perf_counter()
+                started = time.thread_time()
                 projector.backproject(projector.project(columns))
-                seconds.append(time.perf_counter() - started)
+                seconds.append(time.thread_time() - started)
     finally:
         torch.set_num_threads(threads)
     return min(seconds) / (_SLICES * threads)
