@@ -204,6 +204,22 @@ def test_a_limit_of_a_narrower_number_type_is_the_limit(step: float, given: torc
     assert torch.equal(law.log_prob(between), law.log_prob(between.to(own)))
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_limit_in_an_array_of_single_precision_is_the_limit(masked: bool) -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(WIDTH), 0.0, 0.1, 0.9).double()
+    reading = np.array([0.1, 0.9, 0.5, 0.3])
+    law = model(np.array([0.2, 0.8, 0.5, 0.5]))
+    narrow = np.ma.masked_equal(reading, 0.3).astype(np.float32) if masked else reading.astype(np.float32)
+    np.testing.assert_allclose(law.log_prob(narrow)[:3], law.log_prob(reading)[:3], rtol=1e-5)
+
+
+def test_a_limit_of_single_precision_is_the_limit_beneath_offsets_of_rows() -> None:
+    model = noiseflow.ScanNoise(noiseflow.Digitised(noiseflow.Gaussian(WIDTH), 0.0, 0.1, 0.9)).double()
+    reading = torch.tensor([[0.1, 0.9, 0.4, 0.5]], dtype=torch.float64)
+    law = model(torch.full((1, 4), 0.5, dtype=torch.float64))
+    assert_close(law.log_prob(reading.float()), law.log_prob(reading), rtol=1e-5, atol=1e-5)
+
+
 def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up() -> None:
     law = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-4)(SIGNALS)
     with pytest.raises(ValueError, match="likely levels"):

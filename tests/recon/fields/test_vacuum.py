@@ -33,6 +33,14 @@ def test_a_block_is_taken_where_the_data_gain_more_than_its_faces_cost(gain, tak
     assert int(mask.sum()) == (size * block * block if taken else 0)
 
 
+def test_blocks_that_gain_nothing_stay_empty_though_they_cost_nothing():
+    occupancy = Occupancy(torch.zeros(1, 1, 1), (8, 8, 8))
+    projector = SliceProjector(tilt_angles=[0.0], depth=8, width=8)
+    for _ in range(40):
+        occupancy.retest(torch.zeros(8, 8), projector, 0.0)
+    assert not occupancy.mask.any()
+
+
 @pytest.mark.parametrize("smoothing", [1e-3, 0.5])
 def test_total_variation_is_the_sum_of_its_formula(smoothing):
     volume = np.random.default_rng(0).normal(size=(4, 3, 5))
