@@ -147,7 +147,7 @@ def test_a_kill_costs_the_step_at_hand_and_no_other(series, tmp_path, method, st
     fast = ["reconstruct", series, "-o", out, "--method", method, "--checkpoint-interval", 0, "--steps", 20]
     fast += ["--denoiser", "tv"] if method == "wbp-denoised" else []
     finish(fast, tmp_path / "log")
-    expected = steps_taken()
+    expected, volume = steps_taken(), np.load(out)
     out.unlink()
     process = start(fast, tmp_path / "log")
     wait_for(lambda: len(steps_taken()) >= len(expected) * 4 / 3, process)
@@ -157,6 +157,7 @@ def test_a_kill_costs_the_step_at_hand_and_no_other(series, tmp_path, method, st
     finish([*fast, "--resume"], tmp_path / "log")
     rest = steps_taken()[len(expected) + len(begun) :]
     assert rest in (expected[len(begun) - 1 :], expected[len(begun) :])
+    assert_same(np.load(out), volume)  # one more step left out would be seen here
 
 
 def test_sirt_goes_on(series, tmp_path):
