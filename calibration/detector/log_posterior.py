@@ -70,7 +70,7 @@ class LogPosterior:
         g, o, r = (np.atleast_1d(np.asarray(value, float)) for value in (gain, offset, read_noise))
         variance = g * (self.reference - o) + (g * r) ** 2
         second = o if self.by_offset else np.log(np.maximum(variance, np.finfo(float).tiny))
-        return np.stack([np.log(g), second, np.log(r)], -1)
+        return np.column_stack([np.log(g), second, np.log(r)])
 
     def rescaled(self, best: Image) -> LogPosterior | None:
         """The same posterior about the scales that are most likely at `best`; None if they are that already."""

@@ -65,7 +65,7 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
             "give one observation per pixel, or leading axes for several"
         ) from error
     kinds = [torch.promote_types(t.dtype if t.is_floating_point() else working, working) for t in tensors]
-    return [t.to(kind).expand(shape) for t, kind in zip(tensors, kinds, strict=True)], answer
+    return [self.widened(t, kind).expand(shape) for t, kind in zip(tensors, kinds, strict=True)], answer
 
 
 def _density(method: Method, name: str) -> Method:

@@ -58,6 +58,15 @@ class DigitisedDistribution(NoiseDistribution):
     def light(self) -> bool:
         return self.base.light
 
+    def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
+        """An observation in a wider number type: one that is a limit in its own type is the limit in the wider one too."""
+        wider = value.to(dtype)
+        if wider.dtype == value.dtype:
+            return wider
+        for limit in (self.low, self.high):
+            wider = torch.where(value == limit, limit, wider)
+        return wider
+
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
         """The detector and the signal."""

@@ -84,6 +84,10 @@ class Pixels:
         """A tensor in the number type of the computation, or a wider one of its own."""
         return tensor.to(torch.promote_types(tensor.dtype, self.working_dtype))
 
+    def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
+        """An observation, as it was given, in a number type at least as wide."""
+        return value.to(dtype)
+
     def clean(self, signal: Tensor) -> Tensor:
         """A signal in the number type of the computation; NaN where it is not finite, so that all its answers are NaN."""
         signal = self.working(signal)

@@ -139,14 +139,13 @@ class Spline:
         x: (..., K+1) increasing knots.
         y: (..., K+1) increasing values at the knots.
         slope: (..., K+1) positive derivatives at the knots; the outermost ones are the slopes of the tails.
-        row, weight: where given, the knots of each element of `row` are between those of this row and the next, by `weight`.
+        between: rows and weights: the knots of each of the rows are between those of this row and the next, by its weight.
     """
 
     x: Tensor
     y: Tensor
     slope: Tensor
-    row: Tensor | None = None
-    weight: Tensor | None = None
+    between: tuple[Tensor, Tensor] | None = None
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         inside, tail_slope = self._clamped(self.x, x)
@@ -174,7 +173,7 @@ class Spline:
         return x0 + xi * width + (y - inside) / tail_slope, -ladj
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Spline:
-        return Spline(self.x, self.y, self.slope, row, weight)
+        return Spline(self.x, self.y, self.slope, (row, weight))
 
     def _clamped(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
         """The value brought between the outermost knots, and the slope of the tail on its side."""
@@ -192,15 +191,16 @@ class Spline:
 
     def _inner(self, knots: Tensor) -> Tensor:
         inner = knots[..., 1:-1]
-        if self.row is None or self.weight is None:
+        if self.between is None:
             return inner
-        return between_rows(inner, self.row, self.weight.detach())
+        row, weight = self.between
+        return between_rows(inner, row, weight.detach())
 
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
         """The knots of the given numbers."""
-        if self.row is not None and self.weight is not None:
-            at = self.row * knots.shape[-1] + index
-            return between_rows(knots.reshape(-1), at, self.weight, step=knots.shape[-1])
+        if self.between is not None:
+            row, weight = self.between
+            return between_rows(knots.reshape(-1), row * knots.shape[-1] + index, weight, step=knots.shape[-1])
         index = index + torch.zeros(knots.shape[:-1], dtype=torch.long, device=index.device)
         return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
 

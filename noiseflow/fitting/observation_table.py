@@ -187,7 +187,7 @@ class ObservationTable:
         generator = torch.Generator().manual_seed(0)
         coarse = torch.linspace(self.low, self.high, 64, dtype=observation.dtype, device=observation.device)
         likelihood = noise_model(coarse[:, None]).log_prob(observation.expand(coarse.numel(), -1)).cpu()
-        gumbel = -torch.log(-torch.log(torch.rand(likelihood.shape, generator=generator).clamp(1e-7, 1 - 1e-7)))
+        gumbel = -torch.log(-torch.log(torch.rand(likelihood.shape, generator=generator)))
         row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
         jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
         signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)

@@ -79,7 +79,7 @@ class FitPixels:
 
     def batch(self, size: int) -> Tensor:
         """About `size` training pixels, or lines of as many, drawn at random."""
-        count = min(size, self.train.numel()) // max(1, self.train[0].numel())
+        count = min(size, self.train.numel()) * len(self.train) // self.train.numel()
         draw = torch.randint(len(self.train), (max(1, count),), generator=self.generator)
         return self.train[draw.to(self.train.device)]
 

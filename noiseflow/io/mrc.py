@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -131,8 +130,7 @@ def _data_type(header: np.void) -> np.dtype[Any]:
 
 
 def _is_big_endian(header: np.void) -> bool:
-    order = header.dtype["nx"].byteorder
-    return order == ">" or (order == "=" and sys.byteorder == "big")
+    return bool(header.dtype["nx"] == np.dtype(">i4"))
 
 
 def _bytes_are_signed(header: np.void) -> bool:

@@ -159,7 +159,7 @@ def divergence(
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
     low, high = np.quantile(residual, (0.001, 0.999))
-    edges = np.concatenate([[-np.inf], np.linspace(low, max(high, low + 1e-12), num_bins - 1), [np.inf]])
+    edges = np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]])
     counts = np.histogram(residual, edges)[0]
     masses = residual_masses(noise_model, signal, torch.from_numpy(edges))
     return compare_histogram(counts, masses, random)

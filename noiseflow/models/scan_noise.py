@@ -132,6 +132,9 @@ class ScanDistribution(NoiseDistribution):
         super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
         self.base, self.scale, self.axis = base, scale, axis
 
+    def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
+        return self.base.widened(value, dtype)
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density of each reading given those before it along the axis; NaN readings are missing and count 0."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)

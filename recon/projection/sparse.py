@@ -68,7 +68,7 @@ class PanelledMatrix:
         if dense.shape[0] != self.shape[1]:
             raise ValueError(f"{dense.shape[0]} rows do not match the matrix's {self.shape[1]} columns")
         result = dense.new_empty(self.shape[0], dense.shape[1])
-        widest = _WIDEST if dense.device.type == "cpu" else max(1, dense.shape[1])
+        widest = _WIDEST if dense.device.type == "cpu" else max(_WIDEST, dense.shape[1])
         for start in range(0, dense.shape[1], widest):
             part = result[:, start : start + widest]
             for number, (panel, span) in enumerate(zip(self.panels, self._spans, strict=True)):

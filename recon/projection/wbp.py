@@ -75,9 +75,7 @@ def angular_shares(
     first = (wedge + 1) % values.size
     left, right = before.copy(), after.copy()
     left[first], right[wedge] = after[first], before[wedge]
-    shares = np.deg2rad((left + right) / 2)
-    shares *= min(1.0, math.pi / shares.sum())
-    return np.asarray((shares / counts)[back])
+    return np.asarray((np.deg2rad((left + right) / 2) / counts)[back])
 
 
 def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:
@@ -87,5 +85,5 @@ def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:
     kernel[0] = 0.25
     ramp: Tensor = torch.fft.rfft(kernel).real
     share = torch.linspace(0, 1, len(ramp), dtype=torch.float64) / cutoff
-    response = ramp * torch.where(share <= 1, WINDOWS[window](share.clamp_max(1)), 0.0)
+    response = ramp * torch.where(share <= 1, WINDOWS[window](share), 0.0)
     return response.to(dtype=like.dtype, device=like.device)

@@ -128,6 +128,13 @@ def test_rows_outside_the_priors_do_not_change_the_others():
     assert np.isneginf(posterior(too_bright)).all()
 
 
+def test_a_likelihood_that_cannot_be_computed_is_that_of_the_impossible(levels, monkeypatch):
+    posterior = LogPosterior(levels)
+    coordinates = posterior.coordinates(*SETS.T)
+    monkeypatch.setattr(posterior, "likelihood", lambda *parameters: np.array([np.nan, 1.0, np.nan]))
+    assert np.isneginf(posterior(coordinates)).tolist() == [True, False, True]
+
+
 CASES = {
     "lit": (lambda: [collect_levels([readings(np.random.default_rng(3), ELECTRONS, step=1.0)])], None),
     "lit and dark": (with_dark, None),

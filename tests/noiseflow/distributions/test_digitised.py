@@ -16,7 +16,7 @@ from noiseflow.distributions.digitised import DigitisedDistribution
 WIDTH = 0.31
 SIGNALS = torch.tensor([-0.2, 0.13, 0.5, 1.4], dtype=torch.float64)
 CONVERTERS = {
-    "rounded": (0.25, -math.inf, math.inf),
+    "rounded": (0.3, -math.inf, math.inf),
     "rounded and clipped": (0.25, 0.0, 1.0),
     "clipped below": (0.25, 0.1, math.inf),
     "clipped above, between two levels": (0.25, -math.inf, 0.9),
@@ -122,6 +122,13 @@ def test_nothing_lies_beyond_a_limit_by_more_than_half_a_step(name: str) -> None
             assert law.cdf_below(torch.full((4,), high + 0.2, dtype=torch.float64)).tolist() == [1.0] * 4
 
 
+def test_what_is_beyond_a_limit_by_half_a_step_is_on_it() -> None:
+    law, half = made(0.25, 0.0, 1.0), 0.125
+    for limit, beyond in ((0.0, -half), (1.0, half)):
+        at, outside = (law.log_prob(torch.full((4,), value, dtype=torch.float64)) for value in (limit, limit + beyond))
+        assert torch.equal(outside, at)
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.0, math.inf), (-math.inf, 0.9)])
 @pytest.mark.parametrize("shape", [(4,), (3, 4)])
 def test_clipping_alone_keeps_the_density_between_the_limits(low: float, high: float, shape: tuple[int, ...]) -> None:
@@ -181,6 +188,36 @@ def test_limits_that_single_precision_rounds_are_limits_still(step: float) -> No
         for nudge in (0.0, 1e-8 if limit == 0.1 else -1e-8):
             reading = torch.full((4,), limit + nudge, dtype=torch.float32)
             assert_close(law.log_prob(reading).exp(), mass, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.1])
+@pytest.mark.parametrize(("given", "own"), [(torch.float32, torch.float64), (torch.float16, torch.float32)])
+def test_a_limit_of_a_narrower_number_type_is_the_limit(step: float, given: torch.dtype, own: torch.dtype) -> None:
+    """Files hold single precision, in which 0.1 is above the 0.1 of a model in double precision and 0.9 below its 0.9."""
+    law = noiseflow.Digitised(noiseflow.Gaussian(WIDTH), step, 0.1, 0.9).to(own)(SIGNALS.to(own))
+    for limit in (0.1, 0.9):
+        narrow, wide = (torch.full((4,), limit, dtype=kind) for kind in (given, own))
+        assert torch.equal(law.log_prob(narrow), law.log_prob(wide))
+        assert torch.equal(law.cdf(narrow), law.cdf(wide))
+        assert torch.equal(law.cdf_below(narrow), law.cdf_below(wide))
+    between = torch.full((4,), 0.5, dtype=given)
+    assert torch.equal(law.log_prob(between), law.log_prob(between.to(own)))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_limit_in_an_array_of_single_precision_is_the_limit(masked: bool) -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(WIDTH), 0.0, 0.1, 0.9).double()
+    reading = np.array([0.1, 0.9, 0.5, 0.3])
+    law = model(np.array([0.2, 0.8, 0.5, 0.5]))
+    narrow = np.ma.masked_equal(reading, 0.3).astype(np.float32) if masked else reading.astype(np.float32)
+    np.testing.assert_allclose(law.log_prob(narrow)[:3], law.log_prob(reading)[:3], rtol=1e-5)
+
+
+def test_a_limit_of_single_precision_is_the_limit_beneath_offsets_of_rows() -> None:
+    model = noiseflow.ScanNoise(noiseflow.Digitised(noiseflow.Gaussian(WIDTH), 0.0, 0.1, 0.9)).double()
+    reading = torch.tensor([[0.1, 0.9, 0.4, 0.5]], dtype=torch.float64)
+    law = model(torch.full((1, 4), 0.5, dtype=torch.float64))
+    assert_close(law.log_prob(reading.float()), law.log_prob(reading), rtol=1e-5, atol=1e-5)
 
 
 def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up() -> None:

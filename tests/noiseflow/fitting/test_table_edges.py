@@ -122,8 +122,8 @@ def test_rows_grow_where_signals_leave_them_and_not_for_a_few_strays() -> None:
     assert (found.low, found.high) == (0.0, 1.0)
     found.cover(model, torch.full((100,), math.nan))
     assert (found.low, found.high) == (0.0, 1.0)
-    found.cover(model, torch.linspace(0.0, 1.5, 1000))
-    assert found.low == 0.0
+    found.cover(model, torch.cat([torch.zeros(10), torch.linspace(0.0, 1.5, 1000)]))
+    assert found.low == 0.0  # many signals on the first row are not below it
     assert found.high == pytest.approx(1.5 + 0.2 * 1.5, rel=2e-3)  # a fifth beyond, so that it need not grow again soon
     high = found.high
     found.cover(model, torch.linspace(-0.4, 1.0, 1000))
@@ -173,6 +173,16 @@ def test_few_levels_are_columns_so_that_nothing_is_interpolated_along_them() -> 
     assert 0 < int(possible.sum()) < observation.numel()
     assert float((found.log_prob(torch.full_like(observation, 0.5)) - value)[possible].abs().max()) < 0.02
     assert found.error <= 1e-3
+    assert found._columns is None
+
+
+def test_levels_that_serve_badly_as_columns_make_way_for_residuals() -> None:
+    """Ripples along the residual: rows would have to be as fine as they are."""
+    model, observation = Wavy(600.0), (256 * spread()).round() / 256
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    assert found._columns is not None
+    assert found.error <= 1e-3
+    assert error_of(found, model, observation) < 1.5e-3
 
 
 def test_a_single_level_and_a_single_signal_have_a_table() -> None:
@@ -184,6 +194,7 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     assert float((found.slope(torch.full_like(observation, 0.42)) - slope).abs().max()) < 0.02 * float(
         slope.abs().max()
     )
+    assert found._columns is None
     narrow = ObservationTable(model, observation, 0.5, 0.5)
     assert narrow.high > narrow.low
     assert narrow.high - narrow.low < 1e-5

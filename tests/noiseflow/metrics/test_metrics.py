@@ -179,6 +179,16 @@ def test_an_evaluation_is_made_of_its_definitions() -> None:
     assert found.mean_jsd == pytest.approx(np.mean([each.jsd for each in found.per_signal]))
     assert found.mean_jsd_floor == pytest.approx(np.mean([each.jsd_floor for each in found.per_signal]))
     assert len(metrics.evaluate(Wide(), signal[:3], observation[:3]).per_signal) == 3
+    judged = metrics.evaluate(Wide(), signal, observation)
+    assert metrics.divergence(Wide(), signal, observation).jsd == judged.overall.jsd  # in the same bins by default
+
+
+def test_one_signal_for_a_lazy_observation_is_that_of_each_of_its_pixels() -> None:
+    lazy = pytest.importorskip("dask.array")
+    signal, observation = (each[:500].double().numpy() for each in noisy(2))
+    found = pixel_log_prob(noiseflow.Gaussian(0.1).double(), signal, lazy.from_array(observation, chunks=200))
+    exact = torch.distributions.Normal(torch.from_numpy(signal), 0.1).log_prob(torch.from_numpy(observation))
+    np.testing.assert_allclose(np.asarray(found.compute()), exact, atol=1e-6)
 
 
 @pytest.mark.parametrize("num_bins", [4, 64])

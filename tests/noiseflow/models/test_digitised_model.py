@@ -79,3 +79,11 @@ def test_where_too_little_is_left_unclipped_all_of_it_counts(pixels: int) -> Non
     model = noiseflow.Digitised(noiseflow.Gaussian(), 0.0, 0.0, 1.0)
     model.standardise(signal, observation)
     assert float(model.model.log_scale.detach().exp()) == pytest.approx(float((observation - signal).std()), rel=0.5)
+
+
+@pytest.mark.parametrize("kept", ["fixed_part", "fixed_interval_part"])
+def test_a_model_that_keeps_only_half_of_its_likelihood_keeps_none_behind_limits(kept: str) -> None:
+    inner = noiseflow.Gaussian(0.1)
+    setattr(inner, kept, lambda signal, *bounds: torch.zeros(len(signal), 2))
+    model = noiseflow.Digitised(inner, 0.0, 0.0, 1.0)
+    assert model.fixed_part(torch.full((3,), 0.5), torch.tensor([0.0, 0.4, 1.0])) is None

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from recon.fields.occupancy import Occupancy
-from recon.fields.regularisers import total_variation
+from recon.fields.regularisers import TotalVariation, total_variation
 from recon.projection.projector import SliceProjector
 
 
@@ -33,6 +33,14 @@ def test_a_block_is_taken_where_the_data_gain_more_than_its_faces_cost(gain, tak
     assert int(mask.sum()) == (size * block * block if taken else 0)
 
 
+def test_blocks_that_gain_nothing_stay_empty_though_they_cost_nothing():
+    occupancy = Occupancy(torch.zeros(1, 1, 1), (8, 8, 8))
+    projector = SliceProjector(tilt_angles=[0.0], depth=8, width=8)
+    for _ in range(40):
+        occupancy.retest(torch.zeros(8, 8), projector, 0.0)
+    assert not occupancy.mask.any()
+
+
 @pytest.mark.parametrize("smoothing", [1e-3, 0.5])
 def test_total_variation_is_the_sum_of_its_formula(smoothing):
     volume = np.random.default_rng(0).normal(size=(4, 3, 5))
@@ -48,3 +56,16 @@ def test_total_variation_is_the_sum_of_its_formula(smoothing):
     assert float(total_variation(volume, smoothing=smoothing)) == pytest.approx(total, rel=1e-12)
     tensor = torch.from_numpy(volume).requires_grad_()
     assert torch.autograd.gradcheck(lambda v: total_variation(v, smoothing=smoothing), tensor)
+
+
+def test_a_jump_of_a_fiftieth_of_the_scale_counts_less_than_half() -> None:
+    """√2 − 1 of what a sharp face would cost: where quadratic turns into linear, unless another place is asked for."""
+    step = torch.zeros(2, 1, 1, dtype=torch.float64)
+    step[1] = 0.02 * 3.0
+    half = math.sqrt(2) - 1
+    assert float(TotalVariation()(step, 3.0)) == pytest.approx(half * 0.06, rel=1e-12)
+    assert float(TotalVariation(0.5)(25 * step, 3.0)) == pytest.approx(half * 1.5, rel=1e-12)
+    for smoothing in (0.0, -0.1, math.nan):
+        for refused in (TotalVariation, lambda value: total_variation(step, smoothing=value)):
+            with pytest.raises(ValueError, match="must be positive"):
+                refused(smoothing)

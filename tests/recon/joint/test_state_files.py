@@ -10,7 +10,7 @@ import torch
 from safetensors.numpy import load_file
 from torch.testing import assert_close
 
-from recon.joint.state_files import discard_states, read_state, write_state
+from recon.joint.state_files import _packed, discard_states, read_state, write_state
 
 
 def test_nested_values_come_back_as_they_were(tmp_path: Path) -> None:
@@ -52,6 +52,9 @@ def test_views_are_written_alone_and_whole_tensors_without_a_copy_of_their_stora
     stored = load_file(tmp_path / "state.safetensors")
     assert sum(each.size for each in stored.values()) == 4 + 3 + 10 + 50 + 50 + 25
     assert (tmp_path / "state.safetensors").stat().st_size < 2000
+    tensors: dict[str, torch.Tensor] = {}
+    _packed([shared, large], tensors)
+    assert [each.data_ptr() for each in tensors.values()] == [shared.data_ptr(), large.data_ptr()]
 
 
 def test_what_a_state_cannot_hold_and_what_is_no_state_are_refused(tmp_path: Path) -> None:

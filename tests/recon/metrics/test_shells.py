@@ -103,3 +103,18 @@ def test_a_curve_that_starts_below_has_no_reach_and_the_first_shell_does_not_cou
     assert resolution(frequency, np.array([0.1, 0.9, 0.9, 0.9, 0.9, 0.9]), 0.5) == 0.5
     assert resolution(frequency, np.array([1.0, 0.4, 0.9, 0.9, 0.2, 0.9]), 0.5) == 0.0
     assert resolution(frequency, np.array([1.0, 0.9, 0.5, 0.3, 0.9, 0.2]), 0.5) == pytest.approx(0.2)
+    # what only touches the threshold has not fallen below it
+    assert resolution(frequency, np.array([1.0, 0.9, 0.5, 0.9, 0.3, 0.2]), 0.5) == pytest.approx(0.3 + 0.1 * 4 / 6)
+    # a quarter of the way down from 0.8 to 0.4 is a quarter of the way from 0.1 to 0.18 cycles per voxel
+    assert resolution(np.array([0.0, 0.1, 0.18, 0.3]), np.array([1.0, 0.8, 0.4, 0.0]), 0.7) == pytest.approx(0.12)
+
+
+def test_the_rest_of_a_spectrum_that_fits_in_memory_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = np.random.default_rng(0).normal(size=(2, 8, 8, 8))
+    _, exact = fourier_shell_correlation(first, second)
+    size = np.fft.rfftn(first).nbytes
+    for memory, digits in ((size, 1e-14), (size - 1, 1e-5)):
+        monkeypatch.setattr("recon.metrics.metrics.IN_MEMORY", memory)
+        error = np.abs(fourier_shell_correlation(first, second)[1] - exact).max()
+        assert error < digits
+    assert error > 1e-10  # beyond, single precision takes half the room on the disk

@@ -193,6 +193,7 @@ def test_wrong_geometry_is_refused(options, words):
 def test_one_voxel_and_one_pixel_are_enough():
     one = SliceProjector(tilt_angles=0.0, depth=1, width=1, detector_width=1, dtype=torch.float64)
     assert float(one(torch.full((1, 1, 1), 3.0, dtype=torch.float64))) == pytest.approx(3.0)
+    assert (one.device, one.dtype) == (torch.device("cpu"), torch.float64)
 
 
 def test_wrong_shape_is_refused():
