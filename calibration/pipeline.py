@@ -49,6 +49,18 @@ class Findings:
         correlation: between the residuals of neighbouring pixels.
         repairs: what of the exposures was modelled before the detector was measured.
         pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None: none was.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> findings = calibration.calibrate_exposures(
+        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
+        ... )
+        >>> findings.verdict.grade, round(findings.figures.gain.median, 1), [score.name for score in findings.scores]
+        ('good', 2.0, ['gaussian'])
     """
 
     pairs: Sequence[AlignedPair]
@@ -87,6 +99,18 @@ def calibrate_exposures(
 
     Raises:
         ValueError: exposures that cannot be aligned, or a posterior that does not converge.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> findings = calibration.calibrate_exposures(
+        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
+        ... )
+        >>> findings.verdict.grade, round(findings.figures.read_noise.median)
+        ('good', 1)
     """
     measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, bar=bar)
     pixels = collect_pixels(measured.pairs, seed=seed)

@@ -5,7 +5,7 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "tutorials")]
 
 project = "noiseflow"
 author = "The noiseflow developers"
@@ -31,7 +31,10 @@ html_title = "noiseflow"
 
 
 def setup(app: Any) -> None:
-    """Write the reference of the commands before each build."""
+    """Write the reference of the commands and the notebooks before each build."""
     import command_reference
+    import notebooks
 
     app.connect("config-inited", command_reference.write)
+    app.connect("config-inited", notebooks.write_for_sphinx)
+    app.connect("source-read", notebooks.link)

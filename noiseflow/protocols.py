@@ -15,6 +15,11 @@ class NoiseModel(Protocol):
     """A conditional density p(observation | signal); an ``nn.Module``.
 
     `NoiseModelBase` is its full contract, with a default for everything but the call.
+
+    Example:
+        >>> import noiseflow
+        >>> isinstance(noiseflow.Poisson(), noiseflow.NoiseModel)
+        True
     """
 
     def __call__(self, signal: Tensor) -> NoiseDistribution:
@@ -35,6 +40,21 @@ class SignalModel(Protocol):
 
     Two methods are optional: ``signal()`` returns all pixels at once, flat, where that is cheaper than asking for them by
     index; ``penalty()`` returns a scalar added to the mean negative log-likelihood (a regulariser, already weighted).
+
+    Example:
+        >>> import noiseflow, torch
+        >>> class Plane(torch.nn.Module):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.slope = torch.nn.Parameter(torch.ones(2))
+        ...     def forward(self, pixels):
+        ...         return self.slope[0] * (pixels // 32) / 32 + self.slope[1] * (pixels % 32) / 32
+        >>> plane = Plane()
+        >>> rows = torch.arange(32.0)[:, None] / 32
+        >>> observation = 1.5 * rows + 0.5 * rows.T + 0.1 * torch.randn(32, 32, generator=torch.Generator().manual_seed(0))
+        >>> result = noiseflow.fit(noiseflow.Gaussian(), plane, observation, num_steps=200)
+        >>> [round(slope, 1) for slope in plane.slope.tolist()]
+        [1.5, 0.5]
     """
 
     def __call__(self, pixels: Tensor) -> Tensor:

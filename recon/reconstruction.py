@@ -40,6 +40,15 @@ class Reconstruction:
         uncertainty: error bars of the volume, where they were asked for.
         slices_at_once: slices of a block, at most; None where the volume was reconstructed whole.
         orientation: flips of the series before the fit; all other attributes are of the series as it was given.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> result = recon.reconstruct(series, recon.VolumeGrid.of(series, 16), method="sirt", num_steps=30)
+        >>> result.method, result.projections.shape, result.noise_model is None
+        ('sirt', (36, 16, 16), True)
     """
 
     volume: Volume

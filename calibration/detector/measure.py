@@ -62,6 +62,17 @@ class Detector:
         uneven: relative deviation of the pixels' own variances, at equal signal, in a burst of four frames or more; 0: none.
         codes: relative deviation (rms) of the widths of the converter's codes; 0: none.
         dark_deviation: of the dark frames over time, counts rms, without rounding; None without dark frames.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
+        >>> round(detector.line.gain, 1), round(detector.offset[0]), detector.misfit < 1.5
+        (2.0, 100, True)
     """
 
     posterior: DetectorPosterior
@@ -94,6 +105,17 @@ def measure_detector(
     Raises:
         NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.
         ValueError: the posterior does not converge.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> posterior = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True)).posterior
+        >>> round(posterior.gain.median, 1), round(posterior.offset.median), round(posterior.read_noise.median)
+        (2.0, 100, 1)
     """
     plain, cells = [], []
     for number, pair in enumerate(pairs):

@@ -93,6 +93,16 @@ class ModelScore:
         excess: nll above the best model's, nats per pixel.
         excess_error: its standard error, paired block by block.
         evaluation: divergences of the residuals' histogram from the model's own bin masses, each with its floor; PIT.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> (score,) = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian"])
+        >>> score.name, score.excess
+        ('gaussian', 0.0)
     """
 
     name: str
@@ -113,6 +123,16 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         pairs: aligned pairs.
         seed: of the choice of blocks.
         fraction: of the blocks kept apart.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> pixels = calibration.collect_pixels(pairs, fraction=0.25)
+        >>> pixels.observation.shape, float(pixels.held_out.mean())
+        ((24576,), 0.25)
     """
     parts = []
     for number, pair in enumerate(pairs):
@@ -176,6 +196,17 @@ def fit_models(
 
     Raises:
         ValueError: an unknown kind, or a model that cannot be fitted.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> pixels = calibration.collect_pixels(pairs)
+        >>> scores = calibration.fit_models(pixels, kinds=["gaussian", "poisson-gaussian"])
+        >>> [score.name for score in scores if score.excess < 0.02]
+        ['poisson-gaussian']
     """
     models = _fitted(sorted(kinds or _simple(pixels), key=_rank), pixels, detector, seed, device)
     if progress is not None:
@@ -220,7 +251,18 @@ def attainable(model: nn.Module, pixels: Pixels) -> float:
 
 
 def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
-    """The simplest model whose held-out likelihood lies within one standard error of the best one's."""
+    """The simplest model whose held-out likelihood lies within one standard error of the best one's.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> scores = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian", "poisson-gaussian"])
+        >>> calibration.simplest_sufficient(scores).name
+        'poisson-gaussian'
+    """
     return next(score for score in sorted(scores, key=lambda s: _rank(s.name)) if score.excess <= score.excess_error)
 
 

@@ -43,6 +43,17 @@ class PhotonTransfer:
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.
         chi_squared: of the points about the line per degree of freedom, with half a percent of the variance granted to the line.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from calibration.detector.levels import Readings
+        >>> rng = np.random.default_rng(0)
+        >>> electrons = np.linspace(20, 400, 20_000)
+        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> line = calibration.fit_photon_transfer([levels])
+        >>> round(line.gain, 1), line.signal.shape
+        (2.0, (16,))
     """
 
     signal: Image
@@ -71,6 +82,17 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
 
     Raises:
         NotMeasurable: the variance does not grow with the signal, so that no gain shows.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from calibration.detector.levels import Readings
+        >>> rng = np.random.default_rng(0)
+        >>> electrons = np.linspace(20, 400, 20_000)
+        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> line = calibration.fit_photon_transfer([levels])
+        >>> round(line.gain, 1)
+        2.0
     """
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)

@@ -63,6 +63,18 @@ class DetectorPosterior:
         rhat: potential scale reduction of the chain's walkers, or of the two halves of independent draws; the largest of three.
         num_steps: steps kept of a chain, or draws.
         levels: as sampled, about the most likely scales of their signals.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
+        >>> gain = detector.posterior.gain
+        >>> gain.q05 < 2.0 < gain.q95
+        True
     """
 
     samples: Image
@@ -134,6 +146,17 @@ def sample_posterior(
 
     Raises:
         ValueError: the chain has not converged; the message says how many steps it needs.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from calibration.detector.levels import Readings
+        >>> rng = np.random.default_rng(0)
+        >>> electrons = np.linspace(20, 400, 20_000)
+        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> posterior = calibration.sample_posterior([levels], offset=(100.0, 0.1))
+        >>> round(posterior.gain.median, 1), posterior.samples.shape[1]
+        (2.0, 3)
     """
     log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
     likely, kept = np.concatenate(log_posterior.parameters(best)), tuple(log_posterior.levels)

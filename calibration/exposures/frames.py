@@ -36,6 +36,15 @@ class ExposurePair:
     Raises:
         ValueError: a frame is not one grey image, too small, has NaN or infinite pixels, is flat or saturated; the two
             differ in size or are identical; the ratio is not above 1.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from scipy.ndimage import gaussian_filter
+        >>> scene = 1000 * gaussian_filter(np.random.default_rng(0).random((128, 128)), 2)
+        >>> short = np.random.default_rng(1).poisson(scene / 10)
+        >>> pair = calibration.ExposurePair(short, scene, exposure_ratio=10.0)
+        >>> pair.short.shape
+        (128, 128)
     """
 
     short: Image
@@ -72,6 +81,14 @@ class Burst:
 
     Raises:
         ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> calibration.Burst(frames).frames.shape
+        (6, 64, 64)
     """
 
     frames: Image
@@ -201,6 +218,13 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibrat
     Raises:
         FileNotFoundError: a file does not exist.
         ValueError: a file cannot be read, sizes differ, or `Burst` refuses the frames.
+
+    Example:
+        >>> import calibration, noiseflow, numpy as np, pathlib, tempfile
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> noiseflow.io.write(folder / "dark.tif", np.random.default_rng(0).poisson(100, (5, 32, 32)).astype(np.uint16))
+        >>> calibration.read_burst([folder / "dark.tif"], calibration=True).frames.shape
+        (5, 32, 32)
     """
     frames: list[NDArray[Any]] = []
     for path in paths:

@@ -67,6 +67,14 @@ class Registration:
         error_px: standard error of the transform, rms over the frame, from the noise of the short exposure.
         peak: height of the correlation at zero shift over its scatter at others.
         inverted: the two frames have opposite contrast.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from scipy.ndimage import gaussian_filter
+        >>> scene = 1000 * gaussian_filter(np.random.default_rng(0).random((128, 128)), 2)
+        >>> found = calibration.register(scene, 100 - scene)
+        >>> found.inverted, round(found.rotation)
+        (True, 0)
     """
 
     matrix: Image

@@ -40,6 +40,16 @@ class AlignedPair:
         counts: the pixels left out.
         exposure_ratio: as given; None if unknown.
         frames: of the burst whose mean is the signal; 1 for an exposure pair.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> pair = pairs[0]
+        >>> pair.observation.shape, pair.frames, float(pair.mask.mean())
+        ((64, 64), 6, 1.0)
     """
 
     short: Image
@@ -97,7 +107,18 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
-    """Warp and scale a pair whose transform is known already. Raises as `align_pair`."""
+    """Warp and scale a pair whose transform is known already. Raises as `align_pair`.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> from scipy.ndimage import gaussian_filter
+        >>> scene = 1000 * gaussian_filter(np.random.default_rng(0).random((128, 128)), 2)
+        >>> rng = np.random.default_rng(1)
+        >>> pair = calibration.ExposurePair(rng.poisson(scene / 10), rng.poisson(20 * scene))
+        >>> again = calibration.align_with(pair, calibration.align_pair(pair).registration)
+        >>> round(again.scaling.slope * 200)
+        1
+    """
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = (hot | dead | saturated(pair.long)).astype(float)

@@ -38,6 +38,15 @@ class BurstReport:
         dose_error: (frame,) standard errors.
         drifting: the frames were registered before they were compared.
         fading: the dose changes by more than its errors and `LEAST_DOSE_CHANGE`.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> _, report = calibration.align_burst(calibration.Burst(frames))
+        >>> report.drifting, report.fading, report.dose.round(2).tolist()
+        (False, False, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     """
 
     shift: Image
@@ -62,6 +71,15 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
 
     Raises:
         ValueError: too few pixels can be trusted.
+
+    Example:
+        >>> import calibration, noiseflow, torch
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, report = calibration.align_burst(calibration.Burst(frames))
+        >>> len(pairs), report.drifting
+        (6, False)
     """
     frames = burst.frames
     hot, dead = defects(frames)

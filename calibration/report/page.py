@@ -177,6 +177,17 @@ def write_report(
         title: of the page.
         inputs: files that were read, for their checksums.
         seed: of the random choices.
+
+    Example:
+        >>> import calibration, noiseflow, pathlib, tempfile, torch
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
+        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
+        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
+        >>> path.name
+        'report.html'
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

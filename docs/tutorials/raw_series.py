@@ -62,17 +62,17 @@ def _save(figure: Any, path: Path) -> None:
         figure.savefig(partial, dpi=60, facecolor="white")
 
 
-def main(raw_file: str, volume_file: str, told_file: str, folder: str) -> None:
+def main(raw_file: str, volume_file: str, summary_file: str, folder: str) -> None:
     """Draw both pictures and print the verdict."""
     raw = read_tilt_series(raw_file, mode="linear")
-    told = json.loads(Path(told_file).read_text(encoding="utf-8").strip().splitlines()[-1])
-    found = told["alignment"]
+    summary = json.loads(Path(summary_file).read_text(encoding="utf-8").strip().splitlines()[-1])
+    found = summary["alignment"]
     alignment = Alignment(found["tilt_axis_degrees"], np.array(found["shifts_yx_pixels"]), raw.tilt_angles)
     aligned = alignment.apply(raw)
     draw_alignment(raw, aligned, alignment, Path(folder) / "raw_series_alignment.png")
     volume = io.read(volume_file).data
-    draw_volume(aligned, volume, float(np.mean(told["response"]["offset"])), Path(folder) / "raw_series_volume.png")
-    print(told["verdict"]["grade"], *told["verdict"]["reasons"], sep="\n  - ")
+    draw_volume(aligned, volume, float(np.mean(summary["response"]["offset"])), Path(folder) / "raw_series_volume.png")
+    print(summary["verdict"]["grade"], *summary["verdict"]["reasons"], sep="\n  - ")
 
 
 if __name__ == "__main__":

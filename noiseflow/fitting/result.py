@@ -25,6 +25,14 @@ class FitResult:
         recoveries: how often a non-finite step was undone with half the learning rate.
         history: step → held-out NLL, in the order measured.
         table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> signal = torch.linspace(1.0, 5.0, 4000)
+        >>> observation = noiseflow.Gaussian(0.5)(signal).sample(generator=torch.Generator().manual_seed(0))
+        >>> result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
+        >>> round(result.held_out_nll, 1), result.num_steps
+        (0.7, 100)
     """
 
     noise_model: nn.Module

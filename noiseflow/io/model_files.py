@@ -38,6 +38,19 @@ def register(kind: Kind) -> Kind:
     Raises:
         TypeError: not a noise model, or an abstract one.
         ValueError: another class has that name already.
+
+    Example:
+        >>> import noiseflow, pathlib, tempfile, torch
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> @noiseflow.register
+        ... class FixedNoise(noiseflow.NoiseModelBase):
+        ...     def forward(self, signal):
+        ...         return torch.distributions.Normal(signal, torch.ones_like(signal))
+        ...     def config(self):
+        ...         return {}
+        >>> _ = noiseflow.save(FixedNoise(), folder / "fixed.safetensors")
+        >>> type(noiseflow.load(folder / "fixed.safetensors")).__name__
+        'FixedNoise'
     """
     if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
         raise TypeError(

@@ -45,6 +45,17 @@ class NoiseModelBase(Described, ABC):
 
     A model defines `forward`. Everything else has a default that serves any model; override what is known better, a property by
     a class attribute of the same name. What a property says holds for the model as a whole, models inside it included.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> class Laplace(noiseflow.NoiseModelBase):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.raw = torch.nn.Parameter(torch.zeros(()))
+        ...     def forward(self, signal):
+        ...         return torch.distributions.Laplace(signal, self.raw.exp().expand(signal.shape))
+        >>> Laplace()(torch.tensor([2.0, 3.0])).variance
+        tensor([2., 2.], grad_fn=<MulBackward0>)
     """
 
     @abstractmethod

@@ -20,6 +20,13 @@ class Digitisation(NamedTuple):
     Attributes:
         step: rounding step, detector units; 0 where pixel values are not rounded.
         low, high: clipping limits, detector units; infinite where there is none.
+
+    Example:
+        >>> import noiseflow
+        >>> detector = noiseflow.Digitisation(step=1.0, low=0.0, high=255.0)
+        >>> model = noiseflow.Digitised(noiseflow.Poisson(), *detector)
+        >>> model.low, model.high
+        (0.0, 255.0)
     """
 
     step: float = 0.0

@@ -27,6 +27,12 @@ class CoordinateNetwork(Field):
         layers: hidden layers.
         frequencies: octaves of the positional encoding.
         skip: hidden layers after which the encoding is handed in again; 0 for none.
+
+    Example:
+        >>> import recon, torch
+        >>> field = recon.CoordinateNetwork((8, 8, 8), width=16, layers=3, skip=2)
+        >>> field.volume().shape, bool((field.volume() >= 0).all())
+        (torch.Size([8, 8, 8]), True)
     """
 
     relative_rate = 0.005

@@ -26,6 +26,12 @@ class Field(Described, ABC):
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
         scale: attenuation per voxel that counts as one unit; a guess within a factor of ten serves.
+
+    Example:
+        >>> import recon, torch
+        >>> field = recon.VoxelField((4, 6, 8))
+        >>> isinstance(field, recon.Field), field.volume().shape
+        (True, torch.Size([4, 6, 8]))
     """
 
     measured_in = "attenuation per voxel"
@@ -118,7 +124,13 @@ class Field(Described, ABC):
 
 
 class VoxelField(Field):
-    """One free number per voxel."""
+    """One free number per voxel.
+
+    Example:
+        >>> import recon
+        >>> recon.VoxelField((4, 6, 8)).volume().shape  # (z, y, x)
+        torch.Size([4, 6, 8])
+    """
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__(shape, scale=scale)
@@ -143,6 +155,12 @@ class MultiresolutionField(Field):
 
     Args:
         coarsest: voxels along the longest side of the coarsest grid, at least.
+
+    Example:
+        >>> import recon
+        >>> field = recon.MultiresolutionField((8, 8, 8))
+        >>> field.volume().shape, len(list(field.parameters()))
+        (torch.Size([8, 8, 8]), 2)
     """
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, coarsest: int = 3) -> None:

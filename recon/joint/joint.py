@@ -71,6 +71,17 @@ class JointReconstructor:
         device: where to compute.
         run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` keeps what each has reached.
         prefix: of the names under which it does, where one run makes several volumes.
+
+    Example:
+        >>> import noiseflow, numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> noisy = recon.add_noise(series, noiseflow.Gaussian(0.02), seed=0)
+        >>> fit = recon.JointReconstructor(weight=0.5, noise_model=noiseflow.Gaussian, num_steps=20)
+        >>> result = fit(noisy, recon.VolumeGrid.of(noisy, 16))
+        >>> result.volume.attenuation.shape, type(result.noise_model).__name__
+        ((16, 16, 16), 'Gaussian')
     """
 
     weight: float | None = None

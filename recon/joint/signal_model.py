@@ -37,6 +37,13 @@ class TomographySignal(Described):
 
     Raises:
         ValueError: an occupancy for another projector.
+
+    Example:
+        >>> import recon, torch
+        >>> projector = recon.SliceProjector(tilt_angles=[-30.0, 0.0, 30.0], depth=8, width=8)
+        >>> model = recon.TomographySignal(recon.VoxelField((8, 4, 8)), projector, recon.Transmission(intensity=100.0))
+        >>> model(torch.tensor([0, 1, 2])).shape, model.signal().shape
+        (torch.Size([3]), torch.Size([96]))
     """
 
     def __init__(

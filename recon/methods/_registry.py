@@ -110,6 +110,12 @@ class Method:
         learns_noise: whether its result has a noise model.
         plan: the stages of its fit, and the slices of the slab that choices are made on; None where nothing is planned.
         blockwise: settles what all slices share; None where slices cannot be reconstructed apart.
+
+    Example:
+        >>> from recon.methods import find_method
+        >>> sirt = find_method("sirt")
+        >>> sirt.name, sirt.learns_noise
+        ('sirt', False)
     """
 
     name: str

@@ -20,6 +20,11 @@ class Transmission(Described):
 
     Raises:
         ValueError: an intensity that is not positive.
+
+    Example:
+        >>> import recon, torch
+        >>> recon.Transmission(intensity=100.0)(torch.tensor([[[0.0, 1.0]]])).round().tolist()  # (tilt, u, y)
+        [[[100.0, 37.0]]]
     """
 
     offset: Tensor
@@ -80,6 +85,11 @@ class Linear(Described):
 
     Raises:
         ValueError: a gain or unit of zero, or one that is not finite.
+
+    Example:
+        >>> import recon, torch
+        >>> recon.Linear(gain=10.0, offset=3.0)(torch.tensor([[[0.0, 0.5]]])).tolist()  # (tilt, u, y)
+        [[[3.0, 8.0]]]
     """
 
     gain: Tensor

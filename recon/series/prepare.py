@@ -35,6 +35,15 @@ class Prepared:
         tilt_series: aligned, by rising angle, without the tilts that do not belong.
         screening: how well every tilt fits the others, in the order of the series as given.
         alignment: of the raw images, in the order of the series as given; None where they were not moved.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> prepared = recon.prepare(series)
+        >>> prepared.tilt_series.num_tilts, prepared.alignment is None
+        (36, True)
     """
 
     tilt_series: TiltSeries

@@ -173,6 +173,12 @@ class Volume:
     Attributes:
         attenuation: (z, y, x), per voxel, an array or a tensor.
         voxel_size: Å, or None where unknown.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> volume = recon.Volume(np.zeros((4, 6, 8)), voxel_size=10.0)
+        >>> volume.attenuation.shape, volume.voxel_size
+        ((4, 6, 8), 10.0)
     """
 
     attenuation: NDArray[np.float32]
@@ -297,7 +303,16 @@ def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.floa
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
-    """Write the stack, and its angles to a ``.rawtlt`` file beside it; returns the angle file's path."""
+    """Write the stack, and its angles to a ``.rawtlt`` file beside it; returns the angle file's path.
+
+    Example:
+        >>> import numpy as np, pathlib, recon, tempfile
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> series = recon.TiltSeries(np.random.default_rng(0).random((3, 8, 8)), [-30.0, 0.0, 30.0], mode="linear")
+        >>> _ = recon.write_tilt_series(folder / "tilts.mrc", series)
+        >>> recon.read_tilt_series(folder / "tilts.mrc", mode="linear").tilt_angles.tolist()
+        [-30.0, 0.0, 30.0]
+    """
     path = Path(path)
     size = tilt_series.pixel_size
     io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
