@@ -31,6 +31,13 @@ STEADY = 0.003
 LEAST_FRAMES = 8
 """Frames from which on a pixel's own variance is known to a factor of 1.5, so that a map of it tells something."""
 
+SURE = 10.0
+"""Standard errors by which the pixels' variances must differ: the logarithm of a variance of two frames has heavier tails than
+that error allows for."""
+
+LEAST_READ = 0.01
+"""Share of the usual variance below which no pixel's read noise is put: rounding hides less."""
+
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance need dark frames."""
 
@@ -45,7 +52,7 @@ class Camera:
         verdict: how far they can be believed.
         maps: (y, x) by name: ``offset`` counts, ``variance`` counts² in darkness, ``response`` relative, ``gain`` counts per
             electron if all pixels catch light alike, ``defects`` 1 where a pixel stands out of all others.
-        model: noise model with the maps of offset and response.
+        model: noise model with the maps of offset, response and, where the dark frames tell one, read-noise variance.
     """
 
     figures: CameraFigures
@@ -130,16 +137,18 @@ def maps_of(figures: CameraFigures) -> dict[str, Image]:
 
 
 def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.Module:
-    """The noise model of raw frames: that of a mean pixel, seen through the maps of offset and response.
+    """The noise model of raw frames: that of a mean pixel, seen through the maps of offset, response and read-noise variance.
 
-    Its signals are those of a mean pixel; what the maps cannot carry, such as pixels without response, is clipped.
+    Its signals are those of a mean pixel; what the maps cannot carry, such as pixels without response, is clipped. A detector
+    that multiplies electrons reads all pixels through one amplifier, so that it has no map of variance.
     """
     import noiseflow
 
     offset = figures.offset or 0.0
     read = figures.dark_noise.median if figures.dark_noise else 1.0
-    excess = figures.excess_factor
+    excess, variance = figures.excess_factor, read_variance(figures, step)
     if excess is not None and excess.q05 > EXCESS:
+        variance = None
         register_gain = figures.gain.median / excess.median
         inner: nn.Module = noiseflow.ExcessNoise(
             register_gain, offset, read * figures.gain.median / register_gain, excess_factor=excess.median
@@ -150,8 +159,40 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     digitised = noiseflow.Digitised(inner, step=step, high=max(ends, default=np.inf)) if step or ends else inner
     response = np.clip(maps["response"], 0.01, None)
     return noiseflow.WithMaps(
-        digitised, gain=response, offset=maps.get("offset", np.full(response.shape, offset)) - response * offset
+        digitised,
+        gain=response,
+        offset=maps.get("offset", np.full(response.shape, offset)) - response * offset,
+        variance=variance,
     )
+
+
+def read_variance(figures: CameraFigures, step: float) -> Image | None:
+    """(y, x) read-noise variance, counts², as well as the dark frames tell it; None where the pixels do not differ, or without
+    dark frames.
+
+    A variance of few frames scatters by itself. Its logarithm scatters by more where the pixels differ; the scaled inverse χ²
+    distribution of that spread is the prior, and the posterior's mean is returned (doi:10.2202/1544-6115.1027).
+
+    Args:
+        figures: of the camera.
+        step: of rounding, counts; its variance is not read noise.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import digamma, polygamma
+
+    if figures.dark is None:
+        return None
+    freedom = figures.dark.frames - 1
+    measured = np.maximum(figures.dark.noise, max(step**2 / 12, 1e-6 * float(figures.dark.noise.mean())))
+    logarithm = np.log(measured) - digamma(freedom / 2) + np.log(freedom / 2)
+    own = float(polygamma(1, freedom / 2))
+    excess, error = float(np.var(logarithm)) - own, own * np.sqrt(2 / measured.size)
+    if excess < SURE * error:
+        return None
+    prior = 2 * brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
+    usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))
+    whole = (prior * usual + freedom * measured) / (prior + freedom)
+    return np.asarray(np.maximum(whole - step**2 / 12, LEAST_READ * usual))
 
 
 def map_path(model: Path, name: str) -> Path:

@@ -42,7 +42,7 @@ from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_pois
 from noiseflow.distributions.normal import log_normal_cdf, log_normal_interval
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-_RESOLVED = 1.5
+RESOLVED = 1.5  # electrons: a read noise below which the sum is taken
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
 
@@ -55,7 +55,7 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
         rate: expected electrons, ≥ 0, float64.
         read_noise: scalar, electrons, float64.
     """
-    if _most(read_noise) < _RESOLVED:
+    if _most(read_noise) < RESOLVED:
         return _lattice_log_density(residual, rate, read_noise)
     line = saddle_point(residual, rate, read_noise)
     one = torch.ones_like(line)
@@ -72,7 +72,7 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
         twice: take the contour in any case, because the sum needs incomplete gamma functions, which have no second derivative.
     """
     upper = residual.detach() > 0
-    if not twice and _most(read_noise) < _RESOLVED:
+    if not twice and _most(read_noise) < RESOLVED:
         return _lattice_log_tail(residual, rate, read_noise, upper)
     side = torch.where(upper, 1.0, -1.0).to(residual)
     saddle = saddle_point(residual, rate, read_noise)
@@ -99,7 +99,7 @@ def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice:
 def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
     """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite; `twice` as in `log_tail`."""
     width = high - low
-    if _most(read_noise) < _RESOLVED:
+    if _most(read_noise) < RESOLVED:
         narrow = width.detach() <= 3
         direct = _lattice_log_interval
     else:
@@ -162,7 +162,7 @@ def _ways(read_noise: float) -> list[tuple[Callable[..., Tensor], Callable[..., 
     if read_noise > MOST_READ_NOISE:
         return [smooth, everything]
     narrow = (is_narrow, cell_and_slopes)
-    if read_noise >= _RESOLVED:
+    if read_noise >= RESOLVED:
         return [narrow, smooth, everything]
     peaks = (is_near_peak, peaks_and_slopes)
     return [narrow, peaks, everything] if read_noise >= LEAST_READ_NOISE else [peaks, everything]

@@ -121,10 +121,10 @@ class Pixels:
 
     def parts(self, size: int) -> list[Self]:
         """Distributions of `size` consecutive pixels each, of a batch with one axis."""
-        split: dict[int, tuple[Tensor, ...]] = {}
+        split: dict[int, tuple[Tensor, tuple[Tensor, ...]]] = {}  # with the tensor, so that no other one gets its id
 
         def part(index: int) -> Taking:
-            return lambda tensor, rest: split.setdefault(id(tensor), torch.split(tensor, size))[index]
+            return lambda tensor, rest: split.setdefault(id(tensor), (tensor, torch.split(tensor, size)))[1][index]
 
         count = self.batch_shape[0]
         starts = range(0, count, size)

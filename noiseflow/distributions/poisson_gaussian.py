@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.electrons import interval_and_slopes, log_both_tails, log_density, log_interval
+from noiseflow.distributions.electrons import (
+    RESOLVED,
+    interval_and_slopes,
+    log_both_tails,
+    log_density,
+    log_interval,
+)
 from noiseflow.distributions.pixelwise import pixelwise
 
 
@@ -88,7 +95,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
         gain, offset, read_noise: scalars, float64: counts per electron, counts, electrons rms.
     """
 
-    per_pixel = ("signal",)
+    per_pixel: ClassVar[tuple[str, ...]] = ("signal",)
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
@@ -145,3 +152,46 @@ class PoissonGaussianDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.gain**2 * (self.rate + self.read_noise**2)
+
+
+class UnevenPoissonGaussian(PoissonGaussianDistribution):
+    """As `PoissonGaussianDistribution`, of pixels that have a read noise of their own.
+
+    Args:
+        signal: clean pixel values, detector units, any shape.
+        gain, offset: scalars, float64.
+        read_noise: electrons rms, float64, shape of the signal.
+    """
+
+    per_pixel: ClassVar[tuple[str, ...]] = ("signal", "read_noise")
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return pixelwise(_by_read_noise(_log_density), value, *self.law)
+
+    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        below, above = (pixelwise(_by_read_noise(part), value, *self.law) for part in (_log_below, _log_above))
+        return below, above
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return pixelwise(_by_read_noise(_log_below), value, *self.law).exp()
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return pixelwise(_by_read_noise(_log_interval), low, high, *self.law)
+
+
+def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A function of single pixels and last of their read noises, called apart for those that resolve electrons and for others:
+    the two take different ways to the same law."""
+
+    def parted(*inputs: Tensor, twice: bool = False) -> Tensor:
+        resolved = inputs[-1].detach() < RESOLVED
+        if bool(resolved.all()) or not bool(resolved.any()):
+            return function(*inputs, twice=twice)
+        parts = [
+            function(*(each[chosen] if each.ndim else each for each in inputs), twice=twice)
+            for chosen in (resolved, ~resolved)
+        ]
+        found = torch.zeros_like(inputs[-1], dtype=parts[0].dtype)
+        return found.masked_scatter(resolved, parts[0]).masked_scatter(~resolved, parts[1])
+
+    return parted

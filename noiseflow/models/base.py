@@ -93,6 +93,21 @@ class NoiseModelBase(Described, ABC):
         """The axis of an image, −1 or −2, along which pixels share a random offset; None where pixels are independent."""
         return None
 
+    def at_read_noise(self, signal: Any, read_noise: Tensor) -> NoiseDistribution:
+        """As `forward`, of pixels that have a read noise of their own in place of the model's.
+
+        Args:
+            signal: as in `forward`.
+            read_noise: of each pixel, detector units rms, shape of the signal.
+
+        Raises:
+            ValueError: the model has no read noise of single pixels.
+        """
+        raise ValueError(
+            f"{type(self).__name__} has no read noise that pixels could have of their own; use a PoissonGaussian, or leave "
+            "the map of variance out"
+        )
+
     # Rounding and clipping
 
     @property

@@ -55,6 +55,9 @@ class Digitised(ModelAround):
     def forward(self, signal: Signal) -> DigitisedDistribution:
         return DigitisedDistribution(self, self.model(given_to(self.model, signal)), values_of(signal))
 
+    def at_read_noise(self, signal: Signal, read_noise: Tensor) -> DigitisedDistribution:
+        return DigitisedDistribution(self, self.model.at_read_noise(given_to(self.model, signal), read_noise))
+
     def without_rails(self) -> Digitised:
         """The same detector with the same model inside, rounding but never clipping."""
         return Digitised(self.model, step=self.step)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
+from noiseflow.distributions.poisson_gaussian import UnevenPoissonGaussian
 from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
@@ -84,6 +85,11 @@ class PoissonGaussian(ElectronCounter):
     def forward(self, signal: Tensor) -> PoissonGaussianDistribution:
         """The distribution of observations of pixels with the given signals, any shape, detector units."""
         return PoissonGaussianDistribution(signal, *self._parameters_now())
+
+    def at_read_noise(self, signal: Tensor, read_noise: Tensor) -> UnevenPoissonGaussian:
+        gain, offset, _ = self._parameters_now()
+        electrons = (read_noise.double() / gain).clamp(min=_LEAST_READ_NOISE).expand(signal.shape)
+        return UnevenPoissonGaussian(signal, gain, offset, electrons)
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
         """Start at the most likely of many detectors with the variances of the (N,) signals and observations.

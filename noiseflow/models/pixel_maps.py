@@ -1,4 +1,4 @@
-"""Detectors whose pixels have gains and offsets of their own."""
+"""Detectors whose pixels have gains, offsets and read noises of their own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from noiseflow.models.base import NoiseModelBase
 
 
 class WithMaps(ModelAround):
-    """A noise model seen through a detector whose pixels have gains and offsets of their own.
+    """A noise model seen through a detector whose pixels have gains, offsets and, where known, read noises of their own.
 
     observation = gain·o + offset, o drawn from the model at the clean signal: signals are those of an ideal pixel (gain 1,
     offset 0), as after a flat-field correction; observations are raw. The maps are known and not fitted.
@@ -26,10 +26,12 @@ class WithMaps(ModelAround):
         model: the noise model of an ideal pixel.
         gain: (y, x) relative gains, positive; 1 by default.
         offset: (y, x) offsets, detector units; 0 by default.
-        shape: (y, x) size of the maps where neither is given.
+        variance: (y, x) or a number, variance of raw observations in darkness before rounding, detector units², in place of the
+            read noise of the model inside, which is then a `PoissonGaussian`, perhaps `Digitised`; by default the model's own.
+        shape: (y, x) size of the maps where none is given.
 
     Raises:
-        ValueError: no map, maps of different sizes, not finite, or gains that are not positive.
+        ValueError: no map, maps of different sizes, not finite, or gains or variances that are not positive.
 
     Example:
         >>> import noiseflow, torch
@@ -42,46 +44,65 @@ class WithMaps(ModelAround):
     needs_image = True
     gain: Tensor
     offset: Tensor
+    variance: Tensor | None
 
     def __init__(
         self,
         model: nn.Module,
         gain: Tensor | NDArray[Any] | None = None,
         offset: Tensor | NDArray[Any] | None = None,
+        variance: Tensor | NDArray[Any] | float | None = None,
         *,
         shape: Sequence[int] | None = None,
     ) -> None:
         super().__init__(model)
-        sizes = [tuple(each.shape) for each in (gain, offset) if each is not None] or [tuple(shape or ())]
+        given = [each for each in (gain, offset, variance) if each is not None and not isinstance(each, (int, float))]
+        sizes = [tuple(each.shape) for each in given] or [tuple(shape or ())]
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:
-            raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or two of one size")
+            raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or maps of one size")
         self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
         self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
-        given = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
-        if not all(bool(torch.isfinite(each).all()) for each in given):
+        alike = isinstance(variance, (int, float))  # so too where a file is opened, whose maps come later
+        known = torch.full(sizes[0], float(variance)) if isinstance(variance, (int, float)) else variance
+        self.register_buffer("variance", None if known is None else floating(known).detach().clone())
+        checked = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
+        checked += [] if self.variance is None or alike else [self.variance.log()]
+        if not all(bool(torch.isfinite(each).all()) for each in checked):
             raise ValueError(
-                "some gains are not positive, or gains or offsets are NaN; mend or mask these pixels' maps"
+                "some gains or variances are not positive, or some values are NaN; mend or mask these pixels' maps"
             )
 
     def forward(self, signal: Signal) -> NoiseDistribution:
         """The distribution of raw readings.
 
         Raises:
-            ValueError: a flat signal, or images of another size than the maps.
+            ValueError: a flat signal, images of another size than the maps, or a map of variance around a model that has no
+                read noise.
         """
-        base: NoiseDistribution = self.model(given_to(self.model, signal))
-        return base.rescaled(*self._at(signal))
+        gain, offset = self._at(signal)
+        inner = given_to(self.model, signal)
+        if self.variance is None:
+            base: NoiseDistribution = self.model(inner)
+        else:
+            base = self.model.at_read_noise(inner, self._of_pixels(self.variance, signal).sqrt() / gain)
+        return base.rescaled(gain, offset)
+
+    @staticmethod
+    def _of_pixels(values: Tensor, signal: Signal) -> Tensor:
+        """A map at the pixels of a signal."""
+        found = values.reshape(-1)[signal.place] if isinstance(signal, PickedSignal) else values
+        return found.to(values_of(signal).dtype)
 
     def _at(self, signal: Signal) -> tuple[Tensor, Tensor]:
-        dtype = values_of(signal).dtype
+        """Gain and offset at the pixels of a signal."""
         if isinstance(signal, PickedSignal):
-            return self.gain.reshape(-1)[signal.place].to(dtype), self.offset.reshape(-1)[signal.place].to(dtype)
+            return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
         require_image(signal, "every pixel has a gain and an offset of its own")
         if signal.shape[-2:] != self.gain.shape:
             raise ValueError(
                 f"images are {tuple(signal.shape[-2:])} pixels and the maps {tuple(self.gain.shape)}; crop them"
             )
-        return self.gain.to(dtype), self.offset.to(dtype)
+        return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
         """Standardise the model inside on the readings of ideal pixels."""
@@ -93,7 +114,7 @@ class WithMaps(ModelAround):
 
     def config(self) -> dict[str, Any]:
         """The arguments that make this model again, besides the model inside and the maps."""
-        return {"shape": list(self.gain.shape)}
+        return {"shape": list(self.gain.shape)} | ({} if self.variance is None else {"variance": 1.0})
 
     def extra_repr(self) -> str:
         return f"maps of {self.gain.shape[0]} x {self.gain.shape[1]} pixels"

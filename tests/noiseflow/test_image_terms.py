@@ -57,6 +57,80 @@ def test_fit_behind_maps_finds_the_noise_of_ideal_pixels() -> None:
     assert math.exp(result.noise_model.model.log_scale.item()) == pytest.approx(0.1, rel=0.03)
 
 
+@pytest.mark.parametrize("inner", [lambda: Gaussian(3.0), lambda: Digitised(noiseflow.PoissonGaussian(2.0, 90.0, 1.0))])
+def test_large_image_behind_maps_has_the_likelihood_of_its_parts(inner) -> None:  # type: ignore[no-untyped-def]
+    """It is computed in pieces, each of which needs its own part of each map."""
+    (gain, offset), signal, half = maps(520, 520), 100 + 20 * scene(520, 520), 260
+    variance = torch.exp(normal(520, 520, seed=5)) if not isinstance(inner(), Gaussian) else None
+    model = WithMaps(inner().double(), gain, offset, variance)
+    observation = (gain * signal + offset).round()
+    with torch.no_grad():
+        whole = model(signal).log_prob(observation)
+        for rows in (slice(0, half), slice(half, None)):
+            own = None if variance is None else variance[rows]
+            part = WithMaps(inner().double(), gain[rows], offset[rows], own)
+            assert torch.allclose(whole[rows], part(signal[rows]).log_prob(observation[rows]), atol=1e-9)
+
+
+VARIANCES = torch.tensor([[0.05, 1.0, 8.0, 40.0], [400.0, 3.0, 0.3, 90.0]], dtype=torch.float64)
+
+
+def test_read_noise_of_single_pixels_is_that_of_detectors_of_their_own() -> None:
+    """Pixels that resolve electrons and pixels that do not, side by side."""
+    signal = torch.tensor([[3.0, 9.0, 30.0, 5.0], [60.0, 3.5, 400.0, 3.0]], dtype=torch.float64)
+    gain, offset = torch.linspace(0.8, 1.3, 8, dtype=torch.float64).reshape(2, 4), 5 * torch.ones(2, 4)
+    model = WithMaps(noiseflow.PoissonGaussian(2.0, 3.0, 1.0), gain, offset.double(), VARIANCES)
+    observation = (model(signal).mean + torch.tensor(1.7)).requires_grad_()
+    found = model(signal).log_prob(observation)
+    for place in np.ndindex(2, 4):
+        own = math.sqrt(VARIANCES[place]) / (float(gain[place]) * 2.0)
+        alone = WithMaps(noiseflow.PoissonGaussian(2.0, 3.0, own), gain, offset.double())
+        assert found[place].item() == pytest.approx(alone(signal).log_prob(observation)[place].item(), abs=1e-7)
+    slope = torch.autograd.grad(found.sum(), observation)[0]
+    ahead, behind = (model(signal).log_prob(observation + step) for step in (1e-4, -1e-4))
+    assert torch.allclose(slope, (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+def test_density_with_a_map_of_variance_integrates_to_one_and_the_sampler_agrees(rounded: bool) -> None:
+    gain, offset = torch.linspace(0.8, 1.3, 8).reshape(2, 4).double(), torch.linspace(-5, 5, 8).reshape(2, 4).double()
+    inner: torch.nn.Module = noiseflow.PoissonGaussian(2.0, 100.0, 1.0)
+    model = WithMaps(Digitised(inner, low=90.0) if rounded else inner, gain, offset, VARIANCES)
+    signal = torch.tensor([[100.0, 104.0, 130.0, 102.0], [160.0, 103.0, 110.0, 300.0]], dtype=torch.float64)
+    law = model(signal)
+    step = 1.0 if rounded else 0.02
+    values = torch.arange(0.0, 700.0, step, dtype=torch.float64)
+    mass = step * law.log_prob(values[:, None, None].expand(-1, 2, 4)).exp().sum(0)
+    assert torch.allclose(mass, torch.ones_like(mass), atol=1e-5)
+    draws = law.sample((20_000,), generator=torch.Generator().manual_seed(0))
+    for check in (check_quantiles, check_moments):
+        check(law, draws)
+    free = WithMaps(inner, gain, offset, VARIANCES)(signal)
+    expected = VARIANCES + (gain * 2.0) ** 2 * (signal - 100.0) / 2.0
+    assert torch.allclose(free.variance, expected)
+
+
+def test_model_file_keeps_the_map_of_variance_and_has_none_where_there_is_none(tmp_path: Path) -> None:
+    from safetensors import safe_open
+
+    camera, gain = noiseflow.PoissonGaussian(2.0, 100.0, 1.0), torch.ones(2, 4)
+    path = noiseflow.save(WithMaps(Digitised(camera), gain, variance=VARIANCES.float()), tmp_path / "maps.safetensors")
+    again = noiseflow.load(path)
+    assert torch.equal(again.variance, VARIANCES.float())
+    signal = torch.full((2, 4), 130.0)
+    assert again(signal).variance.std() > 10
+    plain = noiseflow.save(WithMaps(Digitised(camera), gain), tmp_path / "plain.safetensors")
+    with safe_open(plain, framework="pt") as file:  # as files of earlier versions
+        assert not any("variance" in name for name in file.keys())  # noqa: SIM118
+        assert "variance" not in file.metadata()["model"]
+    assert noiseflow.load(plain).variance is None
+
+
+def test_map_of_variance_needs_a_model_with_read_noise() -> None:
+    with pytest.raises(ValueError, match="Gaussian has no read noise"):
+        WithMaps(Gaussian(), variance=torch.ones(3, 4))(torch.zeros(3, 4))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -64,6 +138,8 @@ def test_fit_behind_maps_finds_the_noise_of_ideal_pixels() -> None:
         ({"gain": torch.ones(3, 4), "offset": torch.zeros(4, 3)}, "of one size"),
         ({"gain": torch.zeros(3, 4)}, "not positive"),
         ({"offset": torch.full((3, 4), math.nan)}, "NaN"),
+        ({"gain": torch.ones(3, 4), "variance": torch.zeros(3, 4)}, "not positive"),
+        ({"gain": torch.ones(3, 4), "variance": torch.ones(4, 3)}, "of one size"),
     ],
 )
 def test_impossible_maps_are_refused(arguments: dict[str, torch.Tensor], message: str) -> None:

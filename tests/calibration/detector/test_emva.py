@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 import noiseflow
 from calibration.camera import calibrate_camera, write_maps
@@ -98,6 +99,49 @@ def test_model_and_maps_of_a_camera_describe_its_raw_frames(tmp_path):
     assert drawn.var(axis=0, ddof=1).mean() == pytest.approx(4 * (3000 + 9), rel=0.02)
     for written in write_maps(found, path):
         assert read(written).data.shape == SHAPE
+
+
+def uneven_camera(generator, shape=(64, 64)):
+    """A function of electrons and number of frames: bursts of an sCMOS camera whose pixels differ in all; and their read noise,
+    electrons."""
+    read = 2.0 * generator.lognormal(0.0, 0.7, shape)
+    response, offset = 1 + 0.02 * generator.standard_normal(shape), 100 + 3 * generator.standard_normal(shape)
+
+    def frames(electrons: float, number: int) -> Burst:
+        made = [
+            sim.exposed(generator, electrons * response, gain=2.0, offset=offset, read_noise=read)
+            for _ in range(number)
+        ]
+        return Burst(np.stack(made), calibration=True)
+
+    return frames, read
+
+
+@pytest.mark.parametrize("number", [4, 16])
+def test_saved_model_of_an_scmos_camera_has_the_read_noise_of_each_pixel(tmp_path, number):
+    frames, read = uneven_camera(np.random.default_rng(3))
+    flats, dark = [frames(level, 4) for level in (20.0, 200.0, 1000.0)], frames(0.0, number)
+    found = calibrate_camera(flats, [dark])
+    model = noiseflow.load(noiseflow.save(found.model, tmp_path / "camera.safetensors", units="counts"))
+    truth, again = (2 * read) ** 2, model.variance.numpy()
+    assert np.corrcoef(np.log(again).ravel(), np.log(truth).ravel())[0, 1] > (0.7 if number == 4 else 0.9)
+    signal = torch.full((64, 64), float(found.figures.offset) + 2 * 2.0, dtype=torch.float64)
+    held_out = torch.from_numpy(frames(2.0, 2).frames[0])
+    measured = np.maximum(found.maps["variance"] - 1 / 12, 0.04)
+    others = [noiseflow.WithMaps(model.model, model.gain, model.offset, other) for other in (None, measured)]
+    with torch.no_grad():
+        nats, alike, unsmoothed = (float(one(signal).log_prob(held_out).mean()) for one in (model, *others))
+        draws = model(signal).sample((400,), generator=torch.Generator().manual_seed(0))
+    assert nats > alike + 0.02
+    assert nats > unsmoothed - (0.0 if number == 4 else 0.005)  # many frames need no smoothing, and lose nothing by it
+    assert torch.equal(draws, draws.round())
+    own, expected = draws.var(0).numpy() - 1 / 12, again + model.gain.numpy() * 2.0**2 * 2.0
+    assert np.mean(own / expected) == pytest.approx(1.0, abs=0.03)
+    assert np.corrcoef(own.ravel(), expected.ravel())[0, 1] > 0.95
+
+
+def test_pixels_of_equal_read_noise_get_no_map_of_it():
+    assert calibrate_camera(camera(2)[0], camera(2)[1][:1]).model.variance is None
 
 
 def test_levels_are_stacks_or_runs_of_equal_single_frames(tmp_path):
