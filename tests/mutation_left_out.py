@@ -8,8 +8,8 @@ from __future__ import annotations
 PANELS = "how wide panels are: test_it_multiplies_as_the_dense_matrix_does takes widths from one column to all of them"
 SPEED = "how much is computed at once: speed and memory only"
 GUESS = (
-    "where a search begins and its first steps: test_the_maximum_found_is_the_maximum finds the same maximum to a thousandth of a "
-    "nat from five places, only the number of steps differs"
+    "where a search begins and its first steps: test_the_maximum_found_is_the_maximum finds the same maximum to a thousandth "
+    "of a nat from five places, only the number of steps differs"
 )
 FINER = (
     "how fine a rule is that has long converged: the result is the same to more digits than any test or user asks for"
