@@ -62,7 +62,9 @@ class ArrayDistribution:
             if masked is not None:
                 numbers = np.where(masked, np.float32("nan"), np.asarray(numbers))
             tensor = as_tensor(numbers).to(self._like.device)
-            narrow = tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
+            narrow = (
+                tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
+            )
             bare.append(tensor if narrow else tensor.to(self._like.dtype))  # narrow numbers know which limit they were
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():

@@ -5,20 +5,24 @@ What changes is the text of the operator or number, or ``numbers``: each number 
 
 from __future__ import annotations
 
+PANELS = "how wide panels are: test_it_multiplies_as_the_dense_matrix_does takes widths from one column to all of them"
 SPEED = "how much is computed at once: speed and memory only"
-GUESS = "where a search begins: the maximum found is the same (test_log_posterior), only the number of steps differs"
+GUESS = (
+    "where a search begins and its first steps: test_the_maximum_found_is_the_maximum finds the same maximum to a thousandth "
+    "of a nat from five places, only the number of steps differs"
+)
 FINER = (
     "how fine a rule is that has long converged: the result is the same to more digits than any test or user asks for"
 )
 SAFE = "stands in where the value is not used, so that a gradient of nothing is not NaN: any ordinary number would do"
 BOTH = "where one formula takes over from another: both are exact there (tested on both sides)"
+KIND = "of this tensor the number type and the device are taken over, nothing else (`Pixels._set_kind`)"
 RNG = "seed of the package's own random choices: another seed is another, equally good choice"
 
 LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     "noiseflow/distributions/transforms.py": [
         ("small = t < 1e-3", "numbers", BOTH),
         ("small = t < 1e-3", "t < 0.001", BOTH),
-        ("clamp(max=80.0)", "numbers", "beyond exp(80) only that it stays finite counts"),
         ("torch.where(x < 0, self.left, self.right)", "x < 0", "at 0 the map is 0 with slope 1 whatever the weight"),
         ("torch.where(y < 0, self.left, self.right)", "y < 0", "at 0 the map is 0 with slope 1 whatever the weight"),
         ("torch.where(q > 0,", "q > 0", "at q = 0 both forms are the same number"),
@@ -41,6 +45,9 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("-torch.ones_like(low) - high.detach().abs(), low)", "-torch.ones_like(low) - high.detach().abs()", SAFE),
         ("unbounded | (ratio >= 0), -torch", "ratio >= 0", "a ratio of 0 is that of an empty interval"),
         ("unbounded | (ratio >= 0), -torch", "numbers", "a ratio of 0 is that of an empty interval"),
+        ("unbounded | (ratio >= 0), -torch", "-torch.ones_like(ratio)", SAFE),
+        ("torch.special.erfcx(-x.clamp(max=0)", "0", SAFE),
+        ("torch.special.ndtr(x.clamp(min=0))", "0", SAFE),
         ("return torch.where(x <= 0, left, right)", "x <= 0", "at 0 both forms are the same number"),
         ("far = x < -1e4", "numbers", BOTH),
         ("far = x < -1e4", "x < -10000.0", BOTH),
@@ -51,8 +58,10 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
         ("num_steps: int = 60", "numbers", FINER),
         ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
+        ("like=torch.empty(0,", "numbers", KIND),
     ],
     "noiseflow/distributions/digitised.py": [
+        ("like=torch.empty(0,", "numbers", KIND),
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
         ("_ROUNDINGS = 8", "numbers", "slack for rounding errors, of which one or two occur"),
         ("_MOST_LEVELS = 2**16", "numbers", SPEED),
@@ -80,6 +89,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_WORTHWHILE = 0.7", "numbers", SPEED),
         ("stalled = size %", "numbers", SPEED),
         ("stalled = size %", "size % len(SIZES) > 0", SPEED),
+        ("stalled = size %", "size - 1", SPEED),
         ("stalled = size %", "self.error > _WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
         ("stalled = size %", "_WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
         ("signal_low + 1e-6 * (1 + abs(signal_low))", "numbers", "only that a range of one signal has some width"),
@@ -105,6 +115,9 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     ],
     "recon/projection/projector.py": [
         ("_PANEL = 32", "numbers", SPEED),
+        ("panels = shape[::-1] if whole", "numbers", PANELS),
+        ("shape, panel=panels[0]).to", "numbers", PANELS),
+        ("shape[::-1], panel=panels[1]).to", "1", PANELS),
         (
             "abs(cosine) >= abs(sine)",
             "abs(cosine) >= abs(sine)",
@@ -139,6 +152,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("for factor in (0.5, 0.7, 0.85", "numbers", GUESS),
         ("for fraction in (0.02, 0.1, 0.3", "numbers", GUESS),
         ("low + 0.1, high - 0.1", "numbers", GUESS),
+        ("low + 0.1, high - 0.1", "low + 0.1", GUESS),
+        ("low + 0.1, high - 0.1", "high - 0.1", GUESS),
+        ("1e-3 * line.gain**2", "line.gain ** 2", GUESS),
+        ("1e-3 * line.gain**2", "0.001 * line.gain ** 2", GUESS),
+        ("known = [log_posterior.offset[0]]", "0", GUESS),
         ("np.array_split(coordinates, 7)", "numbers", SPEED),
     ],
 }

@@ -95,9 +95,10 @@ def test_bars_fit_a_terminal_and_tell_rate_and_time(name: str, good: Path, tmp_p
 def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(console, "_LOG_SECONDS", -1.0)
     for more in ([], ["--json"]):
-        with pytest.raises(SystemExit):
+        with pytest.raises(SystemExit) as ended:
             main([*words(name, good, tmp_path), *more])
         printed = capsys.readouterr()
+        assert not ended.value.code, printed.err
         lines = re.findall(r"^\S.*: \d+/\d+, [\d.e-]+ steps/s, [\d.]+ (?:s|min|h) left.*$", printed.err, re.MULTILINE)
         assert bool(lines) != bool(more), printed.err
         assert "\x1b" not in printed.out + printed.err

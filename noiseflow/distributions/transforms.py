@@ -199,8 +199,8 @@ class Spline:
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
         """The knots of the given numbers."""
         if self.between is not None:
-            row, weight = self.between
-            return between_rows(knots.reshape(-1), row * knots.shape[-1] + index, weight, step=knots.shape[-1])
+            (row, weight), (_, count) = self.between, knots.shape
+            return between_rows(knots.reshape(-1), row * count + index, weight, step=count)
         index = index + torch.zeros(knots.shape[:-1], dtype=torch.long, device=index.device)
         return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
 

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.projection.saved_gradient import SavedGradient
 from recon.projection.tile import Tile
 
 
-class TileVariation(torch.autograd.Function):
+class TileVariation(SavedGradient):
     """The sum over all voxels, of which only listed ones and the empty ones just before them add anything."""
 
     @staticmethod
@@ -35,11 +36,6 @@ class TileVariation(torch.autograd.Function):
             below = flows[2][:, -1]
         ctx.save_for_backward(gradient)
         return total
-
-    @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * outer, None, None
 
 
 def _differences(values: Tensor, tile: Tile, above: Tile | None) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""The calibration's results page says what its JSON says, and the JSON what the kept trials say."""
+"""The calibration's JSON of results says what the kept trials say."""
 
 from __future__ import annotations
 
@@ -10,11 +10,6 @@ from typing import Any
 import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
-
-
-@pytest.fixture(autouse=True)
-def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
 
 
 def content() -> dict[str, Any]:
@@ -29,12 +24,6 @@ def benchmark() -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def test_page_agrees_with_its_json() -> None:
-    import calibration_page
-
-    assert calibration_page.PAGE.read_text(encoding="utf-8") == calibration_page.page(content())
 
 
 def test_a_part_that_is_not_measured_is_said_to_be_so() -> None:

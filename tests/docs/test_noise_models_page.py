@@ -1,4 +1,4 @@
-"""The noise models' results page says what its JSON says; the known noises are what they claim; rivals are densities."""
+"""The known noises are what they claim; rivals are densities."""
 
 from __future__ import annotations
 
@@ -14,20 +14,9 @@ import torch
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
-@pytest.fixture(autouse=True)
-def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-
 def content() -> dict[str, Any]:
     found: dict[str, Any] = json.loads((BENCHMARKS / "results" / "noise_models.json").read_text(encoding="utf-8"))
     return found
-
-
-def test_page_agrees_with_its_json() -> None:
-    import noise_page
-
-    assert noise_page.PAGE.read_text(encoding="utf-8") == noise_page.page(content())
 
 
 def test_figure_draws_from_part_of_the_rows(tmp_path: Path) -> None:

@@ -11,11 +11,6 @@ BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 NAMES = ("run_time.md", "paper_table.md", "ablations.md", "needle.md")
 
 
-@pytest.fixture(autouse=True)
-def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_page_agrees_with_its_json(name: str) -> None:
     import rivals

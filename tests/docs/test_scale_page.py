@@ -1,8 +1,7 @@
-"""The scale benchmark: its page says what its JSON says, and its measures of volumes and processes are right."""
+"""The scale benchmark's measures of volumes and processes are right."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,6 @@ import pytest
 from noiseflow import io
 from recon.metrics.metrics import compare
 from recon.scale.blocks import HALO, blocks
-
-BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
-
-
-@pytest.fixture(autouse=True)
-def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-
-def test_pages_agree_with_their_json() -> None:
-    import scale_page
-
-    content = json.loads((BENCHMARKS / "results" / "scale.json").read_text(encoding="utf-8"))
-    assert (BENCHMARKS / "scale.md").read_text(encoding="utf-8") == scale_page.page(content)
-    assert (BENCHMARKS / "scale_estimates.md").read_text(encoding="utf-8") == scale_page.estimates(content)
 
 
 def test_a_seam_is_the_jump_across_a_border() -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from recon.fields.regularisers.base import Regulariser
+from recon.projection.saved_gradient import SavedGradient
 
 _LAYERS = 8  # along z at a time: what is computed for them stays in the cache
 
@@ -43,7 +44,7 @@ class SecondOrderVariation(Regulariser):
         return f"SecondOrderVariation(curvature={self.curvature:g}, smoothing={self.smoothing:g})"
 
 
-class _Variation(torch.autograd.Function):
+class _Variation(SavedGradient):
     """The gradient comes in the same pass, a few layers at a time; layers of vacuum cost nothing."""
 
     @staticmethod
@@ -57,11 +58,6 @@ class _Variation(torch.autograd.Function):
                 total += _add(part, own, curvature, smoothing, gradient[first:last])
         ctx.save_for_backward(gradient)
         return total
-
-    @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * outer, None, None
 
 
 def _add(part: Tensor, own: slice, curvature: float, smoothing: float, gradient: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
 from recon.fields.regularisers.base import Regulariser
+from recon.projection.saved_gradient import SavedGradient
 from recon.projection.tiles import Tiles
 
 
@@ -62,7 +63,7 @@ def total_variation(volume: Given, *, smoothing: float) -> Given:
     return alike(value, volume)
 
 
-class _TotalVariation(torch.autograd.Function):
+class _TotalVariation(SavedGradient):
     @staticmethod
     def forward(ctx: Any, volume: Tensor, smoothing: float) -> Tensor:
         differences = [torch.zeros_like(volume) for _ in range(3)]
@@ -81,11 +82,6 @@ class _TotalVariation(torch.autograd.Function):
             gradient.narrow(axis, 1, inner.shape[axis]).add_(inner)
         ctx.save_for_backward(gradient)
         return total
-
-    @staticmethod
-    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * outer, None
 
 
 def _inner(array: Tensor, axis: int) -> Tensor:

@@ -163,8 +163,10 @@ def test_the_maximum_found_is_the_maximum_and_the_search_begins_near_it(name):
     assert gain == pytest.approx(2.0, rel=0.04)
     assert offset_found == pytest.approx(300.0 if name == "dim" else 100.0, abs=2.5)
     assert read_noise == pytest.approx(2.0 if make is not with_dark and name != "lit" else 1.5, rel=0.15)
-    again, same = maximum_likelihood(posterior, start=(2.1, offset_found + 0.5, 1.7))
-    assert float(again(same)[0]) == pytest.approx(highest, abs=0.02)
+    # wherever the search begins: guesses and first steps decide how long it takes, not where it ends
+    for factor, shift, start in ((1.05, 0.5, 1.7), (0.75, -20.0, 4.0), (1.5, 10.0, 0.7), (0.5, -5.0, 3.0)):
+        again, same = maximum_likelihood(posterior, start=(factor * gain, offset_found + shift, start))
+        assert float(again(same)[0]) == pytest.approx(highest, abs=1e-3)
 
 
 @pytest.mark.parametrize(("factor", "change"), [(1.03, 0.0), (1.0, 3.0)])

@@ -158,3 +158,5 @@ def test_far_tails_of_the_inverse_stay_finite() -> None:
     back, ladj = tail.inverse(torch.tensor([8.0, 100.0], dtype=torch.float64))
     assert float(back[0]) == pytest.approx(math.sqrt(math.expm1(64.0)), rel=1e-12)
     assert bool(torch.isfinite(back).all() & torch.isfinite(ladj).all())
+    single = StudentTail(torch.tensor(1.0), torch.tensor(1.0)).inverse(torch.tensor([100.0]))
+    assert all(bool(torch.isfinite(each).all()) for each in single)

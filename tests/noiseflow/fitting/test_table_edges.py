@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import noiseflow
+from noiseflow.distributions.tabulated import SIZES
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 
 
@@ -176,13 +177,25 @@ def test_few_levels_are_columns_so_that_nothing_is_interpolated_along_them() -> 
     assert found._columns is None
 
 
-def test_levels_that_serve_badly_as_columns_make_way_for_residuals() -> None:
+@pytest.mark.parametrize("waves", [150.0, 600.0])
+def test_levels_that_serve_badly_as_columns_make_way_for_residuals(waves: float) -> None:
     """Ripples along the residual: rows would have to be as fine as they are."""
-    model, observation = Wavy(600.0), (256 * spread()).round() / 256
+    model, observation = Wavy(waves), (256 * spread()).round() / 256
     found = ObservationTable(model, observation, 0.0, 1.0)
     assert found._columns is not None
     assert found.error <= 1e-3
     assert error_of(found, model, observation) < 1.5e-3
+    # no finer than for observations between the levels
+    assert found.state()["size"] == len(SIZES) + ObservationTable(model, spread(), 0.0, 1.0).state()["size"]
+
+
+def test_the_finest_table_is_not_made_again_where_it_is_not_fine_enough() -> None:
+    model, observation = Wavy(1200.0), spread()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    state = found.state()
+    assert state["size"] == len(SIZES) - 1
+    assert found.check(model) > 1e-3
+    assert found.state()["laid_out_for"] is state["laid_out_for"]
 
 
 def test_a_single_level_and_a_single_signal_have_a_table() -> None:
@@ -198,6 +211,8 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     narrow = ObservationTable(model, observation, 0.5, 0.5)
     assert narrow.high > narrow.low
     assert narrow.high - narrow.low < 1e-5
+    distant = ObservationTable(model, observation - 1000, -1000.0, -1000.0)
+    assert torch.tensor(distant.high) > torch.tensor(distant.low)  # in single precision
 
 
 def test_some_pixels_are_looked_up_as_all_of_them() -> None:
