@@ -151,6 +151,17 @@ def test_gallery_shows_every_program_and_its_small_picture() -> None:
     assert all(picture.stat().st_size < 150_000 for picture in pictures)
 
 
+def test_every_screenshot_is_taken_by_the_script_and_shown() -> None:
+    script = (ROOT / "docs" / "screenshots.py").read_text(encoding="utf-8")
+    guide = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    pictures = sorted((ROOT / "docs" / "images" / "screenshots").glob("*.png"))
+    assert len(pictures) >= 6
+    for picture in pictures:
+        assert f'"{picture.stem}"' in script
+        assert f"images/screenshots/{picture.name})" in guide
+        assert picture.stat().st_size < 200_000
+
+
 def test_settings_of_the_pages_name_installed_extensions_only() -> None:
     pytest.importorskip("sphinx", reason="needs the extra [docs]")
     settings = runpy.run_path(str(ROOT / "docs" / "conf.py"))

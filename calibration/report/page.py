@@ -75,7 +75,10 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     """One or two sentences: which model suffices, and by how much the others fail."""
     chosen = simplest_sufficient(scores)
     simpler = [score for score in scores[: list(scores).index(chosen)] if np.isfinite(score.excess)]
-    text = f"The {LABELS[chosen.name]} model suffices: no model predicts the pixels kept apart better beyond its error."
+    text = (
+        f"The {LABELS[chosen.name]} model suffices: it is the simplest whose likelihood of held-out pixels is within one "
+        "standard error of the best."
+    )
     if simpler:
         nearest = min(simpler, key=lambda score: score.excess)
         text += (

@@ -18,12 +18,12 @@ RIVALS = {
 Row = dict[str, Any]
 
 _COLOURS = {
-    "automatic": "#d62728",
-    "RadialFlow": "#1f77b4",
-    "SplineFlow": "#17becf",
-    "PhysicsFlow": "#2ca02c",
-    "zuko": "#9467bd",
-    "normflows": "#e377c2",
+    "automatic": "#D55E00",
+    "RadialFlow": "#0072B2",
+    "SplineFlow": "#56B4E9",
+    "PhysicsFlow": "#009E73",
+    "zuko": "#CC79A7",
+    "normflows": "#E69F00",
     "paper": "#7f7f7f",
 }
 
@@ -67,7 +67,7 @@ def _draw_accuracy(axis: Any, rows: list[Row]) -> None:
 
 
 def _draw_speed(axis: Any, rows: list[Row]) -> None:
-    for place, what, goal, colour in ((0, "sample", 1.5, "#1f77b4"), (1, "log_prob", 3.0, "#ff7f0e")):
+    for place, what, goal, colour in ((0, "sample", 1.5, "#0072B2"), (1, "log_prob", 3.0, "#D55E00")):
         found = [row for row in ordered(rows) if row["what"] == what and row["device"] == "cpu"]
         y = [SPEED_MODELS.index(row["model"]) + 0.36 * place - 0.18 for row in found]
         ratios = [row["later"] / row["yardstick"] for row in found]

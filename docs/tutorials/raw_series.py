@@ -31,7 +31,7 @@ def draw_alignment(raw: TiltSeries, aligned: TiltSeries, alignment: Alignment, p
         show_image(axis, raw.images[number], f"raw, {raw.tilt_angles[number]:.0f}°")
         down, right = (np.array([height, width]) - 1) / 2 + alignment.shifts[number]
         reach = 0.45 * width * np.array([-1, 1])
-        axis.plot(right - reach * np.sin(theta), down + reach * np.cos(theta), color="orange", linewidth=1)
+        axis.plot(right - reach * np.sin(theta), down + reach * np.cos(theta), color="#E69F00", linewidth=1)
     show_image(axes[0, 3], raw.images[:, :, width // 2], "raw: one column, tilt by tilt")
     show_image(axes[0, 4], aligned.images[:, aligned.images.shape[1] // 2], "aligned: one row, tilt by tilt")
     _save(figure, path)

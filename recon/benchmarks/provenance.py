@@ -38,16 +38,23 @@ def measured_on(contents: Iterable[dict[str, Any]]) -> str:
     """Markdown: the commits, dates and machines of the cells of some results."""
     contents = list(contents)
     cells = [cell for content in contents for cell in content["cells"].values()]
-    origins = Counter((cell.get("commit") or "an earlier commit, not recorded", cell.get("date", "")) for cell in cells)
+    origins = Counter((_origin(cell), cell.get("date", "")) for cell in cells)
     lines = [
-        f"- commit {commit}" + (f", {day}" if day else "") + f" ({count} row{'s' if count > 1 else ''})"
-        for (commit, day), count in sorted(origins.items(), key=lambda item: item[0][1])
+        f"- {origin}" + (f", {day}" if day else "") + f" ({count} row{'s' if count > 1 else ''})"
+        for (origin, day), count in sorted(origins.items(), key=lambda item: item[0][::-1])
     ]
     for machine_ in (machine_ for content in contents for machine_ in content["machines"]):
         versions = ", ".join(f"{name} {version}" for name, version in machine_["versions"].items())
         cores = f"{machine_['cores']} cores, {machine_['threads']} torch threads"
         lines.append(f"- {machine_['processor']}, {cores}; Python {machine_['python']}, {versions}")
     return "Measured on:\n\n" + "\n".join(dict.fromkeys(lines))
+
+
+def _origin(cell: dict[str, Any]) -> str:
+    """The commit that a row was measured on; of older rows the one that recorded them, which is that of the code or the next."""
+    if "recorded" in cell:
+        return f"recorded by commit {cell['recorded']}, measured on the code shortly before it"
+    return f"commit {cell['commit']}" if cell.get("commit") else "an earlier commit, not recorded"
 
 
 def machine() -> dict[str, Any]:

@@ -6,7 +6,9 @@ found by looking at the truth in a search that is not counted, which favours the
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -75,12 +77,13 @@ def own_sirt(scene: Scene) -> Iterator[Point]:
         yield f"{count} iterations", seconds, volume.numpy()
 
 
-def fitted(scene: Scene, reconstructor: JointReconstructor, steps: Iterable[int]) -> Iterator[Point]:
-    """Whole fits of different lengths."""
+def fitted(scene: Scene, reconstructor: JointReconstructor, steps: Iterable[int | None]) -> Iterator[Point]:
+    """Whole fits of different lengths; None is the length that users get."""
     for count in steps:
         started = time.perf_counter()
         result = replace(reconstructor, num_steps=count)(scene.noisy)
-        yield f"{count} steps", time.perf_counter() - started, result.volume.attenuation
+        setting = "default settings" if count is None else f"{count} steps"
+        yield setting, time.perf_counter() - started, result.volume.attenuation
 
 
 def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
@@ -140,6 +143,7 @@ def curves(scene: Scene, results: Results, key: str, effort: Effort) -> dict[str
         ready = replace(reconstructor, weight=best["weight"], estimate_response=best["estimate_response"])
         found[name] = lambda r=ready: fitted(scene, r, effort.steps)  # type: ignore[misc]
     found["joint"] = lambda: fitted(scene, JointReconstructor(), effort.steps)
+    found["joint, default settings"] = lambda: fitted(scene, JointReconstructor(), (None,))
     found["joint, voxels"] = lambda: fitted(scene, JointReconstructor(make_field=VoxelField), effort.steps)
     if not missing("astra"):
         found["ASTRA SIRT"] = lambda: astra_sirt(scene.noisy, scene.grid, ITERATIONS)
@@ -220,10 +224,10 @@ def summary(results: Results, size: int) -> dict[str, list[dict[str, Any]]]:
 
 
 def table(curves_of_methods: dict[str, list[dict[str, Any]]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows: the best point of each curve and the first that comes within 0.2 dB of it."""
+    """Header and rows: the best point of each finished curve and the first that comes within 0.2 dB of it."""
     rows: list[tuple[str, ...]] = []
     for name, points in curves_of_methods.items():
-        if not points:
+        if not points or unfinished(points):
             continue
         best = max(points, key=lambda point: point["psnr affine"])
         near = next(point for point in points if point["psnr affine"] >= best["psnr affine"] - 0.2)
@@ -243,13 +247,24 @@ def table(curves_of_methods: dict[str, list[dict[str, Any]]]) -> tuple[tuple[str
     return header, rows
 
 
+def unfinished(points: list[dict[str, Any]]) -> str:
+    """How far a curve came whose time ran out, such as "4 of 400000 steps"; empty where it ended by itself."""
+    last = points[-1]["setting"] if points else ""
+    numbers = re.fullmatch(r"(\d+) of (\d+) steps", last)
+    return last if numbers and numbers[1] != numbers[2] else ""
+
+
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
+"""Okabe and Ito's: eyes that confuse red and green tell them apart. Methods beyond seven differ by their markers."""
+
+
 def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
-    """Error against time on one set of axes; the oracle's best is a line."""
+    """Error against time on one set of axes; the oracle's best is a line, and unfinished curves are dotted."""
     from noiseflow.report import new_figure
 
     figure, axes = new_figure(1, width=10.5, height=5.2)
     axis = axes[0][0]
-    colours = iter(["#0b5fa5", "#d1495b", "#2a9d5c", "#e08e0b", "#7b4fb0", "#3d3d3d", "#0aa3a3", "#b05f7b", "#8a8a00"])
+    looks = itertools.product("os^D", _COLOURS)
     for name, points in curves_of_methods.items():
         seconds, psnr = ([point[key] for point in points] for key in ("seconds", "psnr affine"))
         if not points:
@@ -266,9 +281,11 @@ def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
                 label="WBP, window by window" if name == "WBP hann" else None,
             )
         else:
-            bold = name == "joint"
-            style = {"linewidth": 2.6 if bold else 1.3, "marker": "o", "markersize": 5 if bold else 3.5}
-            axis.plot(seconds, psnr, color=next(colours), label=name, **style)
+            bold, stopped = name == "joint", unfinished(points)
+            marker, colour = next(looks)
+            style = {"linewidth": 2.6 if bold else 1.3, "marker": marker, "markersize": 5 if bold else 3.5}
+            style |= {"linestyle": ":", "label": f"{name}, unfinished: {stopped}"} if stopped else {"label": name}
+            axis.plot(seconds, psnr, color=colour, **style)
     axis.set(xscale="log", xlabel="wall time (s)", ylabel="PSNR of the volume, affinely matched (dB)", title=title)
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))

@@ -53,7 +53,7 @@ def _quantile_chart(
 ) -> Figure:
     level = np.array([signal[group].mean() for group in groups])
     data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
-    figure, axis = new_chart("Noise by signal", x="signal, detector units", y="reading − signal")
+    figure, axis = new_chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
     model = _model_quantiles(noise_model, level)
     for number, share in enumerate(_QUANTILES):
         middle = share == 0.5
@@ -84,7 +84,7 @@ def _histogram(noise_model: nn.Module, signal: Pixels, observation: Pixels, *, l
     counts = np.histogram(residual, inner)[0]
     width = inner[1] - inner[0]
     ends = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (signal.min(), signal.max()))
-    figure, axis = new_chart(f"signal {' … '.join(ends)}", x="reading − signal", y="density")
+    figure, axis = new_chart(f"signal {' … '.join(ends)}", x="pixel value − signal", y="density")
     axis.stairs(counts / (residual.size * width), inner, fill=True, color=COLOURS["data"], label="data")
     axis.stairs(masses / width, inner, color=COLOURS["accent"], linewidth=1.6, label="model")
     axis.set_yscale("log")

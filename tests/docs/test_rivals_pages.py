@@ -18,6 +18,16 @@ def test_page_agrees_with_its_json(name: str) -> None:
     assert (BENCHMARKS / name).read_text(encoding="utf-8") == rivals.PAGES[name](rivals.RESULTS)
 
 
+def test_run_time_page_leads_with_what_users_get_and_ranks_no_unfinished_curve() -> None:
+    import rivals
+
+    page = rivals.run_time(rivals.RESULTS)
+    assert page.index("With default settings") < page.index("| method | at its best with")
+    assert "79 tilts | joint |" in page
+    assert "| kniesel2022" not in page
+    assert "kniesel2022: 4 of 400000 steps" in page
+
+
 def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:
     import rivals
 
@@ -44,3 +54,14 @@ def test_a_page_shows_a_changed_figure_and_the_rows_that_are_missing(tmp_path: P
     assert "| WBP | 0.25 | 25.000 | 2.500 | 12.35 |" in page
     assert "Not measured yet: SIRT, L2, noisy images" in page
     assert "cell, clipped noise, 16³, seed 0" in page
+
+
+def test_rows_of_earlier_days_name_the_commit_that_recorded_them() -> None:
+    import record_commits
+
+    new, old = {"psnr": 2.0}, {"psnr": 1.0, "load": 1.4}
+    versions = [("ccc", "day 3", {"a": new, "b": old}), ("bbb", "day 2", {"a": new}), ("aaa", "day 1", {"a": old})]
+    assert record_commits.first_with("a", new | {"recorded": "later"}, versions) == ("bbb", "day 2")
+    assert record_commits.first_with("b", old, versions) == ("ccc", "day 3")
+    with pytest.raises(ValueError, match="commit the results first"):
+        record_commits.first_with("a", {"psnr": 3.0}, versions)

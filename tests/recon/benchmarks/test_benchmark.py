@@ -20,7 +20,7 @@ from recon.benchmarks import rivals as benchmark_rivals
 from recon.benchmarks.defocus import defocused_scene
 from recon.benchmarks.external import _cut, _oriented, _padded, astra_sirt, missing
 from recon.benchmarks.network import fit_network
-from recon.benchmarks.rivals import Effort, best_cutoff, curves, own_sirt, summary, table
+from recon.benchmarks.rivals import Effort, best_cutoff, curves, fitted, own_sirt, summary, table, unfinished
 from recon.benchmarks.scenes import Results, in_turn, make_scene, plain
 from recon.benchmarks.search import Best, best, best_fit
 from recon.commands.benchmark import benchmark
@@ -97,7 +97,7 @@ def test_every_rival_is_ready_at_its_searched_setting(tmp_path, monkeypatch):
     scene, effort = make_scene(16, **TINY), Effort(steps=(3,), weights=(0.2,), refine=0, repeats=1)
     results = Results(tmp_path / "r.json", "rivals")
     ready = curves(scene, results, "16", effort)
-    assert {"SIRT", "WBP hann", "L2 + TV", "joint", "joint, voxels"} <= set(ready)
+    assert {"SIRT", "WBP hann", "L2 + TV", "joint", "joint, default settings", "joint, voxels"} <= set(ready)
     assert results.cells["16/search/L2 + TV"]["weight"] == 0.2
     points = list(ready["L2 + TV"]())
     assert [setting for setting, _, _ in points] == ["3 steps"]
@@ -111,6 +111,35 @@ def test_both_sirts_agree():
     theirs = {setting: volume for setting, _, volume in astra_sirt(scene.noisy, scene.grid, (4, 16))}
     for setting, volume in theirs.items():
         assert np.corrcoef(volume.ravel(), ours[setting].ravel())[0, 1] > 0.995
+
+
+def test_a_curve_that_was_cut_short_is_not_ranked():
+    def curve(*settings):
+        return [
+            {"setting": each, "seconds": 1.0, "psnr raw": 9.0, "psnr affine": 9.0, "mse affine": 0.1}
+            for each in settings
+        ]
+
+    found = {"short": curve("1 of 9 steps", "4 of 9 steps"), "whole": curve("4 of 9 steps", "9 of 9 steps"), "none": []}
+    assert [row[0] for row in table(found)[1]] == ["whole"]
+    assert [unfinished(points) for points in found.values()] == ["4 of 9 steps", "", ""]
+    legend = benchmark_rivals.draw(found, "a title").axes[0].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["short, unfinished: 4 of 9 steps", "whole"]
+
+
+def test_a_fit_with_default_settings_is_left_its_number_of_steps():
+    scene, asked = SimpleNamespace(noisy=None), []
+
+    @dataclass(frozen=True)
+    class Fit:
+        num_steps: int = 5
+
+        def __call__(self, _):
+            asked.append(self.num_steps)
+            return SimpleNamespace(volume=Volume(np.zeros((2, 2, 2), np.float32)))
+
+    assert [setting for setting, _, _ in fitted(scene, Fit(), (3, None))] == ["3 steps", "default settings"]
+    assert asked == [3, None]
 
 
 def test_volumes_of_other_programs_are_turned_the_right_way():
