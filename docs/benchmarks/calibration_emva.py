@@ -100,7 +100,7 @@ def by_emva1288(flats: list[Stack], dark: Stack, light: list[float]) -> Found:
     from emva1288.process.results import Results1288
 
     if not hasattr(np, "asfarray"):  # version 1.0.2 was written for NumPy 1
-        np.asfarray = lambda values: np.asarray(values, float)  # type: ignore[attr-defined]
+        setattr(np, "asfarray", lambda values: np.asarray(values, float))  # noqa: B010
 
     def temporal(frames: Stack) -> dict[str, Any]:
         one = routines.get_int_imgs(list(frames[:2].astype(np.int64)))
