@@ -26,7 +26,7 @@ def page(content: Part) -> str:
         f"Written by `{COMMAND} page` from `results/calibration.json`. Trials are kept line by line in "
         "`results/calibration_rows`; a run that was stopped goes on where it was."
     )
-    parts = {"registration": _registration, "parameters": _parameters, "real": _real, "speed": _speed}
+    parts = {"registration": _registration, "parameters": _parameters, "real": _real, "emva": _emva, "speed": _speed}
     return "\n\n".join([head, *(_part(name, make, content) for name, make in parts.items())]) + "\n"
 
 
@@ -118,6 +118,31 @@ def _real(found: Part) -> str:
         f"{shares['still_pixels']:.0%} of pixels where the scene stands still."
     )
     return f"## Real detectors\n\n{text}"
+
+
+def _emva(found: Part) -> str:
+    tools = ("truth", "noiseflow", "emva1288", "getframes")
+    rows = [
+        [camera, label, *(_figure(one[tool].get(name)) for tool in tools)]
+        for camera, one in found["cameras"].items()
+        for name, label in found["names"].items()
+    ]
+    text = (
+        f"`python docs/benchmarks/calibration_emva.py`, commit {found['commit']}. The packages emva1288 (the standard's reference "
+        f"implementation) and getframes measure the same frames: flats at {found['levels']} levels up to 1.2 saturation "
+        f"capacities, {found['frames']} frames each, and {found['darks']} dark frames, 200² pixels; levels of which half the "
+        "pixels are at the converter's end are left out. The emva1288 package takes two frames of each level for temporal "
+        "noise; its linearity error is the mean of the absolute deviations over the standard's range, and it reports their "
+        "extremes. Saturation is the level of largest variance, so that it comes in steps of the levels (7.5 %). noiseflow's "
+        "largest SNR is the largest measured, near a full well that cuts the noise; emva1288's is the root of its capacity. "
+        "The preset's read noise of the sCMOS camera is that of its usual pixel, both packages report the rms of all. "
+        "getframes extends its line to nine tenths of the level of largest variance, where single pixels saturate already."
+    )
+    return f"## EMVA 1288\n\n{text}\n\n{table(['camera', 'figure', *tools], rows)}"
+
+
+def _figure(value: float | None) -> str:
+    return "–" if value is None or value != value else f"{value:.4g}"
 
 
 def _speed(found: Part) -> str:
