@@ -1,4 +1,4 @@
-"""Fourier shell correlation: of two methods with the truth, and of the volumes of even and of odd tilts."""
+"""Fourier shell correlation: with the truth, inside the band that error bars expect, and of even with odd tilts."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def draw():
     def volume(series, method, **settings):
         return recon.reconstruct(series, recon.VolumeGrid.of(series, 48), method=method, **settings).volume.attenuation
 
-    joint = recon.reconstruct(noisy, recon.VolumeGrid.of(noisy, 48), method="joint")
+    joint = recon.reconstruct(noisy, recon.VolumeGrid.of(noisy, 48), method="joint", uncertainty=16)
     curves = {
         "joint fit with the truth": (joint.volume.attenuation, truth, BLUE),
         "SIRT with the truth": (volume(noisy, "sirt", num_steps=40), truth, ORANGE),
@@ -31,6 +31,9 @@ def draw():
         ),
     }
     figure, axes = new_figure(width=6.5, height=4)
+    band = joint.uncertainty.shells
+    label = "joint fit, expected from its error bars"
+    axes[0, 0].fill_between(band.frequency, band.low, band.high, color=BLUE, alpha=0.2, lw=0, label=label)
     for name, (first, second, colour) in curves.items():
         axes[0, 0].plot(*recon.fourier_shell_correlation(first, second), color=colour, label=name)
     for level in (0.5, 0.143):

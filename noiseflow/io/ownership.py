@@ -1,9 +1,9 @@
 """Which files this program wrote: each carries its mark, and what carries none is not overwritten unasked.
 
 The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` among a Zarr group's attributes,
-the format's name in a safetensors file, ``Software`` in a PNG file, and ``generator`` in a page. An ``.npy`` header has no place
-for words: ours is padded to 1024 bytes, which every reader skips and no other program writes. Angles belong to the stack beside
-them.
+the format's name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table. An
+``.npy`` header has no place for words: ours is padded to 1024 bytes, which every reader skips and no other program writes. Angles
+belong to the stack beside them.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ def is_own(path: Path) -> bool:
         return head[:10] == npy_start()
     if kind == ".png":
         return b"tEXtSoftware\0" + MARK.encode() in head
+    if kind == ".csv":
+        return head.startswith(f"# {MARK} ".encode())
     return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,7 @@ def compare(
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
+    from recon.commands.measure import read_shell_band
     from recon.metrics.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
     from recon.metrics.metrics import reach_in_words
     from recon.series.tilt_series import Volume
@@ -38,11 +40,15 @@ def compare(
     tilt_angles = None if angles is None else io.read_angles(angles)
     with progress_bar("comparing", NUM_STEPS, json_mode=json) as progress:
         comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
+    comparison = replace(comparison, expected=read_shell_band(volume))
     header, rows = error_table(comparison)
     output.table(header, rows)
     for threshold in THRESHOLDS:
         reach = reach_in_words(comparison.crossings[threshold], threshold, second.voxel_size)
         output.line(f"Fourier shell correlation {reach}")
+    if comparison.expected is not None:
+        reach = comparison.expected.in_words(second.voxel_size)
+        output.line(f"its error bars expect 0.5 to be reached at {reach}")
     page = None
     if report is not None:
         report.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,7 @@ from noiseflow.commands.console import JsonOption, Output
 if TYPE_CHECKING:
     from recon.series.tilt_series import Volume
     from recon.uncertainty.result import Uncertainty
+    from recon.uncertainty.shell_band import ShellBand
 
 
 def measure(
@@ -24,7 +25,7 @@ def measure(
 ) -> None:
     """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals where it has error bars.
 
-    Error bars are the files VOLUME_std and VOLUME_bias that `noiseflow reconstruct --uncertainty 16` writes.
+    Error bars are the files VOLUME_std, VOLUME_bias and VOLUME_fsc.csv that `noiseflow reconstruct --uncertainty 16` writes.
     """
     from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
     from recon.uncertainty.result import quantile
@@ -34,7 +35,7 @@ def measure(
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
     mean = mean_of_region(values, part, bars, level=level)
-    rows, result = [("mean attenuation per voxel", mean.in_words())], {"mean": vars(mean)}
+    rows, result = [("mean attenuation per voxel", mean.in_words())], dict[str, Any](mean=vars(mean))
     if above is not None:
         count = volume_above(values, above, part, bars, level=level)
         rows.append((f"voxels above {above:g}", count.in_words()))
@@ -45,6 +46,10 @@ def measure(
             cubed = type(count)(count.value * (size / 10) ** 3, *ends)
             result["volume above (nm³)"] = vars(cubed)
             rows.append((f"volume above {above:g} (nm³)", cubed.in_words()))
+    band = None if bars is None else bars.shells
+    if band is not None:
+        rows.append(("expected resolution, correlation of 0.5 with the truth", band.in_words(found.voxel_size)))
+        result["resolution (cycles per voxel)"] = band.resolution()
     output.table(("figure", "value" if bars is None else f"value ({100 * level:g} % interval)"), rows)
     profile = None
     if line is not None:
@@ -97,7 +102,20 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
             raise ValueError(
                 f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}: of another volume"
             )
-    return Uncertainty(std, bias, 0)
+    return Uncertainty(std, bias, 0, read_shell_band(path))
+
+
+def read_shell_band(path: Path) -> ShellBand | None:
+    """The expected shell correlation beside the file of a volume; None where there is none.
+
+    Raises:
+        ValueError: another table stands there.
+    """
+    from recon.uncertainty.result import shell_band_path
+    from recon.uncertainty.shell_band import ShellBand
+
+    beside = shell_band_path(path)
+    return ShellBand.read(beside) if beside.exists() else None
 
 
 def _ends(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

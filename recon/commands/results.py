@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +16,12 @@ from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.io.files import put_in_place
 from noiseflow.io.model_files import MODEL_SUFFIXES
+from noiseflow.io.ownership import is_own
 from recon.commands.inputs import Prepared
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.result import error_bar_paths
+from recon.uncertainty.result import error_bar_paths, shell_band_path
 from recon.verdict.judge import judge
 from recon.verdict.verdict import Verdict
 
@@ -49,6 +51,8 @@ class Targets:
         io.check_output(self.volume, overwrite=self.overwrite)
         for path in error_bar_paths(self.volume).values() if self.error_bars else ():
             io.check_output(path, overwrite=self.overwrite)
+        if self.error_bars:
+            io.check_output(shell_band_path(self.volume), suffixes=frozenset({".csv"}), overwrite=self.overwrite)
         if self.noise_model is not None:
             io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
         if self.report is not None:
@@ -78,6 +82,7 @@ class Targets:
         else:
             outcome.volume.write(self.volume)
         bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
+        self._remove_former(bars, output)
         verdict = judge(tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment)
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])
@@ -85,6 +90,9 @@ class Targets:
         output.line(f"volume: {self.volume}")
         for path in bars.values():
             output.line(f"error bars: {path}")
+        if outcome.uncertainty is not None and outcome.uncertainty.shells is not None:
+            reach = outcome.uncertainty.shells.in_words(outcome.volume.voxel_size)
+            output.line(f"expected resolution (correlation of 0.5 with the truth): {reach}")
         for line in verdict.lines():
             output.line(line)
         page = None
@@ -114,6 +122,16 @@ class Targets:
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
         return verdict
+
+    def _remove_former(self, written: dict[str, Path], output: Output) -> None:
+        """Error bars of a volume that is no longer there would be read as those of the new one."""
+        beside = error_bar_paths(self.volume) | {"fsc": shell_band_path(self.volume)}
+        for path in (path for name, path in beside.items() if name not in written and path.exists()):
+            if not is_own(path):
+                output.line(f"{path} was not written by noiseflow: it does not belong to the new volume")
+                continue
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            output.line(f"removed: {path}, of the volume that was there before")
 
 
 def _save_noise_model(outcome: Reconstruction, path: Path, source: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,6 +24,9 @@ from recon.metrics.metrics import (
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
 
+if TYPE_CHECKING:
+    from recon.uncertainty.shell_band import ShellBand
+
 Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
@@ -41,6 +44,7 @@ class Comparison:
         projections: the same of projections, image by image; empty where no angles were given.
         frequency, correlation: (N,) Fourier shell correlation, cycles per voxel.
         crossings: threshold → frequency, cycles per voxel.
+        expected: the correlation that the volume's error bars lead to expect of the truth, where they are known.
     """
 
     volume: dict[str, Errors]
@@ -48,12 +52,15 @@ class Comparison:
     frequency: Array
     correlation: Array
     crossings: dict[float, float]
+    expected: ShellBand | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for programs."""
         both = {"volume": self.volume, "projections": self.projections}
         errors = {name: {scaling: asdict(e) for scaling, e in part.items()} for name, part in both.items()}
         crossings = {f"fsc_{threshold:g}": value for threshold, value in self.crossings.items()}
+        if self.expected is not None:
+            errors |= {"fsc_expected": {"low": self.expected.low, "high": self.expected.high}}  # type: ignore[dict-item]
         return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation}
 
 
@@ -171,6 +178,10 @@ def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str
 
 def _draw_correlation(axis: Any, comparison: Comparison) -> None:
     axis.plot(comparison.frequency[1:], comparison.correlation[1:])
+    band = comparison.expected
+    if band is not None:
+        axis.fill_between(band.frequency[1:], band.low[1:], band.high[1:], alpha=0.25, label="expected of the truth")
+        axis.legend(fontsize=9, loc="upper right")
     for threshold, crossing in comparison.crossings.items():
         axis.axhline(threshold, color="grey", linestyle=":", linewidth=1)
         axis.text(0.005, threshold + 0.01, f"{threshold:g}: {crossing:.3f} cycles per voxel", fontsize=9)

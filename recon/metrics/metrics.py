@@ -143,21 +143,33 @@ def _shell_sums(first: Array, second: Array, shells: int) -> Array:
     they are large."""
     if first.ndim == 2:
         first, second = first[None], second[None]
-    depth, height, width = first.shape
+    depth, height, _ = first.shape
     spectra = [_section_spectra(array) for array in (first, second)]
-    z, y, x = (axis**2 for axis in (np.fft.fftfreq(depth), np.fft.fftfreq(height), np.fft.rfftfreq(width)))
-    twice = np.full(len(x), 2.0)  # real volumes: the other half of the spectrum is the same
-    twice[0] = 1.0
-    if width % 2 == 0:
-        twice[-1] = 1.0
-    sums, rows = np.zeros((3, shells + 1)), max(1, _SLAB_ELEMENTS // (depth * len(x)))
+    sums, rows = np.zeros((3, shells + 1)), max(1, _SLAB_ELEMENTS // (depth * spectra[0].shape[2]))
     for start in range(0, height, rows):
-        f, g = (np.fft.fft(spectrum[:, start : start + rows], axis=0) for spectrum in spectra)
-        squared = z[:, None, None] + y[start : start + rows, None] + x
-        shell = np.rint(np.sqrt(squared) * 2 * shells).astype(np.intp).ravel()
+        part = slice(start, start + rows)
+        f, g = (np.fft.fft(spectrum[:, part], axis=0) for spectrum in spectra)
+        shell, times = shells_of(first.shape, shells, part)
         for total, values in zip(sums, ((f * g.conj()).real, np.abs(f) ** 2, np.abs(g) ** 2), strict=True):
-            total += np.bincount(shell, weights=(values * twice).ravel(), minlength=shells + 1)[: shells + 1]
+            total += np.bincount(shell.ravel(), weights=(values * times).ravel(), minlength=shells + 1)[: shells + 1]
     return sums
+
+
+def shells_of(shape: tuple[int, ...], shells: int, rows: slice = slice(None)) -> tuple[NDArray[np.intp], Array]:
+    """The shell of each frequency (kz, ky, kx) of a real volume's half spectrum, and how often that half stands for it, (kx,).
+
+    Args:
+        shape: (z, y, x).
+        shells: up to 0.5 cycles per voxel; higher numbers lie in the corners beyond.
+        rows: along ky.
+    """
+    z, y, x = np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1])[rows], np.fft.rfftfreq(shape[2])
+    squared = (z**2)[:, None, None] + (y**2)[:, None] + x**2
+    times = np.full(len(x), 2.0)
+    times[0] = 1.0
+    if shape[2] % 2 == 0:
+        times[-1] = 1.0
+    return np.rint(np.sqrt(squared) * 2 * shells).astype(np.intp), times
 
 
 def _section_spectra(volume: Array) -> Array:

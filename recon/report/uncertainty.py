@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.report.charts import new_figure, show_image
+from noiseflow.report.charts import COLOURS, new_chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.unseen import in_words
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from noiseflow.report import Report
     from recon.uncertainty.result import Uncertainty
+    from recon.uncertainty.shell_band import ShellBand
 
 _REACH = 99.8  # percentile: a few voxels of the edge must not set the scale
 
@@ -26,6 +27,17 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
     report.text(in_words(tilt_series.tilt_angles))
+    if bars.shells is not None:
+        _add_shells(report, bars.shells, volume.voxel_size)
+
+
+def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> None:
+    figure, axis = new_chart("Expected Fourier shell correlation with the truth", x="cycles per voxel", y="correlation")
+    axis.fill_between(band.frequency, band.low, band.high, color=COLOURS["accent"], alpha=0.3)
+    axis.axhline(0.5, color=COLOURS["warm"], linewidth=1, linestyle="--")
+    axis.set_ylim(0, 1.05)
+    words = "The lower edge counts the bias in full, the upper edge not at all."
+    report.charts([figure], caption=f"Falls to 0.5 at {band.in_words(voxel_size)}. {words}")
 
 
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:

@@ -9,5 +9,6 @@ from .measure import volume_above as volume_above
 from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
 from .result import Uncertainty as Uncertainty
+from .shell_band import ShellBand as ShellBand
 from .unseen import unseen_range as unseen_range
 from .unseen import unseen_share as unseen_share

@@ -16,6 +16,7 @@ from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.energy import Energy
 from recon.uncertainty.moments import Moments
 from recon.uncertainty.result import Uncertainty
+from recon.uncertainty.shell_band import ShellSums
 
 _STEPS = 30  # between two samples
 _SETTLE = 120  # steps that lead from the most likely volume to a usual one
@@ -75,6 +76,7 @@ class Posterior:
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # blocks must not share their noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
+        self.sums = ShellSums(self.energy.volume(self.units)) if place is None else None  # a block is not the volume
 
     @torch.no_grad()
     def step(self) -> str:
@@ -89,6 +91,8 @@ class Posterior:
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the error bars diverged: a voxel is no longer finite; check the data's scale")
         self.done += 1
+        if self.sums is not None:
+            self.sums.add(self.energy.volume(self.units))
         if self.visit is not None:
             self.visit(torch.from_numpy(self._volume(self.units)))
         return f"sample {self.done}"
@@ -104,19 +108,23 @@ class Posterior:
     def state(self) -> dict[str, Any]:
         """The chain where it is, and its moments so far."""
         chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
-        return chain | {"moments": self.moments.state()}
+        sums = None if self.sums is None else self.sums.state()
+        return chain | {"moments": self.moments.state(), "sums": sums}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.done, self.units = state["done"], state["units"].to(self.units).clone()
         self.generator.set_state(state["generator"])
         self.moments.load_state(state["moments"])
+        if self.sums is not None:
+            self.sums.load_state(state["sums"])
 
     def result(self) -> Uncertainty:
-        """Standard deviation and bias from the samples so far."""
+        """Standard deviation, bias and expected shell correlation from the samples so far."""
         parts = self.moments.std, self.moments.mean - self.energy.start
         std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
-        return Uncertainty(std, bias, self.done)
+        shells = None if self.sums is None else self.sums.band(self.energy.volume(self.moments.mean))
+        return Uncertainty(std, bias, self.done, shells)
 
 
 def error_bars(

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from recon.fields.fields import VoxelField
 from recon.fields.regularisers import Regulariser
 from recon.joint.signal_model import TomographySignal
 from recon.methods import reconstruct
+from recon.metrics.metrics import fourier_shell_correlation, resolution
 from recon.projection.image_formation import Linear
 from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
@@ -25,6 +27,7 @@ from recon.simulate.phantoms import particles
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.uncertainty import (
     Posterior,
+    ShellBand,
     Uncertainty,
     error_bars,
     left_out_ranks,
@@ -37,6 +40,7 @@ from recon.uncertainty import (
     volume_above,
 )
 from recon.uncertainty.measure import parse_region
+from recon.uncertainty.shell_band import ShellSums
 from tests.commands import run_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -177,7 +181,7 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)
     options = ["--weight", 0.4, "--steps", 5, "--uncertainty", 2, "--regulariser", "second-order"]
     result = run_command("reconstruct", tmp_path / "tilts.npy", "-o", tmp_path / "v.mrc", *options)
-    assert set(result["uncertainty"]) == {"std", "bias"}
+    assert set(result["uncertainty"]) == {"std", "bias", "fsc"}
     assert result["choices"]["regulariser"] == "second-order"
     assert io.read(tmp_path / "v_std.mrc").data.shape == (16, 16, 16)
     measured = measure_volume(
@@ -186,6 +190,58 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     assert measured["mean"]["low"] < measured["mean"]["value"] < measured["mean"]["high"]
     assert measured["voxels above"]["low"] <= measured["voxels above"]["value"] <= measured["voxels above"]["high"]
     assert len(measured["line"]["high"]) == 16
+    low, high = measured["resolution (cycles per voxel)"]
+    assert 0 <= low <= high <= 0.5
     (tmp_path / "v_bias.mrc").unlink()
     with pytest.raises(ValueError, match="missing"):
         measure_volume(tmp_path / "v.mrc")
+
+
+def test_a_new_volume_without_error_bars_does_not_keep_those_of_the_old(scene, tmp_path):
+    np.save(tmp_path / "tilts.npy", scene.images)
+    np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)
+    options = ["reconstruct", tmp_path / "tilts.npy", "-o", tmp_path / "v.mrc", "--weight", 0.4, "--steps", 5]
+    result = run_command(*options, "--uncertainty", 2)
+    assert all(Path(path).exists() for path in result["uncertainty"].values())
+    run_command(*options)
+    assert [path.name for path in tmp_path.glob("v*")] == ["v.mrc"]
+
+
+def test_shell_band_is_that_of_known_samples(tmp_path):
+    """The samples' mean is the volume less half of it, and each adds noise of the same power in every shell."""
+    generator = torch.Generator().manual_seed(0)
+    volume = torch.randn(24, 24, 24, generator=generator)
+    sums = ShellSums(volume)
+    samples = [0.5 * volume + torch.randn(volume.shape, generator=generator) for _ in range(40)]
+    for sample in samples:
+        sums.add(sample)
+    band = sums.band(torch.stack(samples).mean(0))
+    np.testing.assert_allclose(band.high[4:], (1 / 2) ** 0.5, atol=0.03)  # the volume and noise as strong
+    np.testing.assert_allclose(band.low[4:], (0.25 / 1.25) ** 0.5, atol=0.1)  # a twentieth quantile: below the mean
+    assert (band.low[4:] < (0.25 / 1.25) ** 0.5 + 0.01).all()
+    band.write(tmp_path / "v_fsc.csv")
+    np.testing.assert_allclose(ShellBand.read(tmp_path / "v_fsc.csv").low, band.low, rtol=1e-5)
+    (tmp_path / "v_fsc.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="not the table"):
+        ShellBand.read(tmp_path / "v_fsc.csv")
+    assert ShellSums(volume[:3]).band(volume[:3]) is None
+
+
+def test_shell_band_of_a_fit_holds_the_correlation_with_the_truth(tmp_path):
+    density = particles(32, generator=np.random.default_rng(1))
+    clean, unit = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
+    noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+    found = reconstruct(noisy, weight=0.34, method="joint", uncertainty=8)  # as it would choose
+    band = found.uncertainty.shells
+    frequency, correlation = fourier_shell_correlation(found.volume.attenuation, density * unit)
+    np.testing.assert_allclose(band.frequency, frequency)
+    told = correlation > 0.5  # shells that a reader would trust, and the first is the mean
+    inside = (band.low <= correlation) & (correlation <= band.high)
+    assert inside[told][1:].mean() > 0.7
+    assert (band.low <= correlation)[told][1:].all()  # it never promises more than there is
+    assert band.resolution()[0] < resolution(frequency, correlation, 0.5)
+    for name, values in (("v", found.volume.attenuation), ("truth", density * unit)):
+        io.write(tmp_path / f"{name}.mrc", values.astype(np.float32))
+    found.uncertainty.write(tmp_path / "v.mrc")
+    compared = run_command("compare", tmp_path / "v.mrc", tmp_path / "truth.mrc")
+    np.testing.assert_allclose(compared["fsc_expected"]["low"], band.low, atol=1e-5)
