@@ -34,6 +34,7 @@ class Options:
         out: folder of results and figures.
         output: tells people what is going on.
         overwrite: replace figures whoever made them; otherwise only those that this program made.
+        method: of `sabotage`; None for the joint fit, or least squares where quick.
     """
 
     size: int
@@ -43,6 +44,7 @@ class Options:
     out: Path
     output: Output
     overwrite: bool = False
+    method: str | None = None
 
     def results(self, name: str) -> Results:
         """The kept results of a benchmark on this scene; another scene or effort has another file."""
@@ -60,9 +62,9 @@ class Options:
             results.forget(self.again)
         return results
 
-    def results_of_series(self, name: str) -> Results:
-        """The kept results of a benchmark that has scenes of its own, of this size."""
-        return self._kept(name, str(self.size), str(self.scene["seed"]))
+    def results_of_series(self, name: str, method: str) -> Results:
+        """The kept results of a benchmark that has scenes of its own, of this size and method."""
+        return self._kept(name, str(self.size), method, str(self.scene["seed"]))
 
     def results_on_real_data(self, name: str) -> Results:
         """The kept results of a benchmark that has data of its own."""
@@ -157,12 +159,13 @@ def needle(options: Options) -> dict[str, Any]:
 
 def sabotage(options: Options) -> dict[str, Any]:
     """Series spoilt on purpose: whether the verdict sees it and names the reason."""
-    results = options.results_of_series("sabotage")
+    method = options.method or ("l2" if options.quick else "joint")
+    results = options.results_of_series("sabotage", method)
     benchmark_sabotage.run(
         results,
         options.output.line,
         size=options.size,
-        method="l2" if options.quick else "joint",
+        method=method,
         seed=options.scene["seed"],
         quick=options.quick,
     )

@@ -23,6 +23,9 @@ def benchmark(
     quick: Annotated[
         bool, typer.Option("--quick", help="A small scene and few settings: under three minutes.")
     ] = False,
+    method: Annotated[
+        str | None, typer.Option(help="Method of sabotage: joint, or l2 with --quick, if not given.")
+    ] = None,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
     again: Annotated[str, typer.Option(help="Compute anew the kept results whose name contains this.")] = "",
@@ -49,18 +52,30 @@ def benchmark(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file; name a folder with --out")
     _check_scene(size, noise, phantom)
+    _check_method(method, names)
     out.mkdir(parents=True, exist_ok=True)
     effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite)
+    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method)
     check_figures(names, options)
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})
     except KeyboardInterrupt:
         kept = f"what is finished is kept in {out}; the same command goes on from there"
         raise KeyboardInterrupt(kept) from None
+
+
+def _check_method(method: str | None, names: list[str]) -> None:
+    from recon.methods._names import method_names
+
+    if method is None:
+        return
+    if names != ["sabotage"]:
+        raise ValueError("--method belongs to the benchmark sabotage; the others run every method")
+    if method not in method_names():
+        raise ValueError(f"--method {method}: choose from {', '.join(method_names())}")
 
 
 def _check_scene(size: int | None, noise: str, phantom: str) -> None:

@@ -53,7 +53,8 @@ class Schedule:
         adapt: signal steps on the slab under the chosen noise model.
         refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
         learn: noise-model steps on the whole volume of a quiet series.
-        trial: signal steps that compare weights, after the first quarter of those of the volume.
+        trial: signal steps that compare weights, after the first quarter of those of the volume; in a quiet series as many as
+            the volume takes.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
         rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
@@ -154,10 +155,14 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
         # trial and final fits share one schedule, because longer fits favour larger weights
-        rate, begin = schedule.rate, schedule.whole // 4
+        rate, begin, steps = schedule.rate, schedule.whole // 4, schedule.trial
+        if facts.quiet:
+            # gaps of tilts are predicted best by unfinished fits of far too large a weight (needle: 51 after 50 steps, 8 after 180)
+            begin = schedule.quiet // 4
+            steps = schedule.quiet - begin
         again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
         trials = FitStage(
-            "choose weight", "weights", "slab", noise, schedule.trial, rate=rate, hold_offset=hold, fits=_TRIALS
+            "choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS
         )
         stages += [again, trials]
         if facts.learn_noise:

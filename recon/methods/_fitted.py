@@ -27,7 +27,7 @@ from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import far_level, lowered_by
+from recon.series.views import dark_level, lowered_by
 
 Options = Callable[[Settings], dict[str, Any]]
 """From what a user settled to further options of a `JointReconstructor`."""
@@ -143,7 +143,7 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
     """What is taken off the images before the fit; nothing under a calibrated noise model, which knows its detector's level."""
-    return 0.0 if settings.noise_model is not None else far_level(tilt_series)
+    return 0.0 if settings.noise_model is not None else dark_level(tilt_series)
 
 
 @torch.no_grad()

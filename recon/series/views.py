@@ -11,7 +11,6 @@ from recon.series.tilt_series import TiltSeries
 
 _TWINS = 0.1  # of the mean step: tilts so near to each other show the same view
 _SAMPLE = 100_000
-_FAR = 16.0  # spreads of the pixel values: a level so high takes four of the 24 bits that float32 has for the contrast
 
 
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
@@ -73,14 +72,13 @@ def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
     return numbers
 
 
-def far_level(tilt_series: TiltSeries) -> float:
-    """The dark level of linear images where it is far beyond their spread, which it would take digits from; else zero.
+def dark_level(tilt_series: TiltSeries) -> float:
+    """The dark level of linear images, that of the darkest hundredth of their pixels; zero for bright field.
 
-    It is that of the darkest hundredth of the pixels: noise models that count electrons then begin to count near zero.
+    Noise models that count electrons begin to count near zero without it, and what a fit chooses does not depend on a constant
+    added.
     """
-    level = level_of(tilt_series, quantile=0.01)
-    step = max(1, tilt_series.images.shape[1] // 64)
-    return level if abs(level) > _FAR * float(np.std(tilt_series.images[:, ::step], dtype=np.float64)) else 0.0
+    return level_of(tilt_series, quantile=0.01)
 
 
 def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:

@@ -42,8 +42,14 @@ def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _weight(tried: dict[float, float]) -> list[Finding]:
-    """Weights, and their held-out likelihoods, of which the lowest is the best: the fit follows something that is no noise."""
-    if len(tried) < 2 or min(tried, key=lambda weight: tried[weight]) > min(tried):
+    """Weights, with their held-out negative log-likelihoods: where the best lies at an end, a better one lies beyond."""
+    if len(tried) < 2:
         return []
-    words = f"held-out pixels want less of the regulariser than the lowest weight tried, {min(tried):.2g}"
-    return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
+    best = min(tried, key=lambda weight: tried[weight])
+    if best == min(tried):  # the fit follows something that is no noise
+        words = f"held-out pixels want less of the regulariser than the lowest weight tried, {best:.2g}"
+        return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
+    if best == max(tried):  # nothing but the regulariser helps: what is left is misfit, and the volume turns blocky
+        words = f"held-out pixels want more of the regulariser than the highest weight tried, {best:.2g}"
+        return [Finding("weight", 2.0, words, "give --weight, about 1 to 10, and compare with --method l2")]
+    return []

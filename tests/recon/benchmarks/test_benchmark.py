@@ -17,6 +17,7 @@ from recon.benchmarks import named
 from recon.benchmarks import needle as benchmark_needle
 from recon.benchmarks import paper as benchmark_paper
 from recon.benchmarks import rivals as benchmark_rivals
+from recon.benchmarks import sabotage as benchmark_sabotage
 from recon.benchmarks.defocus import defocused_scene
 from recon.benchmarks.external import _cut, _oriented, _padded, astra_sirt, missing
 from recon.benchmarks.network import fit_network
@@ -151,7 +152,12 @@ def test_volumes_of_other_programs_are_turned_the_right_way():
 def test_command_refuses_what_it_does_not_know(tmp_path):
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command()(benchmark)
-    for arguments, words in ((["magic"], "choose from rivals"), (["--repeats", "0"], "at least 1")):
+    for arguments, words in (
+        (["magic"], "choose from rivals"),
+        (["--repeats", "0"], "at least 1"),
+        (["sabotage", "--method", "magic"], "choose from auto"),
+        (["needle", "--method", "l2"], "belongs to the benchmark sabotage"),
+    ):
         result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
         assert isinstance(result.exception, ValueError)
         assert words in str(result.exception)
@@ -170,6 +176,20 @@ def test_command_writes_results_and_a_figure(tmp_path, monkeypatch):
     assert found["machines"][0]["versions"]["torch"]
     assert set(found["curves"]) >= {"SIRT", "WBP ramp"}
     assert len(list(tmp_path.glob("*.png"))) == 1
+
+
+def test_sabotage_keeps_the_results_of_every_method_apart(tmp_path, monkeypatch):
+    methods = []
+    monkeypatch.setattr(benchmark_sabotage, "run", lambda results, line, *, method, **_: methods.append(method))
+    monkeypatch.setattr(benchmark_sabotage, "table", lambda cells: (("spoilt by",), []))
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(benchmark)
+    paths = set()
+    for arguments in ([], ["--method", "sirt"], ["--quick"]):
+        result = CliRunner().invoke(app, ["sabotage", *arguments, "--size", "16", "--out", str(tmp_path), "--json"])
+        paths.add(json.loads(result.stdout.splitlines()[-1])["sabotage"]["results"])
+    assert methods == ["joint", "sirt", "l2"]
+    assert len(paths) == 3
 
 
 def test_plain_values_are_json():
