@@ -43,6 +43,12 @@ WRITERS = {
     "reconstruct {files}/new/tilts.mrc -o {out}/volume.npy --method wbp --report {out}/page": ["page/index.html"],
     "reconstruct {files}/new/tilts.mrc -o {out}/volume.tif --method l2 --weight 0.4 --steps 3 "
     "--save-noise-model {out}/noise.safetensors": ["noise.safetensors"],
+    "reconstruct {files}/new/tilts.mrc -o {out}/volume.mrc --method l2 --weight 0.4 --steps 3 --uncertainty 2": [
+        "volume_std.mrc",
+        "volume_bias.mrc",
+    ],
+    "batch {files}/series.csv -o {out} --options '--method wbp'": ["batch.csv"],
+    "batch {files}/series.csv -o {out} --table {out}/table.json --options '--method wbp'": ["table.json"],
     CALIBRATE: ["camera.safetensors", "page/report.html", "camera_offset.tif"],
 }
 
@@ -62,6 +68,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "new" / "clean8.mrc",
         truth + np.float32(0.01) * np.random.default_rng(0).random(truth.shape, np.float32),
     )
+    (folder / "series.csv").write_text(f"tilts\n{folder / 'new' / 'tilts.mrc'}\n")
     return folder
 
 
@@ -261,7 +268,7 @@ def test_a_noise_model_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None
     assert [file.name for file in tmp_path.iterdir()] == ["model.safetensors"]
 
 
-@pytest.mark.parametrize("name", ["calibrate", "compare", "demo", "reconstruct", "sample", "simulate"])
+@pytest.mark.parametrize("name", ["batch", "calibrate", "compare", "demo", "reconstruct", "sample", "simulate"])
 def test_commands_that_write_say_how_to_overwrite(name: str, capsys) -> None:
     with pytest.raises(SystemExit):
         main([name, "-h"])

@@ -47,11 +47,12 @@ def batch(
     """Reconstruct many tilt series, and write one table of verdicts and figures. One that fails does not stop the others."""
     from noiseflow import io
     from recon.scale.cluster import client_of
-    from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, write_table
+    from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, require_own_table, write_table
 
     output, table = Output(json), out / "batch.csv" if table is None else table
     if table.suffix.lower() not in (".csv", ".json"):
         raise ValueError(f"--table {table}: name a .csv or a .json file")
+    require_own_table(table, overwrite=overwrite)
     words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
     jobs, skipped = jobs_of(source, out, words), left_out(source)
     if skipped:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,6 +38,8 @@ def measure(
     mean = mean_of_region(values, part, bars, level=level)
     rows, result = [("mean attenuation per voxel", mean.in_words())], dict[str, Any](mean=vars(mean))
     if above is not None:
+        if not math.isfinite(above):
+            raise ValueError(f"--above {above}: give a finite attenuation per voxel")
         count = volume_above(values, above, part, bars, level=level)
         rows.append((f"voxels above {above:g}", count.in_words()))
         result["voxels above"] = vars(count)

@@ -16,12 +16,14 @@ from typing import Any
 
 from noiseflow import io
 from noiseflow.io.image_file import SUFFIXES
+from noiseflow.io.ownership import signature
 from recon.scale.cluster import all_threads_of_worker, usable_cores
 
 Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "seconds")
 """First columns of the table of results; the figures of `noiseflow reconstruct` follow."""
 _NOT_OPTIONS = ("tilts", "out")
+_JSON_START = '{\n "written_by": "noiseflow'
 
 
 @dataclass(frozen=True)
@@ -112,11 +114,30 @@ def read_table(path: Path) -> list[Row]:
     return _rows(path)
 
 
+def require_own_table(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a table that `write_table` did not write.
+
+    Raises:
+        FileExistsError: the file is another's.
+    """
+    if overwrite or not path.exists() or path.stat().st_size == 0:
+        return
+    with path.open("rb") as stream:
+        head = stream.read(200)
+    # CSV has no place for a mark: the columns are ours
+    if not head.startswith((_JSON_START.encode(), ",".join(COLUMNS).encode()[:200])):
+        raise FileExistsError(
+            f"{path} exists and was not written by noiseflow; name another --table, or replace it with --overwrite"
+        )
+
+
 def write_table(path: Path, rows: Sequence[Row]) -> None:
     """Write rows to a CSV or JSON file, all at once or not at all."""
     with io.atomic_path(path) as partial:
         if path.suffix.lower() == ".json":
-            partial.write_text(json.dumps({"series": list(rows)}, indent=1) + "\n", encoding="utf-8")
+            partial.write_text(
+                json.dumps({"written_by": signature(), "series": list(rows)}, indent=1) + "\n", encoding="utf-8"
+            )
             return
         names = list(dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)]))
         with partial.open("w", newline="", encoding="utf-8") as stream:
