@@ -64,7 +64,7 @@ class WithMaps(ModelAround):
             )
 
     def forward(self, signal: Signal) -> NoiseDistribution:
-        """The distribution of raw readings.
+        """The distribution of raw pixel values.
 
         Raises:
             ValueError: a flat signal, or images of another size than the maps.
@@ -84,7 +84,7 @@ class WithMaps(ModelAround):
         return self.gain.to(dtype), self.offset.to(dtype)
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
-        """Standardise the model inside on the readings of ideal pixels."""
+        """Standardise the model inside on the pixel values of ideal pixels."""
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 

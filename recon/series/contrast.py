@@ -21,7 +21,7 @@ _BRIGHTER = 1.5
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
-    """Swap bright and dark: every reading becomes largest + smallest − reading, in the same number type."""
+    """Swap bright and dark: every pixel value becomes largest + smallest − reading, in the same number type."""
     images = tilt_series.images
     if np.issubdtype(images.dtype, np.integer):  # largest − reading fits the type, and adding smallest keeps it there
         return replace(tilt_series, images=(images.max() - images) + images.min())
