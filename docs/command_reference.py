@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def page() -> str:
     ]
     for name, command in program.commands.items():
         parts.append(f"## noiseflow {name}")
-        parts += [" ".join(each.split()) for each in (command.help or "").split("\n\n")]
+        parts += [_options_as_code(" ".join(each.split())) for each in (command.help or "").split("\n\n")]
         arguments = [p for p in command.params if p.param_type_name == "argument"]
         options = [p for p in command.params if p.param_type_name == "option"]
         words = [f"`{_metavar(p)}`: {_help(p)}" for p in arguments]
@@ -51,7 +52,12 @@ def _row(option: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    return " ".join((getattr(parameter, "help", None) or "").split()).replace("|", "\\|")
+    return _options_as_code(" ".join((getattr(parameter, "help", None) or "").split()).replace("|", "\\|"))
+
+
+def _options_as_code(text: str) -> str:
+    """Options of a command as code: elsewhere two hyphens become a dash."""
+    return re.sub(r"(`[^`]*`)|(--[a-z][a-z-]*)", lambda found: found[1] or f"`{found[2]}`", text)
 
 
 if __name__ == "__main__":

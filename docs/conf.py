@@ -26,8 +26,12 @@ autodoc_preserve_defaults = True
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 
+smartquotes_action = "qe"  # without dashes: two hyphens begin an option
+
 html_theme = "furo"
 html_title = "noiseflow"
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
 
 
 def setup(app: Any) -> None:

@@ -1,4 +1,4 @@
-"""Clean volumes from noisy single-axis tilt series: projector, fields, joint fit, classical rivals, metrics, phantoms.
+"""Clean volumes from noisy single-axis tilt series: projector, fields, joint fit, classical methods, metrics, phantoms.
 
 Names load on first use, so importing the package costs nothing.
 """

@@ -151,6 +151,22 @@ def test_gallery_shows_every_program_and_its_small_picture() -> None:
     assert all(picture.stat().st_size < 150_000 for picture in pictures)
 
 
+def test_reference_explains_every_option_of_every_command() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "command_reference.py"))["page"]()
+    program = typer.main.get_command(build_app())
+    for name, section in zip(program.commands, page.split("\n## noiseflow ")[1:], strict=True):
+        assert section.startswith(f"{name}\n")
+        rows = {
+            option: row for row in section.splitlines() for option in re.findall(r"`(--?[\w-]+)`", row.split(" | ")[0])
+        }
+        for parameter in program.commands[name].params:
+            if parameter.param_type_name == "option":
+                assert all(len(rows[option].split(" | ")[-1].strip(" |")) > 10 for option in parameter.opts), (
+                    parameter.name
+                )
+    assert not re.findall(r"(?<![`\w-])--[a-z]", re.sub(r"`[^`]*`", "", page)), "a dash in place of two hyphens"
+
+
 def test_every_screenshot_is_taken_by_the_script_and_shown() -> None:
     script = (ROOT / "docs" / "screenshots.py").read_text(encoding="utf-8")
     guide = "".join(page.read_text(encoding="utf-8") for page in PAGES)

@@ -1,4 +1,4 @@
-"""Histograms of the readings themselves, at signal levels chosen by noisy estimates: what residuals blur stays visible."""
+"""Histograms of the pixel values themselves, at signal levels chosen by noisy estimates: what residuals blur stays visible."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from calibration.detector.levels import REACH, Levels, Readings, constants, gath
 from calibration.exposures.frames import Image
 
 LEVEL_WIDTH = 0.8
-"""Standard deviations of the noise that a level of unaltered readings spans."""
+"""Standard deviations of the noise that a level of unaltered pixel values spans."""
 
 LEAST_READINGS = 100
-"""Readings that such a level needs."""
+"""Pixel values that such a level needs."""
 
 MOST_CELLS = 512
 """Cells of such a level's histogram."""
 
 
 def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
-    """Sort readings by their own estimated signal and count them as they are, on the converter's own lattice.
+    """Sort pixel values by their own estimated signal and count them as they are, on the converter's own codes.
 
     That keeps what a residual blurs: rounding, clipping and the peaks of single electrons. Choosing pixels by an estimate
     that is noisy itself makes the true signals regress towards where signals are common; `true_moments` says how far.
@@ -93,7 +93,7 @@ def true_moments(estimate: Image, density: Image, unit: float, variance: float) 
 
 
 def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: float) -> dict[str, Any]:
-    """Histogram of the readings of one level on whole steps, wide enough for what noise may do."""
+    """Histogram of the pixel values of one level on whole steps, wide enough for what noise may do."""
     observation, signal = one.observation[group], one.signal[group]
     span = 2 * REACH * deviation
     width = max(min(deviation / 6, finest), span / MOST_CELLS)
@@ -117,7 +117,7 @@ def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: fl
 
 
 def _density(values: Image, at: Image, blur: Image) -> Image:
-    """Readings per count at some places, by a Gaussian kernel."""
+    """Pixel values per count at some places, by a Gaussian kernel."""
     count, edges = np.histogram(values, bins=4000)
     centre = 0.5 * (edges[1:] + edges[:-1])
     distance = (centre - at[:, None]) / blur[:, None]

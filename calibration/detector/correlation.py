@@ -27,7 +27,7 @@ LONGEST_PERIOD = 10.0
 """Pixels: blocks of image compression have 8, resampling by factors near 1 has more but then hardly changes the noise."""
 
 LEAST_PROFILE = 64
-"""Pixels along an axis from which on a period can be told from chance."""
+"""Pixels along an axis from which on a period can be distinguished from chance."""
 
 LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if dy > 0 or dx > 0]
 

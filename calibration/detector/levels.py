@@ -1,4 +1,4 @@
-"""Signal levels: the readings of like signal, counted into histograms that hold all the detector's likelihood needs."""
+"""Signal levels: the pixel values of like signal, counted into histograms that hold all the detector's likelihood needs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NUM_BINS = 128
 """Bins of each level's residual histogram."""
 
 REACH = 8.0
-"""Standard deviations of the residual that the histogram covers either way; readings beyond it are defects, not
+"""Standard deviations of the residual that the histogram covers either way; pixel values beyond it are defects, not
 noise."""
 
 
@@ -29,7 +29,7 @@ scatter."""
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of one exposure beside an independent estimate of their signal.
+    """Pixel values of one exposure beside an independent estimate of their signal.
 
     Attributes:
         observation: (N,) counts.
@@ -37,11 +37,11 @@ class Readings:
         level: (N,) what sorts the pixels, known without the noise of either: the neighbours' signal.
         shot_share: variance of the estimate's shot noise over that of the observation.
         read_share: the same for read noise.
-        weight: independent information per reading, 1 unless readings share their estimates.
+        weight: independent information per pixel value, 1 unless pixel values share their estimates.
         dark: taken without light: read noise alone.
         step: rounding step of the observation, counts; 0 if it is not rounded.
-        rails: the converter's lower and upper rail, counts; infinite where there is none.
-        scale: whose signals they are, see `Scale`; None where each level's mean is taken from its readings.
+        rails: the converter's lower and upper clipping limit, counts; infinite where there is none.
+        scale: whose signals they are, see `Scale`; None where each level's mean is taken from its pixel values.
     """
 
     observation: Image
@@ -61,7 +61,7 @@ class Readings:
         return float(signal.mean()), float(np.hypot(signal.std(), self.step) / np.sqrt(len(signal)))
 
     def rescaled(self, scale: Scale) -> Readings:
-        """The same readings with their signals on another scale of the same long exposure."""
+        """The same pixel values with their signals on another scale of the same long exposure."""
         old = self.scale or scale
         factor = scale.slope / old.slope
         signal = factor * (self.signal - old.intercept) + scale.intercept
@@ -93,27 +93,27 @@ class Scale:
 
 @dataclass(frozen=True)
 class Levels:
-    """Histograms at L signal levels, of residuals (observation − signal), or of the readings themselves.
+    """Histograms at L signal levels, of residuals (observation − signal), or of the pixel values themselves.
 
     Attributes:
         signal: (L,) mean signal, counts.
-        spread: (L,) variance of the true signals within the level, counts²; in histograms of readings that of the
+        spread: (L,) variance of the true signals within the level, counts²; in histograms of pixel values that of the
             estimated ones.
         variance: (L,) variance of observation − signal, counts².
-        count: (L,) readings.
+        count: (L,) pixel values.
         width: (L,) of a histogram cell, counts.
         origin: (L,) left edge of the first cell, counts.
-        histogram: (L, cells) readings.
+        histogram: (L, cells) pixel values.
         shot_share, read_share, weight, dark, step: (L,) as in `Readings`.
-        low, high: (L,) rails; the cells that hold them hold all readings beyond them too.
+        low, high: (L,) clipping limits; the cells that hold them hold all pixel values beyond them too.
         own: (L,) variance of the estimate's own noise that the next two go by, counts².
         shift: (L,) how far the mean true signal lies above the mean estimate, counts.
         excess: (L,) by how many times `own` the true signals' variance exceeds that of the estimates.
         darkest, darkest_error: (L,) signal of the darkest pixels of an exposure and its standard error, counts, beside its first
             level; infinite beside the others, and where no light was.
         scales: of the pairs.
-        scale: (L,) index into `scales`; −1 where the mean of the level is its readings' own.
-        absolute: the histograms are of the readings themselves.
+        scale: (L,) index into `scales`; −1 where the mean of the level is its pixel values' own.
+        absolute: the histograms are of the pixel values themselves.
     """
 
     signal: Image
@@ -155,7 +155,7 @@ class Levels:
         return np.array([index >= 0 and self.scales[index].common_offset for index in self.scale])
 
     def clipped(self) -> Image:
-        """(L,) share of the readings in a rail's cell."""
+        """(L,) share of the pixel values in a clipping limit's cell."""
         cell = [
             np.floor((np.nan_to_num(rail, posinf=-1e300, neginf=-1e300) - self.origin) / self.width)
             for rail in (self.low, self.high)
@@ -168,7 +168,7 @@ class Levels:
         return np.asarray(sum(held) / self.count if self.absolute else np.zeros_like(self.signal))
 
     def rescaled(self, change: dict[int, tuple[float, float]]) -> Levels:
-        """The same readings when the signals of some scales become factor·signal + shift.
+        """The same pixel values when the signals of some scales become factor·signal + shift.
 
         Args:
             change: factor and shift by index of the scale.
@@ -206,11 +206,11 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS
 
     Example:
         >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
+        >>> from calibration.detector.levels import Pixel values
         >>> rng = np.random.default_rng(0)
         >>> electrons = np.linspace(20, 400, 20_000)
         >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> levels = calibration.collect_levels([Pixel values(counts, 100 + 2 * electrons, electrons, step=0.0)])
         >>> levels.signal.shape
         (16,)
     """

@@ -11,7 +11,7 @@ from calibration.detector.levels import Levels, Scale
 from calibration.exposures.frames import Image
 
 LEAST_SIZE = 1e-8
-"""Size of a characteristic function that is left out: of 10⁷ readings it moves a tenth of one from its cell."""
+"""Size of a characteristic function that is left out: of 10⁷ pixel values it moves a tenth of one from its cell."""
 
 LEAST_MASS = LEAST_SIZE
 """Probability below which what was left out of the transform rules; outliers so far out all count alike."""
@@ -27,9 +27,9 @@ class DetectorLikelihood:
 
     An observation is rounded and clipped gain·Poisson((signal − offset)/gain) + offset + gain·read_noise·normal. The Fourier
     transform of its characteristic function gives the mass of every cell exactly, for Poisson counts of any size, for cells
-    as fine as the rounding, and for the rails, whose cells hold all that lies beyond. Within a level true signals spread as a
-    gamma distribution of the measured variance. Residuals from a signal estimate that is noisy itself have the characteristic
-    function of both noises together; in them rounding counts as independent uniform noise.
+    as fine as the rounding, and for the clipping limits, whose cells hold all that lies beyond. Within a level true signals
+    spread as a gamma distribution of the measured variance. Residuals from a signal estimate that is noisy itself have the
+    characteristic function of both noises together; in them rounding counts as independent uniform noise.
 
     The scale and offset that made signals of a long exposure are uncertain: the likelihood is integrated over them,
     to second order around their estimates.
@@ -110,7 +110,7 @@ class LevelMasses:
     """Cell masses of one set of levels.
 
     Args:
-        levels: all of residuals or all of readings.
+        levels: all of residuals or all of pixel values.
     """
 
     def __init__(self, levels: Levels) -> None:
@@ -188,8 +188,8 @@ class LevelMasses:
         return self._kept[0][:, :number], self._kept[1][:, :number]
 
     def _folded(self, transform: Complex) -> Image:
-        """Cell masses from the transform at frequencies 0, 1, …, aliased as cells alias them; what lies beyond a rail joins
-        the rail's cell."""
+        """Cell masses from the transform at frequencies 0, 1, …, aliased as cells alias them; what lies beyond a clipping
+        limit joins its cell."""
         number = self.num_cells
         if transform.shape[-1] > number // 2 + 1:
             periods = -(-transform.shape[-1] // number)

@@ -1,4 +1,4 @@
-"""From aligned exposures to the detector's parameters: readings collected, offset measured where it can be, posterior."""
+"""From aligned exposures to the detector's parameters: pixel values collected, offset measured where it can be, posterior."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def _with_cells(
     offset: tuple[float, float] | None,
     guess: tuple[float, float, float],
 ) -> tuple[list[Levels], tuple[float, float, float]]:
-    """Levels of residuals and of readings, the latter laid out by the parameters that a first fit of them finds; and
+    """Levels of residuals and of pixel values, the latter laid out by the parameters that a first fit of them finds; and
     these."""
     first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
     gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
@@ -174,11 +174,11 @@ def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
 
 
 def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
-    """The trusted pixels of a pair, in two parts: for residuals, and for histograms of the readings themselves.
+    """The trusted pixels of a pair, in two parts: for residuals, and for histograms of the pixel values themselves.
 
-    The latter are those of few electrons, of a noise as fine as the rounding, or near the converter's rails: their residuals
-    would lose what the likelihood can use. A burst, whose signals are as noisy as its readings, has only residuals, clear of
-    the rails.
+    The latter are those of few electrons, of a noise as fine as the rounding, or near the converter's clipping limits: their
+    residuals would lose what the likelihood can use. A burst, whose signals are as noisy as its pixel
+    values, has only residuals, clear of the clipping limits.
 
     Args:
         pair: aligned.
@@ -278,8 +278,8 @@ def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
 
 
 def pooled(readings: Sequence[Readings]) -> list[Readings]:
-    """Readings with those of the frames of a burst taken together: one histogram of all frames at a level holds what a hundred
-    small ones do, and takes a hundredth of the time."""
+    """Pixel values with those of the frames of a burst taken together: one histogram of all frames at a level holds what a
+    hundred small ones do, and takes a hundredth of the time."""
     groups: dict[Any, list[Readings]] = {}
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)

@@ -341,7 +341,7 @@ def _tensors(pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[Tensor, Tensor]
 def _mean_and_error(values: NDArray[np.float64], block: NDArray[np.int64]) -> tuple[float, float]:
     """Mean, and its standard error from the scatter of whole blocks (pixels of one block may err alike)."""
     mean = float(values.mean())
-    if not np.isfinite(mean):  # a reading that the model holds impossible
+    if not np.isfinite(mean):  # a pixel value that the model holds impossible
         return mean, float("nan")
     _, index = np.unique(block, return_inverse=True)
     departure = np.bincount(index, values - mean)

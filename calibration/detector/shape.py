@@ -39,13 +39,13 @@ CUT = 5.0
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
-    """χ² per degree of freedom of the histograms, over cells where at least `least` readings are expected.
+    """χ² per degree of freedom of the histograms, over cells where at least `least` pixel values are expected.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
-        least: readings expected.
-        merged: neighbouring cells of the readings' histograms that are taken together.
+        least: pixel values expected.
+        merged: neighbouring cells of the pixel values' histograms that are taken together.
     """
     squares, freedom = 0.0, -3
     for one, histogram, expected in _expected(levels, parameters):
@@ -67,7 +67,7 @@ def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
-        least: readings expected of a code.
+        least: pixel values expected of a code.
     """
     seen: dict[int, list[float]] = {}
     gain, _, read_noise = parameters

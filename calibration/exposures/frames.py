@@ -148,7 +148,7 @@ def checked_frame(data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SI
 
 
 def saturation_level(frame: NDArray[Any]) -> float:
-    """The upper rail of the analogue-to-digital converter, or infinity where the frame shows none.
+    """The upper clipping limit of the analogue-to-digital converter, or infinity where the frame shows none.
 
     Args:
         frame: any shape, detector units.
@@ -157,12 +157,12 @@ def saturation_level(frame: NDArray[Any]) -> float:
 
 
 def rounding_step(frame: Image) -> float:
-    """1 where all readings are whole numbers, else 0: not rounded."""
+    """1 where all pixel values are whole numbers, else 0: not rounded."""
     return 1.0 if np.array_equal(frame, np.round(frame)) else 0.0
 
 
 def rails(frame: Image) -> tuple[float, float]:
-    """Lower and upper rail of the converter as the frame shows them; infinite where it shows none."""
+    """Lower and upper clipping limit of the converter as the frame shows them; infinite where it shows none."""
     found = detect_digitisation(frame)
     return (0.0 if frame.min() == 0 else found.low), found.high
 

@@ -37,7 +37,7 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     detector.
 
     Judged in detector coordinates, before any frame is warped. A real feature of the scene spreads over neighbours
-    through the optics; a single noisy reading does not repeat.
+    through the optics; a single noisy pixel value does not repeat.
 
     Args:
         frames: (frame, y, x).
@@ -55,17 +55,17 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
 
 
 def saturated(frame: Image, *, margin: int = 0) -> Mask:
-    """Pixels at the upper rail, grown by `margin` pixels."""
+    """Pixels at the upper clipping limit, grown by `margin` pixels."""
     at_rail = frame >= saturation_level(frame)
     return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
 
 
 def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float = 3.5) -> Mask:
-    """Pixels whose level lies at least some standard deviations off the converter's rails, so that no noise is cut off.
+    """Pixels whose level lies at least some standard deviations off the converter's clipping limits, so that no noise is cut off.
 
     Args:
-        frame: (y, x) readings.
-        level: (y, x) the signal by other readings than the frame's own: a choice by these would cut their noise.
+        frame: (y, x) pixel values.
+        level: (y, x) the signal by other pixel values than the frame's own: a choice by these would cut their noise.
         mask: (y, x) pixels to judge the noise by.
         deviations: the distance asked for.
     """

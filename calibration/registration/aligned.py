@@ -20,7 +20,7 @@ LARGEST_RATIO_ERROR = 0.25
 """Departure, in the logarithm, of the exposures' scale from their ratio that a change of dose may explain."""
 
 MINIMUM_PIXELS = 500
-"""Pixels below which a noise model cannot be told from another."""
+"""Pixels below which a noise model cannot be distinguished from another."""
 
 
 @described(short="counts", long="as recorded", signal="counts")

@@ -30,7 +30,7 @@ Progress = Callable[[int, str], None]
 StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)``: the same for several pieces of work one after the other."""
 START_AGAIN = "nothing was left behind; the same command starts again"
-"""What is told of stopped work that keeps no state."""
+"""What is reported of stopped work that keeps no state."""
 _LOG_SECONDS = 10.0
 
 

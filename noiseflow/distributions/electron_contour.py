@@ -164,7 +164,7 @@ def _cell_at_zero(line: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def contour_log_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
-    """Without read noise the bell still ends before Im s = π where the rate is large; the pole becomes that of a lattice."""
+    """Without read noise the bell still ends before Im s = π where the rate is large; the pole becomes that of a comb."""
     side = torch.where(upper, 1.0, -1.0).to(rate)
     least = 2 / torch.sqrt(torch.maximum(rate, edge)).detach()
     line = side * torch.maximum(side * torch.log(edge / rate).detach(), least)

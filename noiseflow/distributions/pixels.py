@@ -146,8 +146,8 @@ class Pixels:
 
     @property
     def splits(self) -> bool:
-        """Whether pixels can be told apart in all that is kept: a tensor whose leading axes are not the batch's may hold pixels
-        along others, and such a distribution is computed whole."""
+        """Whether pixels can be distinguished in all that is kept: a tensor whose leading axes are not the batch's may hold
+        pixels along others, and such a distribution is computed whole."""
         for name, value in vars(self).items():
             if isinstance(value, Pixels) and not value.splits:
                 return False

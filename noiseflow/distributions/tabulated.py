@@ -22,7 +22,7 @@ _COARSE = 65
 
 @dataclass(frozen=True)
 class RootScale:
-    """A scale of readings on which noise is about equally wide everywhere: √((reading − low)/(high − low) + shift).
+    """A scale of pixel values on which noise is about equally wide everywhere: √((value − low)/(high − low) + shift).
 
     Below `low` it goes on along its slope, for observations fall below every signal.
     """
@@ -50,13 +50,13 @@ class RootScale:
         return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
 
     def observation(self, observation: Tensor) -> Tensor:
-        """The scale at any readings."""
+        """The scale at any pixel values."""
         share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
         root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
         return root
 
     def inverse(self, root: Tensor) -> Tensor:
-        """The readings at places of the scale."""
+        """The pixel values at places of the scale."""
         start = self.shift**0.5
         share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
         readings: Tensor = self.low + (self.high - self.low) * share
@@ -93,9 +93,10 @@ class Rows:
 
 @dataclass(frozen=True)
 class Columns:
-    """Equally spaced residuals on a scale, with a column at each end for observations on a rail.
+    """Equally spaced residuals on a scale, with a column at each end for observations on a clipping limit.
 
-    In texture coordinates an observation's column is offset − rate · (the signal's place on the scale); on a rail the rate is 0.
+    In texture coordinates an observation's column is offset − rate · (the signal's place on the scale); on a clipping limit
+    the rate is 0.
     """
 
     scale: RootScale
@@ -120,7 +121,8 @@ class Columns:
         return torch.cat([ends[0], inner, ends[1]], dim=1)
 
     def position(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
-        """Offset, rate and, where some residuals may lie outside the columns, the bounds that keep them off the rails."""
+        """Offset, rate and, where some residuals may lie outside the columns, the bounds that keep them off the clipping
+        limits."""
         unit = 2 / (self.count + 1)
         root = self.scale.observation(observation)
         offset = root * (unit / self.step) + ((1 - self.start / self.step) * unit - 1)
@@ -159,8 +161,8 @@ def interpolate(table: Tensor, grid: Tensor) -> Tensor:
 
 
 def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, between_rails: bool) -> Tensor:
-    """Log-likelihood on a table. With `between_rails` only the outer columns know of the rails, so that neighbours of a rail
-    interpolate cleanly."""
+    """Log-likelihood on a table. With `between_rails` only the outer columns know of the clipping limits, so that neighbours
+    of a clipping limit interpolate cleanly."""
     if between_rails and hasattr(noise_model, "without_rails"):
         free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
         outer = [noise_model(signals).log_prob(end) for end in ends]

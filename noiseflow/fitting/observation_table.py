@@ -29,7 +29,7 @@ class ObservationTable:
 
     Args:
         noise_model: the model to tabulate; call `rebuild` after it changes.
-        observation: (N,) readings.
+        observation: (N,) pixel values.
         signal_low, signal_high: range of the signals to expect.
         tolerance: accepted mean absolute interpolation error, nats per pixel.
         resume: what `state` returned; the table takes the same rows and columns again.
@@ -100,7 +100,7 @@ class ObservationTable:
 
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
         """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
-        likelihood has no curvature, and where rails hide the observations nothing else would hold a signal back."""
+        likelihood has no curvature, and where clipping limits hide the observations nothing else would hold a signal back."""
         stray = int(_STRAY * signal.numel())
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
         if not math.isfinite(low + high) or (low >= self.low and high <= self.high):

@@ -14,7 +14,7 @@ class FitPixels:
     """The pixels of a fit.
 
     Attributes:
-        observation: (N,) readings; unusable ones hold some finite number, or NaN where lines are fitted.
+        observation: (N,) pixel values; unusable ones hold some finite number, or NaN where lines are fitted.
         shape: of the images they come from.
         train, judge: indices of the pixels that train and of those that judge, (P,); or of lines of pixels, (P, L).
         weight: (N,) weight of each pixel in a full-batch loss.

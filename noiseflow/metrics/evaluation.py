@@ -185,7 +185,7 @@ def residual_masses(
 
 
 def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> int:
-    """How many signals stand for all: single readings that have mass must not move across bins within a group."""
+    """How many signals stand for all: single pixel values that have mass must not move across bins within a group."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return _SIGNAL_GROUPS
     bins = edges[torch.isfinite(edges)].diff()

@@ -44,8 +44,8 @@ class Gaussian(NoiseModelBase):
 class Poisson(NoiseModelBase):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
-    Observations lie on a lattice of spacing ``gain``. ``log_prob`` spreads each lattice point's mass evenly over its cell: it
-    is a density per detector unit like that of the other models, for observations between lattice points too.
+    Observations lie on a grid of spacing ``gain``. ``log_prob`` spreads each grid point's mass evenly over its cell: it
+    is a density per detector unit like that of the other models, for observations between grid points too.
 
     Args:
         gain: counts per electron.
@@ -71,7 +71,7 @@ class Poisson(NoiseModelBase):
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the straight line of variance against (N,) signal, and stay there: the likelihood of a lattice of unknown
+        """Start at the straight line of variance against (N,) signal, and stay there: the likelihood of a grid of unknown
         spacing has no useful gradient."""
         gain, offset = photon_line(signal, observation)
         self.log_gain.copy_(torch.log(gain))
@@ -85,8 +85,8 @@ class Poisson(NoiseModelBase):
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
     """Gain and offset of pure shot noise, ``variance = gain·(signal − offset)``, for (N,) signals and observations.
 
-    Least squares of squared residual on signal gives the line. Where it makes readings impossible (shot noise never falls below
-    the offset), the offset moves one count below the lowest reading and the gain keeps the mean variance.
+    Least squares of squared residual on signal gives the line. Where it makes pixel values impossible (shot noise never
+    falls below the offset), the offset moves one count below the lowest pixel value and the gain keeps the mean variance.
     """
     signal, observation = signal.double(), observation.double()
     squared = (observation - signal) ** 2

@@ -33,7 +33,7 @@ def find_detector(signal: Tensor, observation: Tensor) -> Detector:
     """The most likely detector for (N,) signals and observations: many starts are scored, the best are climbed.
 
     Starts with the measured variances come from a straight line of variance against signal; starts with a comb of electrons from
-    the strongest frequencies of the readings, which give the comb's spacing, phase and sharpness.
+    the strongest frequencies of the pixel values, which give the comb's spacing, phase and sharpness.
 
     Raises:
         ValueError: the observations equal the signals.
@@ -86,7 +86,7 @@ def _part(signal: Tensor, count: int) -> Tensor:
 
 
 def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Readings of few levels are spread over their cells: a density could otherwise grow without bound at the levels."""
+    """Pixel values of few levels are spread over their cells: a density could otherwise grow without bound at the levels."""
     levels = torch.unique(observation)
     if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
         return signal, observation

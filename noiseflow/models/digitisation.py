@@ -1,4 +1,4 @@
-"""What a set of readings tells of the converter that made them: its rounding step and the rails at which it clips."""
+"""What a set of pixel values shows of the converter that made them: its rounding step and clipping limits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Digitisation(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether there is any rounding or rail."""
+        """Whether there is any rounding or clipping limit."""
         return self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
 
     def in_words(self) -> str:
@@ -101,7 +101,7 @@ def _spacing(levels: NDArray[np.float64]) -> float:
     """The common spacing of sorted levels, or 0 where there is none."""
     gaps = np.diff(levels)
     least = np.median(gaps[gaps < 1.5 * gaps.min()])
-    # a gap carries the rounding error of two readings; the whole span carries it only once
+    # a gap carries the rounding error of two pixel values; the whole span carries it only once
     step = float((levels[-1] - levels[0]) / np.round(gaps / least).sum())
     steps = (levels - levels[0]) / step
     return step if float(np.abs(steps - np.round(steps)).max()) < 0.02 else 0.0
@@ -125,7 +125,7 @@ def _rail(values: NDArray[Any], step: float, *, high: bool) -> float:
 
 
 def _piles_up(count: int, beside: int, beyond: int) -> bool:
-    """Whether the outermost of three neighbouring levels holds more readings than a log-concave histogram allows."""
+    """Whether the outermost of three neighbouring levels holds more pixel values than a log-concave histogram allows."""
     log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
     error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
     return (count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)

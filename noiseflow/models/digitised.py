@@ -74,10 +74,11 @@ class Digitised(ModelAround):
             self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
-        """Which pixels the rails leave as they were, boolean, and their readings.
+        """Which pixels the clipping limits leave as they were, boolean, and their pixel values.
 
-        Of 64 equally populated groups by signal, those are kept of which hardly any reading is clipped. Where one rail clips,
-        `mirror` keeps what lies on the other side of the signal, half of it mirrored: it is as wide as the noise was.
+        Of 64 equally populated groups by signal, those are kept of which hardly any pixel value is clipped. Where one
+        clipping limit clips, `mirror` keeps what lies on the other side of the signal, half of it mirrored: it is as wide as
+        the noise was.
         """
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
@@ -104,7 +105,7 @@ class Digitised(ModelAround):
         low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
         if self.step > 0:
             return self.model.fixed_interval_part(signal, low, high)
-        # readings between the rails have a density: their interval is the whole line, and is not used
+        # pixel values between the clipping limits have a density: their interval is the whole line, and is not used
         on_rail = on_low | on_high
         low, high = torch.where(on_rail, low, -math.inf), torch.where(on_rail, high, math.inf)
         interval, density = (

@@ -61,7 +61,7 @@ class ConditionalFlow(NoiseModelBase):
     Args:
         layers: the maps, in the order in which they turn an observation into the latent.
         mean_preserving: shift the noise so that E[observation | signal] = signal (before any digitisation). A joint fit
-            needs it: otherwise an offset of the signal cannot be told from a mean of the noise.
+            needs it: otherwise an offset of the signal cannot be distinguished from a mean of the noise.
         width: hidden units of the network that turns a signal into the parameters of the conditional layers.
         neighbourhood: side, odd, of the window of clean signals around each pixel that moves and widens its noise. Off (1) by
             default: a model that sees the scene around a pixel can learn the scene's structure in place of the noise's.

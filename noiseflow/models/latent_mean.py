@@ -1,4 +1,4 @@
-"""Keeping the mean of a `PhysicsFlow`: the shift of its latent that undoes what the flow does to the mean of the readings."""
+"""Keeping the mean of a `PhysicsFlow`: the shift of its latent that undoes what the flow does to the mean of the pixel values."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ _ALL, _FEW = slice(None), slice(None, None, 3)
 class LatentMean:
     """Latent shifts at chosen signals, kept from call to call while the detector and the range of signals stay as they are.
 
-    With F(o) = Φ(T(z(o) − c)) the mean reading is o_last − ∫F do up to the last node; z(o), the detector's latent, is computed
-    once on nodes fine enough for the detector's read noise, and c follows by Newton's method. Signals are dense where the law
+    With F(o) = Φ(T(z(o) − c)) the mean pixel value is o_last − ∫F do up to the last node; z(o), the detector's latent, is
+    computed once on nodes fine enough for the detector's read noise, and c follows by Newton's method. Signals are dense
+    where the law
     changes fastest: just above the offset, on a logarithmic scale, and on a scale of the square root of the rate.
     """
 

@@ -125,7 +125,7 @@ class MixtureDistribution(NoiseDistribution):
     """A mixture of normal distributions; its components are computed when first needed.
 
     Args:
-        signal: clean readings, any shape.
+        signal: clean signals, any shape.
         components_at: gives log-weights, means and log-scales at signals, (*signal.shape, K) each.
         model: the noise model it comes from, for the tables of large inputs.
     """

@@ -95,8 +95,8 @@ class PoissonGaussian(ElectronCounter):
         """Start at the most likely of many detectors with the variances of the (N,) signals and observations.
 
         Where single electrons are resolved the likelihood has many maxima, one for each way to lay the comb of electrons on the
-        readings; the starts cover them. The parameters are then scaled by the curvature of the likelihood, so that one learning
-        rate suits a comb of fifty electrons, known to a part in a thousand, and an offset that is hardly known at all.
+        pixel values; the starts cover them. The parameters are then scaled by the curvature of the likelihood, so that one
+        learning rate suits a comb of fifty electrons, known to a part in a thousand, and an offset that is hardly known at all.
         """
         from noiseflow.models.detector_start import find_detector, likelihood_axes
 

@@ -169,7 +169,7 @@ def _latent(
 
 @torch.no_grad()
 def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
-    """Residuals, electrons, that cover the readings of signals (G, 1) as finely as the read noise asks, and their latents.
+    """Residuals, electrons, that cover the pixel values of signals (G, 1) as finely as the read noise asks, and their latents.
 
     The nodes of a row are equally spaced but in the far tails, which only a flow that widens them brings near.
 
@@ -189,7 +189,7 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
 
 
 def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """Φ⁻¹(P(reading ≤ residual)), of residuals in electrons."""
+    """Φ⁻¹(P(pixel value ≤ residual)), of residuals in electrons."""
     side = torch.where(residual.detach() > 0, -1.0, 1.0).to(residual)
     return side * ndtri_exp(log_tail(residual, rate, read_noise, twice=twice), twice=twice)
 

@@ -73,7 +73,7 @@ class WithMaps(ModelAround):
             )
 
     def forward(self, signal: Signal) -> NoiseDistribution:
-        """The distribution of raw readings.
+        """The distribution of raw pixel values.
 
         Raises:
             ValueError: a flat signal, images of another size than the maps, or a map of variance around a model that has no
@@ -105,7 +105,7 @@ class WithMaps(ModelAround):
         return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
-        """Standardise the model inside on the readings of ideal pixels."""
+        """Standardise the model inside on the pixel values of ideal pixels."""
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 

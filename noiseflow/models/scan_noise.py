@@ -24,7 +24,7 @@ class ScanNoise(ModelAround):
     The pixel values of a row are no longer independent: given the offset b they are, so the likelihood of a row is
     ∫ N(b; 0, scale²) ∏ p(oᵢ − b | sᵢ) db, one integral along each row, done by quadrature (to 1e-6 nats per row for smooth
     noise, to 1e-3 nats per pixel for densities with kinks). ``log_prob`` of a pixel
-    is that of its reading given those before it in its row, so that the sum over a row is the row's log-likelihood; ``cdf``,
+    is that of its pixel value given those before it in its row, so that the sum over a row is the row's log-likelihood; ``cdf``,
     ``icdf``, ``mean`` and ``variance`` are of single pixel values.
 
     Args:
@@ -116,10 +116,10 @@ def shared_axis(noise_model: nn.Module) -> int | None:
 
 
 class ScanDistribution(NoiseDistribution):
-    """Readings that share an offset along an axis.
+    """Pixel values that share an offset along an axis.
 
     Args:
-        base: distribution of the readings without offsets.
+        base: distribution of the pixel values without offsets.
         scale: standard deviation of the offsets.
         axis: the axis along which they are shared, −1 or −2.
     """
@@ -136,7 +136,7 @@ class ScanDistribution(NoiseDistribution):
         return self.base.widened(value, dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density of each reading given those before it along the axis; NaN readings are missing and count 0."""
+        """Log-density of each pixel value given those before it along the axis; NaN pixel values are missing and count 0."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
         cumulative = torch.cumsum(self._log_prob_at(value, offsets), self.axis)
         total = torch.logsumexp(cumulative + log_weight, 0)
@@ -150,7 +150,7 @@ class ScanDistribution(NoiseDistribution):
         return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
 
     def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """P(reading < value) and P(reading ≤ value) given the readings before each along the axis."""
+        """P(pixel value < value) and P(pixel value ≤ value) given the pixel values before each along the axis."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
         log_prob = self._log_prob_at(value, offsets)
         weight = torch.softmax(torch.cumsum(log_prob, self.axis) - log_prob + log_weight, 0)
@@ -163,7 +163,7 @@ class ScanDistribution(NoiseDistribution):
         return self.base.rescaled(torch.ones_like(offset), offset)
 
     def _log_prob_at(self, value: Tensor, offsets: Tensor) -> Tensor:
-        """(Q, ...) log-densities of the readings at each of the offsets (Q, ..., 1)."""
+        """(Q, ...) log-densities of the pixel values at each of the offsets (Q, ..., 1)."""
         missing = torch.isnan(value)
         safe = torch.where(missing, self.base.mean.detach(), value)
         found = torch.stack([self._shifted(offset).log_prob(safe) for offset in offsets])
@@ -188,7 +188,7 @@ class ScanDistribution(NoiseDistribution):
         return offsets.to(value.dtype), (log_prior + log_step).to(value.dtype)
 
     def _posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of each line's offset given all its readings."""
+        """Mean and standard deviation of each line's offset given all its pixel values."""
         present = ~torch.isnan(value)
         precision = torch.where(present, 1 / self.base.variance, 0.0)
         residual = torch.where(present, value - self.base.mean, 0.0)
@@ -211,7 +211,7 @@ class ScanDistribution(NoiseDistribution):
         return centre, width
 
     def _average(self, function: Callable[[NoiseDistribution], Tensor]) -> Tensor:
-        """Mean over the offsets of something of single readings."""
+        """Mean over the offsets of something of single pixel values."""
         nodes, weights = normal_quadrature(torch.float64, limit=7.0, count=57)
         like = self.scale.detach()
         parts = [
@@ -234,7 +234,7 @@ class ScanDistribution(NoiseDistribution):
         return bisect_quantile(self, value, self.mean - reach + 0 * value, self.mean + reach + 0 * value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        """Draw readings; every row (or column) of every image has an offset of its own."""
+        """Draw pixel values; every row (or column) of every image has an offset of its own."""
         return self._shifted(self._draw_offsets(sample_shape, generator)).sample(generator=generator)
 
     def _draw_offsets(self, sample_shape: Sequence[int], generator: torch.Generator | None) -> Tensor:

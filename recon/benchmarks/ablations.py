@@ -44,7 +44,7 @@ def run(scene: Scene, results: Results, line: Callable[[str], None], *, quick: b
     Args:
         scene: of most groups.
         results: where cells are kept.
-        line: told what is going on.
+        line: called with what is going on.
         quick: the first groups only.
         small: the scene of the coordinate networks, which are slow.
     """

@@ -1,4 +1,4 @@
-"""Rivals from other packages, for benchmarks only: ASTRA's SIRT and quantem's implicit reconstruction."""
+"""Methods of other packages, for benchmarks only: ASTRA's SIRT and quantem's implicit reconstruction."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 
 def missing(package: str) -> bool:
-    """Whether a rival's package is not installed; ``pip install 'noiseflow[benchmark]'`` brings all."""
+    """Whether the package of another method is not installed; ``pip install 'noiseflow[benchmark]'`` brings all."""
     return find_spec(package) is None
 
 
@@ -29,7 +29,7 @@ def astra_sirt(tilt_series: TiltSeries, grid: VolumeGrid, counts: Sequence[int])
 
     Args:
         tilt_series: the data.
-        grid: the lattice.
+        grid: the voxel grid.
         counts: numbers of iterations at which to look.
 
     Yields:
@@ -76,7 +76,7 @@ def quantem_inr(
 
     Args:
         tilt_series: the data.
-        grid: the lattice.
+        grid: the voxel grid.
         budget: seconds after which no further pass over the data is begun.
         device: where to compute.
 

@@ -93,7 +93,7 @@ def rivals(options: Options) -> dict[str, Any]:
 
 
 def slow_rivals(options: Options) -> dict[str, Any]:
-    """The rivals that take hours, as far as the budget goes."""
+    """The other methods that take hours, as far as the budget goes."""
     results = options.results("slow-rivals")
     benchmark_rivals.run_slow(options.size, results, effort=options.effort, line=options.output.line, **options.scene)
     return _shown(options, results)

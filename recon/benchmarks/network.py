@@ -1,4 +1,4 @@
-"""The coordinate network of Kniesel et al. (CVPR 2022) evaluated once on the whole lattice and projected to all tilts."""
+"""The coordinate network of Kniesel et al. (CVPR 2022) evaluated once on the whole voxel grid and projected to all tilts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class NetworkField(Field):
     """A volume that a network of nine layers computes from coordinates.
 
     Args:
-        shape: (depth, height, width) of the lattice.
+        shape: (depth, height, width) of the voxel grid.
         layer_width: units of the hidden layers.
     """
 
@@ -65,7 +65,7 @@ def fit_network(
 
     Args:
         tilt_series: the data.
-        grid: the lattice.
+        grid: the voxel grid.
         width: of the hidden layers.
         noise_model: makes a model to learn with the volume.
         num_steps: of Adam, over all pixels; half of them by least squares where there is a noise model.

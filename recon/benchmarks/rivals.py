@@ -157,7 +157,7 @@ def run(size: int, results: Results, *, effort: Effort, line: Callable[[str], No
         size: voxels along each edge.
         results: where cells are kept.
         effort: how much to spend.
-        line: told what is going on.
+        line: called with what is going on.
         **scene_options: as `make_scene`.
     """
     scene = make_scene(size, **scene_options)
@@ -172,7 +172,7 @@ def run(size: int, results: Results, *, effort: Effort, line: Callable[[str], No
 
 
 def run_slow(size: int, results: Results, *, effort: Effort, line: Callable[[str], None], **scene_options: Any) -> None:
-    """The rivals that take hours, as far as the budget goes; one curve each."""
+    """The other methods that take hours, as far as the budget goes; one curve each."""
     scene = make_scene(size, **scene_options)
     slow: dict[str, Callable[[], Iterator[Point]]] = {
         name: lambda p=preset: _trained(scene, p, effort.budget)  # type: ignore[misc]

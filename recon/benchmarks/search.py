@@ -1,4 +1,4 @@
-"""Rivals at every setting worth trying, and the best of them by whatever judge a benchmark has."""
+"""Other methods at every setting worth trying, and the best of them by whatever judge a benchmark has."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 FIRST_WEIGHT = 0.2
 STEPS = 360
-"""Of the rivals' fits: three times those of the joint fit, so that they end where they would."""
+"""Of the fits of other methods: three times those of the joint fit, so that they end where they would."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def best_fit(
 
     Args:
         tilt_series: the data.
-        grid: the lattice.
+        grid: the voxel grid.
         reconstructor: whose weight is searched.
         score: of a volume.
         first: where to begin.

@@ -38,7 +38,7 @@ def batch(
     resume: Annotated[
         bool,
         typer.Option(
-            "--resume", help="Leave out series that the table calls done; go on with those that were stopped."
+            "--resume", help="Leave out series that the table lists as done; resume those that were interrupted."
         ),
     ] = False,
     overwrite: OverwriteOption = False,

@@ -28,7 +28,7 @@ def benchmark(
     ] = None,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
-    again: Annotated[str, typer.Option(help="Compute anew the kept results whose name contains this.")] = "",
+    again: Annotated[str, typer.Option(help="Recompute the kept results whose name contains this.")] = "",
     out: Annotated[
         Path, typer.Option("--out", help="Folder for results and figures; an interrupted run resumes there.")
     ] = Path("noiseflow-benchmark"),

@@ -13,7 +13,7 @@ from recon.commands.options import parse_mode
 
 
 def compare(
-    volume: Annotated[Path, typer.Argument(help="Volume to judge, of whatever program: .mrc, .rec, .tif or .npy.")],
+    volume: Annotated[Path, typer.Argument(help="Volume to judge, from any program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
     angles: Annotated[
         Path | None, typer.Option(help="Angle file; projections at these angles are compared too.")

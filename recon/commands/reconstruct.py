@@ -77,7 +77,7 @@ def reconstruct(
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
     window: Annotated[
         str | None,
-        typer.Option(help="Of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen by itself if not given."),
+        typer.Option(help="Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given."),
     ] = None,
     denoiser: Annotated[
         str,
@@ -104,7 +104,7 @@ def reconstruct(
         ),
     ] = None,
     keep_tilts: Annotated[
-        bool, typer.Option("--keep-tilts", help="Leave no tilt out, though it does not fit the others.")
+        bool, typer.Option("--keep-tilts", help="Keep tilts that do not fit the others.")
     ] = False,
     defocus: Annotated[
         float,
@@ -115,7 +115,7 @@ def reconstruct(
     ] = 0.0,
     slices_at_once: Annotated[
         int | None,
-        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen by itself for large volumes."),
+        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen automatically for large volumes."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Reconstruct blocks in so many processes at a time (extra [distributed]).")
@@ -147,7 +147,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a clean volume, and the noise model with it, from one noisy tilt series.
 
-    Ctrl-C saves the state and says how to go on; twice, it stops at once. Tilts may come in any order.
+    Ctrl-C saves the state and says how to resume; pressed twice, it stops at once. Tilts may come in any order.
     """
     from noiseflow.io import locked, require_other
     from noiseflow.io.mapped import is_large

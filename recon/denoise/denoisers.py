@@ -1,4 +1,4 @@
-"""Denoisers of single images behind one callable, image to image; the rivals that clean first and reconstruct then."""
+"""Denoisers of single images behind one callable, image to image; the methods that clean first and reconstruct then."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
     Args:
         name: one of `DENOISERS`, or a function of your own as ``package.module:function``, which is given the images as they
             are and does all by itself.
-        images: (image, y, x) noisy readings, detector units.
+        images: (image, y, x) noisy pixel values, detector units.
         noise_model: fitted to such images.
 
     Raises:

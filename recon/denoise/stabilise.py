@@ -25,7 +25,7 @@ class Stabiliser:
     """An increasing map under which the noise has unit standard deviation, and its exact unbiased inverse, as tables.
 
     Attributes:
-        readings, stabilised: (N,) the map of readings.
+        pixel values, stabilised: (N,) the map of pixel values.
         signals, expected: (N,) the mean of the stabilised reading at each clean signal, increasing.
     """
 
@@ -35,7 +35,7 @@ class Stabiliser:
     expected: Array
 
     def forward(self, image: Array) -> Array:
-        """Readings, any shape, to the scale on which the noise has unit standard deviation."""
+        """Pixel values, any shape, to the scale on which the noise has unit standard deviation."""
         return _extended(image, self.readings, self.stabilised)
 
     def inverse(self, image: Array) -> Array:
@@ -47,11 +47,11 @@ def of_noise_model(noise_model: nn.Module, images: Array) -> Stabiliser:
     """The stabiliser of a fitted noise model, for images of its units.
 
     The map is ∫ ds / σ(s) over the model's own standard deviation; for Poisson–Gaussian noise that is the generalised Anscombe
-    transform. The inverse uses the model's quantiles, so that skewness, rounding and rails are accounted for.
+    transform. The inverse uses the model's quantiles, so that skewness, rounding and clipping limits are accounted for.
 
     Args:
         noise_model: called with signals, gives distributions with ``variance`` and ``icdf``.
-        images: the noisy readings, any shape; they tell the range of signals.
+        images: the noisy pixel values, any shape; they tell the range of signals.
     """
     low, high = (float(value) for value in np.quantile(images, (0.002, 0.998)))
     margin = 0.05 * (high - low)
@@ -67,13 +67,13 @@ def of_noise_model(noise_model: nn.Module, images: Array) -> Stabiliser:
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:
-    """The generalised Anscombe transform of readings gain·Poisson + N(offset, read_noise²).
+    """The generalised Anscombe transform of pixel values gain·Poisson + N(offset, read_noise²).
 
     Args:
         gain: detector units per electron.
         offset: detector units at zero dose.
         read_noise: standard deviation at zero dose, detector units.
-        images: the noisy readings, any shape; they tell the range of signals.
+        images: the noisy pixel values, any shape; they tell the range of signals.
 
     Raises:
         ValueError: a gain that is not positive.
@@ -138,7 +138,7 @@ def _with_inverse(signals: Array, stabilised: Array, readings: Array) -> Stabili
 
 
 def _increasing(values: Array) -> Array:
-    """Strictly increasing by the least change: flat where rails hide the signal, an inverse still exists."""
+    """Strictly increasing by the least change: flat where clipping limits hide the signal, an inverse still exists."""
     step = 1e-9 * max(float(np.ptp(values)), 1e-12)
     raised: Array = np.maximum.accumulate(values) + step * np.arange(values.size)
     return raised

@@ -1,4 +1,4 @@
-"""The volume as a network of coordinates, evaluated on the lattice: one evaluation serves the rays of all tilts."""
+"""The volume as a network of coordinates, evaluated on the voxel grid: one evaluation serves the rays of all tilts."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class CoordinateNetwork(Field):
         return self.at(everywhere).view(self.depth, self.width, self.height)
 
     def at(self, indices: Tensor) -> Tensor:
-        """Attenuation, in units of the scale, at (N,) places of the flat lattice (z, x, y)."""
+        """Attenuation, in units of the scale, at (N,) places of the flat voxel grid (z, x, y)."""
         parts = torch.split(indices, _POINTS_TOGETHER)
         values = [checkpoint(self._density, part, use_reentrant=False) for part in parts]
         return torch.cat(values) * _DENSEST

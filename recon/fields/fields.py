@@ -1,4 +1,4 @@
-"""What holds the volume: ``field()`` gives the attenuation of the whole lattice in the projector's native layout."""
+"""What holds the volume: ``field()`` gives the attenuation of the whole voxel grid in the projector's native layout."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Field(Described, ABC):
         """Attenuation in units of the scale, not negative, (depth, width, height)."""
 
     def at(self, places: Tensor) -> Tensor:
-        """Attenuation, in units of the scale, at (N,) places of the flat lattice (z, x, y)."""
+        """Attenuation, in units of the scale, at (N,) places of the flat voxel grid (z, x, y)."""
         return self.units().reshape(-1).index_select(0, places)
 
     def on(self, tiles: Tiles) -> Tensor:
@@ -93,8 +93,8 @@ class Field(Described, ABC):
         return False
 
     def coarser(self) -> Field | None:
-        """This field on a lattice half as fine, by the same parameters: what it learns, this one has learnt. None where it has no
-        such lattice."""
+        """This field on a voxel grid half as fine, by the same parameters: what it learns, this one has learnt. None where
+        it has no such voxel grid."""
         return None
 
     def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
@@ -114,7 +114,7 @@ class Field(Described, ABC):
         return values.reshape(self.depth * self.width, self.height)
 
     def extra_repr(self) -> str:
-        """The lattice and the scale."""
+        """The voxel grid and the scale."""
         return f"{self.depth} x {self.height} x {self.width} voxels (z, y, x), scale={float(self.scale):.4g}"
 
     def volume(self) -> Tensor:
@@ -174,7 +174,7 @@ class MultiresolutionField(Field):
         nn.init.constant_(self.grids[0], math.log(math.expm1(_LEAST)))
 
     def start_from(self, volume: Tensor) -> None:
-        """The start lives in a grid four times coarser than the lattice: what is finer is noise."""
+        """The start lives in a grid four times coarser than the voxel grid: what is finer is noise."""
         with torch.no_grad():
             for grid in self.grids:
                 grid.zero_()

@@ -23,9 +23,9 @@ class Occupancy(nn.Module):
 
     Args:
         rough: (z, y, x) of the same extent and any resolution, in units of the field's scale.
-        shape: (depth, height, width) of the lattice.
+        shape: (depth, height, width) of the voxel grid.
         least: what counts as something in the rough volume.
-        margin: voxels of the lattice around it.
+        margin: voxels of the voxel grid around it.
         block: voxels along the edges of the blocks that are tested.
     """
 
@@ -45,7 +45,7 @@ class Occupancy(nn.Module):
 
     @property
     def share(self) -> float:
-        """The share of the lattice that is occupied."""
+        """The share of the voxel grid that is occupied."""
         return float(self.mask.float().mean())
 
     def rows(self, rows: slice) -> Occupancy:
@@ -58,7 +58,7 @@ class Occupancy(nn.Module):
         return part
 
     def coarser(self, shape: Sequence[int]) -> Occupancy:
-        """The same on a lattice (depth, height, width) half as fine."""
+        """The same on a voxel grid (depth, height, width) half as fine."""
         part = Occupancy(torch.zeros(1, 1, 1), shape, block=self.block).to(self.mask.device)
         part.mask = functional.adaptive_max_pool3d(self.mask.float()[None], part.mask.shape)[0] > 0
         return part
@@ -79,7 +79,7 @@ class Occupancy(nn.Module):
 
         Args:
             gradient: of the loss with respect to the line integrals, (tilts * detector_width, height).
-            projector: of the whole lattice.
+            projector: of the whole voxel grid.
             cost: of the total variation, loss per unit of attenuation and voxel face.
         """
         self.num_steps += 1

@@ -26,7 +26,7 @@ _SHARED = 6  # Gaussians of a shape that all signals share: enough for a long ta
 
 
 def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Module]:
-    """Noise models worth trying for these images, simplest first, behind the rounding and rails that they show.
+    """Noise models worth trying for these images, simplest first, behind the rounding and clipping limits that they show.
 
     All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
     anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
@@ -34,7 +34,7 @@ def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Mo
     cannot explain, and a noise model of learnt shape would learn to excuse it.
 
     Args:
-        images: the readings.
+        images: the pixel values.
         quiet: whether noise is small beside the contrast.
     """
     digitisation = detect_digitisation(images)
@@ -47,14 +47,14 @@ def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Mo
 
 
 def first_noise(images: NDArray[Any]) -> nn.Module:
-    """Simple noise to start a fit with: where clipping hides readings, least squares would take their mean for the signal."""
+    """Simple noise to start a fit with: where clipping hides pixel values, least squares would take their mean for the signal."""
     digitisation = detect_digitisation(images)
     return Digitised(SignalDependentGaussian(), *digitisation) if _clipped(images, digitisation) else Gaussian()
 
 
 def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
-    """Whether clipping hides much: many readings, and noise that takes their neighbours far from the rails. A dark background
-    at zero, whose noise is nothing beside the contrast, is as good as seen."""
+    """Whether clipping hides much: many pixel values, and noise that takes their neighbours far from the clipping limits. A
+    dark background at zero, whose noise is nothing beside the contrast, is as good as seen."""
     on_rail = (images <= digitisation.low) | (images >= digitisation.high)
     if on_rail.mean() < _CLIPPED:
         return False

@@ -1,4 +1,4 @@
-"""Checkpoints of a reconstruction: what every fit has reached, so that a stopped run goes on where it was.
+"""Checkpoints of a reconstruction: what every fit has reached, so that an interrupted run resumes.
 
 A journal is a folder of safetensors files with JSON metadata, each written beside its target and renamed; opening one runs no
 code from it.
@@ -50,7 +50,7 @@ class Journal:
         settings: all that decides the result, by name, as JSON can hold it. Another run's journal is refused.
         resume: go on with what the folder holds; otherwise the first thing written replaces it.
         interval: seconds between checkpoints within a stage; one more is written when it ends, and when it is stopped.
-        report: told of every step. It may raise KeyboardInterrupt: the step is whole by then, and is saved.
+        report: called with every step. It may raise KeyboardInterrupt: the step is whole by then, and is saved.
 
     Attributes:
         in_fit: whether a fit or another stage is running.

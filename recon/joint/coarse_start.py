@@ -63,7 +63,7 @@ def coarse_start(
     Args:
         tilt_series: the data.
         response: its first guess; set in place.
-        grid: the lattice at full resolution.
+        grid: the voxel grid at full resolution.
         num_steps: of the fit.
         generator: source of the choice of pixels that judge the fit.
 
@@ -106,7 +106,7 @@ class _BestResponse(nn.Module):
 def _binned(
     tilt_series: TiltSeries, grid: VolumeGrid, binning: int
 ) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
-    """The series averaged over squares of pixels, with a mask, and the projector from a lattice of voxels as large."""
+    """The series averaged over squares of pixels, with a mask, and the projector from a grid of voxels as large."""
     images, share = (np.stack(parts) for parts in zip(*_binned_images(tilt_series, binning), strict=True))
     mask = share > 0
     images[~mask] = images[mask].mean()

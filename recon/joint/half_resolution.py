@@ -13,9 +13,10 @@ _LEAST = 128  # voxels; half the resolution of 96 costs 0.2 dB of a volume of sh
 
 
 class HalfResolution:
-    """A signal model on a lattice half as fine, and the pixels it is fitted to: every second one along u and y.
+    """A signal model on a voxel grid half as fine, and the pixels it is fitted to: every second one along u and y.
 
-    Each pixel keeps its own likelihood, which that of binned pixels would not follow: of clipped readings, the mean is another.
+    Each pixel keeps its own likelihood, which that of binned pixels would not follow: of clipped pixel values, the mean is
+        another.
     Where the first of them stands differs from tilt to tilt, so that the volume is not shifted. Total variation weighs as much
     as at full resolution, for faces and pixels become fewer alike. Half of an odd number of voxels is a little too wide, half a
     pixel at the edges: good enough for a start.

@@ -1,4 +1,4 @@
-"""Laplace noise: as a likelihood it is least absolute deviations (L1), the robust rival of least squares."""
+"""Laplace noise: as a likelihood it is least absolute deviations (L1), the robust alternative to least squares."""
 
 from __future__ import annotations
 

@@ -91,14 +91,14 @@ class TomographySignal(Described):
         return signal.reshape(-1)
 
     def _evaluate(self) -> Tensor:
-        """The field on the whole lattice, (depth * width, height), or as the list of `tiles`."""
+        """The field on the whole voxel grid, (depth * width, height), or as the list of `tiles`."""
         if self.occupancy is None:
             everywhere: Tensor = self.field()
             return everywhere
         return self.field.on(self.tiles) * self.field.scale
 
     def _project(self, values: Tensor) -> Tensor:
-        """Line integrals; what the data wants where the lattice counts as empty is tested as gradients pass."""
+        """Line integrals; what the data wants where the voxel grid counts as empty is tested as gradients pass."""
         occupancy, projector = self.occupancy, self.projector
         if occupancy is None:
             return projector.project(values)

@@ -76,7 +76,7 @@ def compare_volumes(
 
     Args:
         volume: to be judged.
-        reference: the truth, on the same lattice.
+        reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: what a projection is: line integrals (``linear``), or exp(−line integral).
         progress: called with the steps done, of `NUM_STEPS`, and a note.

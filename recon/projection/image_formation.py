@@ -44,7 +44,7 @@ class Transmission(Described):
         return torch.exp(self.log_intensity - line_integrals) + self.offset
 
     def invert(self, signal: Tensor) -> Tensor:
-        """Line integrals of signals; readings below a thousandth of the incident intensity count as that much."""
+        """Line integrals of signals; pixel values below a thousandth of the incident intensity count as that much."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
         return -torch.log(share.clamp_min(1e-3))
 
@@ -158,5 +158,5 @@ def _range(values: Tensor) -> str:
 
 
 def _relative(log_beam: Tensor) -> Tensor:
-    """The beam with a geometric mean of one: a brighter beam could not be told from a denser volume."""
+    """The beam with a geometric mean of one: a brighter beam could not be distinguished from a denser volume."""
     return torch.exp(log_beam - log_beam.mean())

@@ -1,4 +1,4 @@
-"""A few neighbouring slices of a lattice, those of its columns that hold anything there, and where their neighbours stand."""
+"""A few neighbouring slices of a voxel grid, those of its columns that hold anything there, and where their neighbours stand."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _positions(columns: Tensor, total: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Tile:
-    """Neighbouring slices `rows` of the lattice, and those of its `columns` that hold anything there.
+    """Neighbouring slices `rows` of the voxel grid, and those of its `columns` that hold anything there.
 
     Attributes:
         part: where in the list their values stand, column by column.

@@ -1,4 +1,4 @@
-"""Total variation of the occupied part of a lattice, as if all the rest were there and empty."""
+"""Total variation of the occupied part of a voxel grid, as if all the rest were there and empty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The occupied part of a lattice: projected, and regularised, as if all the rest were there and empty."""
+"""The occupied part of a voxel grid: projected, and regularised, as if all the rest were there and empty."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _TOGETHER, _MOST_TILES = 16, 8
 
 
 class Tiles:
-    """The columns (z, x) of a lattice in which neighbouring slices hold anything, tile by tile of such slices.
+    """The columns (z, x) of a voxel grid in which neighbouring slices hold anything, tile by tile of such slices.
 
     Every tile has its own small part of the projector's matrix: the columns that are occupied in any of its slices. They are
     listed whole, so that memory is read in runs. A list of values counts as a volume that is empty wherever the list has no
     voxel.
 
     Args:
-        mask: (depth, width, height) of the lattice, True where occupied.
-        projector: of the whole lattice.
-        known: tiles of another mask of the lattice, for the same projector; what is the same is taken over, the rest let go of,
-            and they cannot be used any more.
+        mask: (depth, width, height) of the voxel grid, True where occupied.
+        projector: of the whole voxel grid.
+        known: tiles of another mask of the voxel grid, for the same projector; what is the same is taken over, the rest let
+            go of, and they cannot be used any more.
 
     Attributes:
         mask: as given.
@@ -62,7 +62,7 @@ class Tiles:
 
     @property
     def share(self) -> float:
-        """The share of the lattice that is listed."""
+        """The share of the voxel grid that is listed."""
         return self.filled.numel() / math.prod(self.shape)
 
     @cached_property
@@ -72,7 +72,7 @@ class Tiles:
 
     @cached_property
     def voxels(self) -> Tensor:
-        """(M,) flat lattice indices (z, x, y) of the occupied voxels."""
+        """(M,) flat voxel grid indices (z, x, y) of the occupied voxels."""
         height, device = self.shape[2], self.filled.device
         spans = [torch.arange(tile.rows.start, tile.rows.stop, device=device) for tile in self._tiles]
         listed = [
@@ -86,17 +86,17 @@ class Tiles:
         return rays
 
     def total_variation(self, values: Tensor, *, smoothing: float) -> Tensor:
-        """Of the whole lattice, see `recon.fields.regularisers.total_variation`."""
+        """Of the whole voxel grid, see `recon.fields.regularisers.total_variation`."""
         variation: Tensor = TileVariation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
         return variation
 
     def gathered(self, lattice: Tensor) -> Tensor:
-        """The list, (N,), of a whole lattice, (z, x, y)."""
+        """The list, (N,), of a whole voxel grid, (z, x, y)."""
         values: Tensor = _Gathering.apply(lattice, self)  # type: ignore[no-untyped-call]
         return values
 
     def upsampled(self, grid: Tensor) -> Tensor:
-        """The list, (N,), of a grid half as fine as the lattice, (z, x, y), interpolated: see `recon.fields.upsampling`."""
+        """The list, (N,), of a grid half as fine as the voxel grid, (z, x, y), interpolated: see `recon.fields.upsampling`."""
         values: Tensor = _Upsampling.apply(grid, self)  # type: ignore[no-untyped-call]
         return values
 
@@ -113,7 +113,7 @@ class Tiles:
         return self._upsampling[1]
 
     def lattice(self, values: Tensor) -> Tensor:
-        """The whole lattice, (depth * width, height), without gradient."""
+        """The whole voxel grid, (depth * width, height), without gradient."""
         return self.scattered(values.detach()).view(-1, self.shape[2])
 
     def spread(self, values: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ class Tiles:
         return lattice
 
     def scattered(self, values: Tensor) -> Tensor:
-        """The lattice, (z, x, y), of a list: the adjoint of `gathered`."""
+        """The voxel grid, (z, x, y), of a list: the adjoint of `gathered`."""
         lattice = values.new_zeros(self.shape)
         for tile in self._tiles:
             lattice.view(-1, self.shape[2])[:, tile.rows].index_copy_(0, tile.columns, tile.of(values))

@@ -29,7 +29,7 @@ def noise_charts(noise_model: nn.Module, signal: Pixels, observation: Pixels) ->
 
     Args:
         noise_model: the model.
-        signal, observation: (N,) predicted clean pixels and their readings, detector units.
+        signal, observation: (N,) predicted clean pixels and their pixel values, detector units.
     """
     stride = -(-signal.size // _MOST_PIXELS)
     signal, observation = signal[::stride], observation[::stride]

@@ -203,7 +203,7 @@ def _on_worker(job: Job) -> Row:
 
 
 def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | None, str]:
-    """What a command answered, and the last line of what it told; no answer where it failed."""
+    """What a command answered, and the last line of what it printed; no answer where it failed."""
     command = [sys.executable, "-m", "noiseflow", *words, "--json"]
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     with running.lock:

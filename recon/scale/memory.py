@@ -28,7 +28,7 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
 
     Args:
         tilt_series: the images.
-        grid: the lattice.
+        grid: the voxel grid.
         fitted: whether a field is fitted, with its optimiser's moments and best state; else SIRT or back-projection.
     """
     depth, height, width = grid.shape

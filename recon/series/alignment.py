@@ -26,7 +26,7 @@ class Alignment:
         tilt_axis: degrees from y towards −x, anticlockwise where y points up (IMOD's rotation angle).
         shifts: (tilt, 2) pixels of the raw images, in the order (y, x): where the aligned middle lies from the raw one.
         tilt_angles: (tilt,) degrees.
-        evidence: for this axis and then for its rivals, best first; empty where the axis was given without a search.
+        evidence: for this axis and then for the other candidates, best first; empty where the axis was given without a search.
     """
 
     tilt_axis: float
@@ -38,7 +38,7 @@ class Alignment:
         """The series with the axis along y through the middle; what is not in the raw images is masked.
 
         Cubic splines interpolate, once, which correlates the noise of neighbouring pixels. Within 45° of x, height and width
-        are swapped. Without rotation and fraction of a pixel, readings stay what they are. Large series go to a temporary file.
+        are swapped. Without rotation and fraction of a pixel, pixel values stay what they are. Large series go to a temporary file.
 
         Raises:
             OSError: the disk has no room for that file.

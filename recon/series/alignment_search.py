@@ -106,7 +106,7 @@ class _Search:
         self.binnings = _binnings(max(series.images.shape[1:]))
 
     def run(self) -> tuple[Match, list[Evidence]]:
-        """The alignment, and the evidence for its axis and for its rivals."""
+        """The alignment, and the evidence for its axis and for the other candidates."""
         candidates: list[_Candidate] = []
         decided = False
         for done, binning in enumerate(self.binnings):
@@ -148,7 +148,7 @@ class _Search:
         return [_weighed(matcher, match, known) for match, known in tried]
 
     def _refined(self, matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
-        """Shifts and axes at a finer size, best first; rivals that are beaten, but for a few, are dropped."""
+        """Shifts and axes at a finer size, best first; all but the best few are dropped."""
         best, *others = _distinct([self._matched(matcher, each) for each in candidates], _KEPT[1], _SAME)
         rivals = [each for each in others if not best.evidence.is_clear_of(each.evidence)]
         beaten = [each for each in others if each not in rivals]

@@ -22,7 +22,7 @@ _BRIGHTER = 1.5
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
-    """Swap bright and dark: every reading becomes largest + smallest − reading, in the same number type."""
+    """Swap bright and dark: every pixel value becomes largest + smallest − reading, in the same number type."""
     images = tilt_series.images
     largest, smallest = images.max(), images.min()
     # in this order integers stay within their type

@@ -1,4 +1,5 @@
-"""What a look at a tilt series tells before any fit: the detector's response, its rails and steps, the scale of attenuation."""
+"""What a look at a tilt series tells before any fit: the detector's response, its clipping limits and steps, the scale of
+attenuation."""
 
 from __future__ import annotations
 

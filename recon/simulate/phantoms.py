@@ -17,7 +17,7 @@ Array = NDArray[np.float32]
 _VIRION_VOXELS = 32  # across; the atoms' density is known to 15 Å, and a coarser voxel would not show it
 
 
-_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about a voxel of 64 and four: neighbours are told apart
+_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about a voxel of 64 and four: neighbours are distinguished
 
 
 class Canvas:

@@ -103,7 +103,7 @@ def clean_tilt_series(
 
 
 def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
-    """Draw one noisy reading of every pixel of a clean series; whole numbers are stored as integers.
+    """Draw one noisy pixel value of every pixel of a clean series; whole numbers are stored as integers.
 
     Example:
         >>> import noiseflow, numpy as np, recon
@@ -118,7 +118,7 @@ def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0)
 
 
 def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> Iterator[NDArray[Any]]:
-    """One noisy reading of each clean image (y, x) after the other."""
+    """One noisy pixel value of each clean image (y, x) after the other."""
     generator = torch.Generator().manual_seed(seed)
     for image in images:
         with torch.no_grad():
@@ -126,7 +126,7 @@ def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> It
 
 
 def stored_type(noise_model: nn.Module | None) -> type[np.generic]:
-    """The number type of a detector's readings: integers where it rounds to whole numbers."""
+    """The number type of a detector's pixel values: integers where it rounds to whole numbers."""
     if not isinstance(noise_model, Digitised) or noise_model.step != 1:
         return np.float32
     return np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32

@@ -12,7 +12,7 @@ from noiseflow.fitting.observation_table import ObservationTable
 from recon.joint.signal_model import TomographySignal
 from recon.projection.base import from_columns
 
-_SOFTENED = 10  # times the smoothing: a tenth as stiff, and still a fifth of a unit, below what is to be told apart
+_SOFTENED = 10  # times the smoothing: a tenth as stiff, and still a fifth of a unit, below what is to be distinguished
 _POWER_STEPS = 8
 _SAFE = 1.2  # a power iteration of few steps comes out low
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import io
 import re
 import runpy
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,7 +37,9 @@ WORDS = {
     r"asks nothing of a network": "works offline",
 }
 # What the patterns find and the field says itself.
-ALLOWED = re.compile(r"(?:crystal|atomic|Bravais|reciprocal) lattices?|rivals, slow-rivals", re.IGNORECASE)
+ALLOWED = re.compile(
+    r"(?:crystal|atomic|Bravais|reciprocal) lattices?|rivals, slow-rivals|the stage's own readings", re.IGNORECASE
+)
 
 
 def without_code(text: str) -> str:
@@ -64,6 +68,13 @@ def messages(source: str) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.value
 
 
+def comments(source: str) -> Iterator[tuple[int, str]]:
+    """(line, text) of comments and docstrings, without the names of arguments in them."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT or token.string.startswith(('"""', 'r"""')):
+            yield token.start[0], re.sub(r"^ *\w+: |`[^`]*`|>>> .*", "", token.string, flags=re.MULTILINE)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 def test_pages_use_the_words_of_the_field(page: Path) -> None:
     assert misused(without_code(page.read_text(encoding="utf-8"))) == []
@@ -84,6 +95,16 @@ def test_messages_use_the_words_of_the_field() -> None:
     assert not found, "\n".join(found)
 
 
+def test_docstrings_and_comments_use_the_words_of_the_field() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {word}"
+        for path in SOURCES
+        for line, text in comments(path.read_text(encoding="utf-8"))
+        for word in misused(text)
+    ]
+    assert not found, "\n".join(found)
+
+
 def test_the_check_finds_and_forgives() -> None:
     assert misused("The readings lie on the rails; what was told holds.") != []
     assert len(misused("clipped readings are at a rail")) == 2
@@ -91,4 +112,6 @@ def test_the_check_finds_and_forgives() -> None:
     assert not misused(
         without_code("run `rivals` and see [the page](rivals.md)\n```sh\nnoiseflow benchmark rivals\n```\n")
     )
+    source = '"""Doc.\n\nArgs:\n    rails: the rails.\n"""\n# `told`, not told\n'
+    assert sum(len(misused(text)) for _, text in comments(source)) == 2
     assert [text for _, text in messages('"""told"""\nraise ValueError(f"{a} was told")')] == [" was told"]

@@ -169,7 +169,7 @@ class PresetState:
         return nll if likelihood else ((predicted - observed) ** 2).mean()
 
     def _rays(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Origins and directions (x, y, z) and readings of randomly drawn rays; the cube is as wide as the image."""
+        """Origins and directions (x, y, z) and pixel values of randomly drawn rays; the cube is as wide as the image."""
         tilts, height, width = self.images.shape
         tilt, row, column = (
             torch.randint(size, (self.preset.rays,), generator=self.generator).to(self.images.device)
@@ -193,7 +193,7 @@ class PresetState:
 
     @torch.no_grad()
     def volume(self, grid: VolumeGrid) -> Volume:
-        """The fine network on the lattice, attenuation per voxel."""
+        """The fine network on the voxel grid, attenuation per voxel."""
         axes = [((2 * torch.arange(size) + 1 - size) / grid.width) for size in grid.shape]
         z, y, x = torch.meshgrid(*axes, indexing="ij")
         points = torch.stack([x, y, z], -1).reshape(-1, 3)
