@@ -157,7 +157,7 @@ def _correlation(
         text += "carry afterglow or interference"
         if correctable(correlation, repairs):
             text += (
-                f". If that keeps the mean, the variance was {correlation.factor:.3g} times as large before, and the gain "
+                f". If that keeps the mean, the variance was {figures.factor:.3g} times as large before, and the gain "
                 "reported is the one before; per pixel of the recorded frame it is "
                 f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Give raw frames to be sure"
             )
@@ -171,10 +171,13 @@ def _correlation(
         text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
         found.append(Reason("compressed", "bad", text + ". Give raw frames."))
     if correlation.period:
-        text = (
-            f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled or compressed"
-        )
-        found.append(Reason("periodic noise", "bad", text + ", so that the gain is not the camera's. Give raw frames."))
+        text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled "
+        if correlation.step != 1 and correctable(correlation, repairs):
+            text += f"by {1 / correlation.step:.2g} with linear interpolation; that was taken out of the gain, to a few percent"
+            grade = "doubtful"
+        else:
+            text, grade = text + "or compressed, so that the gain is not the camera's", "bad"
+        found.append(Reason("periodic noise", grade, text + ". Give raw frames."))
     return found
 
 

@@ -23,6 +23,10 @@ PEAK = 25.0
 """Power of a spectral line over its neighbourhood's mean. Noise exceeds it with probability exp(−25); the mean is known to 30 %,
 which leaves exp(−17), once in 10⁴ frames of 1000 lines."""
 
+ALIKE = 0.03
+"""Departure from a linear kernel's correlation within which frames count as interpolated by it: the places between pixels move it
+by up to 0.015, the noise of 200² pixels by as much at three standard errors, and cubic kernels are 0.09 and more away."""
+
 LONGEST_PERIOD = 10.0
 """Pixels: blocks of image compression have 8, resampling by factors near 1 has more but then hardly changes the noise."""
 
@@ -59,6 +63,21 @@ class Correlation:
         """Whether the correlation dies out within `REACH`, as a filter's does and an interference's does not."""
         outer = np.abs(self.value[np.abs(self.lags).max(axis=1) == REACH]).max()
         return bool(outer < max(0.1 * np.abs(self.value).max(), CLEAR * self.error.max()))
+
+    @property
+    def step(self) -> float:
+        """Pixels of the frames before from one pixel to the next, if these were resampled by linear interpolation; else 1.
+
+        Interpolation repeats itself after `period` pixels, so that the step is 1 ± 1/period. Which of the two it is, and that
+        the interpolation is linear, show in the neighbours' correlation: that of linear kernels so far apart.
+        """
+        if self.period:
+            for step in (1 + 1 / self.period, 1 - 1 / self.period):
+                near = _overlap(step) / _overlap(0.0)
+                expected = {(0, 1): near, (1, 0): near, (1, 1): near**2}
+                if all(abs(self.at(*lag) - value) < ALIKE for lag, value in expected.items()):
+                    return step
+        return 1.0
 
     @property
     def inflation(self) -> float:
@@ -104,6 +123,12 @@ def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[I
     near = _near_clear(value, error)
     factor, spread = 1 + 2 * float(value[near].sum()), 2 * float(np.sqrt(np.sum(error[near] ** 2)))
     return Correlation(np.array(LAGS), value, error, factor, spread, max(map(_period, residuals)))
+
+
+def _overlap(distance: float) -> float:
+    """Integral of the product of two kernels of linear interpolation at a distance, pixels of the frame that is interpolated."""
+    far = max(2 - distance, 0.0) ** 3 / 6
+    return far if distance >= 1 else far - 4 / 6 * (1 - distance) ** 3
 
 
 def _near_clear(value: Image, error: Image) -> Mask:

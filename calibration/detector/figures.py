@@ -23,6 +23,10 @@ LARGEST_UNEVENNESS = 0.05
 """Relative deviation of the pixels' variances above which one gain and read noise do not describe them all: mixed so, the tails
 of the noise exceed any single pixel's by the square, a quarter of a percent, which pulls an offset but hardly a gain."""
 
+RESAMPLED_ERROR = 0.03
+"""Relative standard error of a gain from which linear interpolation was taken out: the places between pixels that it happened to
+take move its noise by this (frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
+
 NINETY = 1.645
 """Standard deviations either way of a 90 % interval."""
 
@@ -38,7 +42,7 @@ class Figures:
         read_noise: electrons rms; None where the exposures do not determine it.
         source: ``"posterior"``, or ``"photon transfer"`` where the noise is not Poisson-Gaussian: the line of variance against
             signal holds for any detector of independent events.
-        factor: by which correlation between pixels had reduced the variance, taken out of the gain; 1: none.
+        factor: by which correlation between pixels, or resampling, had reduced the variance, taken out of the gain; 1: none.
     """
 
     gain: Interval
@@ -95,12 +99,14 @@ def _by_line(detector: Detector) -> Figures:
 
 
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
-    """Variance before a filter that keeps the mean: the noise's spectral density at frequency 0."""
-    factor, error = correlation.factor, correlation.factor_error
-    gain = figures.gain
+    """Variance before a filter that keeps the mean: the noise's spectral density at frequency 0, which is one per area of the
+    frames as they were before they were resampled."""
+    area = correlation.step**2
+    factor, error = area * correlation.factor, area * correlation.factor_error
+    gain, resampled = figures.gain, RESAMPLED_ERROR if area != 1 else 0.0
     middle = gain.median * factor
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
-    whole = middle * float(np.hypot(width, error / factor))
+    whole = middle * float(np.linalg.norm((width, error / factor, resampled)))
     read = figures.read_noise
     noise = (
         None if read is None else Interval(*(value / np.sqrt(factor) for value in (read.median, read.q05, read.q95)))
