@@ -100,8 +100,8 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
-        slab   begin again                  signal      37  simple, rate 0.6, offset held, afresh
-        slab   choose weight                weights     50 x 4  simple, rate 0.6, offset held
+        slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
+        slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
         whole  go on                        signal      60  simple, rate 0.6, offset held, half resolution

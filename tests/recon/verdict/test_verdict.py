@@ -209,9 +209,15 @@ def test_a_fit_that_got_worse_is_doubtful() -> None:
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("tried", "grade"),
-    [({0.4: 1.0, 0.2: 0.9, 0.1: 0.8}, "doubtful"), ({0.4: 1.0, 0.2: 0.9, 0.1: 1.1}, "good"), ({}, "good")],
+    [
+        ({0.4: 1.0, 0.2: 0.9, 0.1: 0.8}, "doubtful"),
+        ({0.4: 1.0, 0.8: 0.9, 1.6: 0.8}, "doubtful"),
+        ({0.4: 1.0, 0.2: 0.9, 0.1: 1.1}, "good"),
+        ({0.4: 1.0}, "good"),
+        ({}, "good"),
+    ],
 )
-def test_a_weight_that_is_the_lowest_of_those_tried_is_doubtful(tried: dict[float, float], grade: str) -> None:
+def test_a_weight_at_either_end_of_those_tried_is_doubtful(tried: dict[float, float], grade: str) -> None:
     series, told = oracle()
     verdict = judge(series, replace(told, weights_tried=tried))
     assert verdict.grade == grade
