@@ -20,11 +20,13 @@ START, END = "<!-- table -->", "<!-- end of table -->"
 def counted(rows: list[tuple[str, ...]]) -> str:
     """The counts at the end of a table, in a sentence."""
     counts = {row[0]: row[1] for row in rows}
-    right, named, other, missed = (int(counts[f"total {kind}"]) for kind in ("right", "named", "other reason", "missed"))
+    right, named, other, missed = (
+        int(counts[f"total {kind}"]) for kind in ("right", "named", "other reason", "missed")
+    )
     return (
-        f"Of {right + named + other + missed} spoilt series, {right} are reconstructed right and {named} are graded `doubtful` or "
-        f"`bad`, or refused, with the cause among the first two reasons; {other} are graded `doubtful` or `bad` for another reason, "
-        f"and {missed} are missed. False alarms among the good series: {counts['false alarms']}."
+        f"Of {right + named + other + missed} spoilt series, {right} are reconstructed right and {named} are graded `doubtful` "
+        f"or `bad`, or refused, with the cause among the first two reasons; {other} are graded `doubtful` or `bad` for another "
+        f"reason, and {missed} are missed. False alarms among the good series: {counts['false alarms']}."
     )
 
 

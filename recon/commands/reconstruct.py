@@ -77,7 +77,9 @@ def reconstruct(
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
     window: Annotated[
         str | None,
-        typer.Option(help="Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given."),
+        typer.Option(
+            help="Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given."
+        ),
     ] = None,
     denoiser: Annotated[
         str,
@@ -103,9 +105,7 @@ def reconstruct(
             help="Direction of the tilt axis in the images, degrees from y (up) anticlockwise; with --refine-alignment, roughly."
         ),
     ] = None,
-    keep_tilts: Annotated[
-        bool, typer.Option("--keep-tilts", help="Keep tilts that do not fit the others.")
-    ] = False,
+    keep_tilts: Annotated[bool, typer.Option("--keep-tilts", help="Keep tilts that do not fit the others.")] = False,
     defocus: Annotated[
         float,
         typer.Option(

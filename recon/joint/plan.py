@@ -157,13 +157,11 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         # trial and final fits share one schedule, because longer fits favour larger weights
         rate, begin, steps = schedule.rate, schedule.whole // 4, schedule.trial
         if facts.quiet:
-            # gaps of tilts are predicted best by unfinished fits of far too large a weight (needle: 51 after 50 steps, 8 after 180)
+            # unfinished fits predict gaps of tilts best at far too large a weight (needle: 51 after 50 steps, 8 after 180)
             begin = schedule.quiet // 4
             steps = schedule.quiet - begin
         again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
-        trials = FitStage(
-            "choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS
-        )
+        trials = FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
         stages += [again, trials]
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))

@@ -38,7 +38,8 @@ class Alignment:
         """The series with the axis along y through the middle; what is not in the raw images is masked.
 
         Cubic splines interpolate, once, which correlates the noise of neighbouring pixels. Within 45° of x, height and width
-        are swapped. Without rotation and fraction of a pixel, pixel values stay what they are. Large series go to a temporary file.
+        are swapped. Without rotation and fraction of a pixel, pixel values stay what they are. Large series go to a
+        temporary file.
 
         Raises:
             OSError: the disk has no room for that file.
