@@ -16,6 +16,7 @@ FINER = (
 )
 SAFE = "stands in where the value is not used, so that a gradient of nothing is not NaN: any ordinary number would do"
 BOTH = "where one formula takes over from another: both are exact there (tested on both sides)"
+WARNED = "the line of the caller that a warning names"
 KIND = "of this tensor the number type and the device are taken over, nothing else (`Pixels._set_kind`)"
 RNG = "seed of the package's own random choices: another seed is another, equally good choice"
 
@@ -87,6 +88,12 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_CHUNK = 2**18", "numbers", SPEED),
         ("_CHUNK = 2**18", "2 ** 18", SPEED),
         ("_WORTHWHILE = 0.7", "numbers", SPEED),
+        ("chunk = _CHUNK if signal.device", "signal.device.type == 'cpu'", SPEED),
+        (
+            "levels = self._levels if size < len(SIZES)",
+            "size < len(SIZES)",
+            "the first table of residuals would be the first of levels again, which was too coarse: the next finer one is taken",
+        ),
         ("stalled = size %", "numbers", SPEED),
         ("stalled = size %", "size % len(SIZES) > 0", SPEED),
         ("stalled = size %", "size - 1", SPEED),
@@ -112,6 +119,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_SHIFT_WITHIN_GROUP = 1 / 16", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),
+    ],
+    "noiseflow/io/angles.py": [("stacklevel=", "numbers", WARNED)],
+    "noiseflow/io/mrc.py": [
+        ("stacklevel=", "numbers", WARNED),
+        ("data.dtype.itemsize > 2", "2", "integers have 1, 2, 4 or 8 bytes"),
     ],
     "recon/projection/projector.py": [
         ("_PANEL = 32", "numbers", SPEED),

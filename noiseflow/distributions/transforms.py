@@ -201,7 +201,7 @@ class Spline:
         if self.between is not None:
             (row, weight), (_, count) = self.between, knots.shape
             return between_rows(knots.reshape(-1), row * count + index, weight, step=count)
-        index = index + torch.zeros(knots.shape[:-1], dtype=torch.long, device=index.device)
+        index = index.broadcast_to(torch.broadcast_shapes(index.shape, knots.shape[:-1]))
         return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
 
 

@@ -73,7 +73,7 @@ class SliceProjector(Projector):
             )
         self.tilt_angles = angles
         self.depth, self.width, self.detector_width = depth, width, detector_width
-        self.detector_offset = np.broadcast_to(offsets.reshape(-1), angles.shape)
+        self.detector_offset = np.broadcast_to(offsets.ravel(), angles.shape)
         self._halves: dict[tuple[int, ...], SliceProjector] = {}
         if torch.device(device).type == "cpu":
             self.transposed = self._by_panels(dtype)

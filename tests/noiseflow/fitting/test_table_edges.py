@@ -118,11 +118,13 @@ def test_a_model_that_outgrows_its_table_gets_a_finer_one_when_checked() -> None
 def test_rows_grow_where_signals_leave_them_and_not_for_a_few_strays() -> None:
     model, observation = noiseflow.Gaussian(0.1), spread()
     found = ObservationTable(model, observation, 0.0, 1.0)
+    laid_out_for = found.state()["laid_out_for"]
     strays = torch.cat([torch.linspace(0.1, 0.9, 4000), torch.tensor([5.0, -5.0, 6.0])])
     found.cover(model, strays)
     assert (found.low, found.high) == (0.0, 1.0)
     found.cover(model, torch.full((100,), math.nan))
     assert (found.low, found.high) == (0.0, 1.0)
+    assert found.state()["laid_out_for"] is laid_out_for
     found.cover(model, torch.cat([torch.zeros(10), torch.linspace(0.0, 1.5, 1000)]))
     assert found.low == 0.0  # many signals on the first row are not below it
     assert found.high == pytest.approx(1.5 + 0.2 * 1.5, rel=2e-3)  # a fifth beyond, so that it need not grow again soon
@@ -213,6 +215,22 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     assert narrow.high - narrow.low < 1e-5
     distant = ObservationTable(model, observation - 1000, -1000.0, -1000.0)
     assert torch.tensor(distant.high) > torch.tensor(distant.low)  # in single precision
+
+
+class Partly(torch.nn.Module):
+    """Normal noise whose likelihood cannot be computed for the weakest signals."""
+
+    def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
+        class Law(torch.distributions.Normal):
+            def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+                return torch.where(self.loc < 0.1, math.nan, super().log_prob(value))
+
+        return Law(signal, torch.full_like(signal, 0.1), validate_args=False)
+
+
+def test_signals_whose_likelihood_cannot_be_computed_do_not_count_for_the_error() -> None:
+    observation = 0.7 + 0.05 * spread()
+    assert ObservationTable(Partly(), observation, 0.0, 1.0).error < 1e-2
 
 
 def test_some_pixels_are_looked_up_as_all_of_them() -> None:

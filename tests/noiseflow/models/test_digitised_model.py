@@ -53,6 +53,8 @@ def test_groups_of_pixels_that_a_limit_clips_are_left_out_or_mirrored(sign: floa
     signal = sign * torch.linspace(0.0, 1.5, 64_000)
     observation = signal + 0.1 * torch.randn(signal.shape, generator=generator)
     observation[::40] = signal[::40]  # neither side's: they would be mirrored onto themselves
+    limit = (sign * signal - 1.0).abs() < 1e-3
+    signal[limit] = sign
     low, high = (-math.inf, 1.0) if sign > 0 else (-1.0, math.inf)
     model = noiseflow.Digitised(noiseflow.Gaussian(), 0.0, low, high)
     clipped = observation.clamp(low, high)
@@ -68,6 +70,8 @@ def test_groups_of_pixels_that_a_limit_clips_are_left_out_or_mirrored(sign: floa
     free = sign * (clipped - signal) < 0
     assert torch.equal(kept[near], free[near])
     assert not kept[reach > 1.03].any()
+    assert int(limit.sum()) > 50
+    assert not kept[limit].any()  # of a signal on the limit nothing tells how far the noise would reach beyond
     spread = (seen - signal)[near & kept]
     assert float(spread.std()) == pytest.approx(0.1, rel=0.05)
     assert float(spread.mean()) == pytest.approx(0.0, abs=0.005)

@@ -33,6 +33,15 @@ def test_a_block_is_taken_where_the_data_gain_more_than_its_faces_cost(gain, tak
     assert int(mask.sum()) == (size * block * block if taken else 0)
 
 
+def test_a_margin_wider_than_the_volume_fills_it():
+    rough = torch.zeros(2, 3, 9)
+    rough[0, 0, 0] = 1.0
+    mask = Occupancy(rough, (2, 3, 9), margin=6).mask  # (z, x, y)
+    assert mask.shape == (2, 9, 3)
+    assert mask.any(1).all()
+    assert mask.all(0).all(1).tolist() == [True] * 7 + [False] * 2
+
+
 def test_blocks_that_gain_nothing_stay_empty_though_they_cost_nothing():
     occupancy = Occupancy(torch.zeros(1, 1, 1), (8, 8, 8))
     projector = SliceProjector(tilt_angles=[0.0], depth=8, width=8)
