@@ -190,8 +190,7 @@ def test_settings_of_the_pages_name_installed_extensions_only() -> None:
 def test_denoiser_named_in_the_guide_takes_an_image() -> None:
     from recon.denoise.denoisers import find_denoiser
 
-    (named,) = re.findall(
-        r"--denoiser (\w[\w.]*:\w+)", (ROOT / "docs" / "guide" / "extend.md").read_text(encoding="utf-8")
-    )
+    code = "".join(blocks(ROOT / "docs" / "guide" / "extend.md", "sh"))
+    (named,) = re.findall(r"--denoiser (\S+)", code)
     images = np.random.default_rng(0).random((2, 12, 14), dtype=np.float32)
     assert find_denoiser(named, images)(images[0]).shape == (12, 14)
