@@ -178,12 +178,12 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
     first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
     if mean.shape != first.shape:
         raise ValueError(
-            f"{dark.name} is {mean.shape} and the exposures are {first.shape} pixels; take dark frames with the same "
+            f"{dark.name}: {mean.shape} pixels, but the exposures have {first.shape}; take dark frames with the same "
             "binning and region"
         )
     if mean.mean() >= first.mean():
         raise ValueError(
-            f"{dark.name} has the mean {mean.mean():.5g} and the exposure {first.mean():.5g} counts; dark frames cannot be the "
+            f"{dark.name}: mean {mean.mean():.5g} counts, the exposure {first.mean():.5g}; dark frames cannot be the "
             "brighter ones: swap them, or take them at the same offset setting"
         )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)

@@ -185,3 +185,12 @@ def test_settings_of_the_pages_name_installed_extensions_only() -> None:
     assert [importlib.import_module(extension).__name__ for extension in settings["extensions"]] == settings[
         "extensions"
     ]
+
+
+def test_denoiser_named_in_the_guide_takes_an_image() -> None:
+    from recon.denoise.denoisers import find_denoiser
+
+    code = "".join(blocks(ROOT / "docs" / "guide" / "extend.md", "sh"))
+    (named,) = re.findall(r"--denoiser (\S+)", code)
+    images = np.random.default_rng(0).random((2, 12, 14), dtype=np.float32)
+    assert find_denoiser(named, images)(images[0]).shape == (12, 14)
