@@ -197,6 +197,18 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
         measure_volume(tmp_path / "v.mrc")
 
 
+def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
+    density = particles(24, generator=np.random.default_rng(1))
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
+    noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
+    settings = {"noise_model": ACQUISITIONS["clipped"].noise(), "weight": 0.4, "uncertainty": 16, "num_steps": 60}
+    whole = reconstruct(noisy, method="joint-supervised", **settings).uncertainty.std.attenuation
+    blocks = {"slices_at_once": 6, "scratch": tmp_path / "v.npy"}
+    parts = reconstruct(noisy, method="joint-supervised", **settings, **blocks).uncertainty.std.attenuation
+    inside = density > 0.05 * density.max()
+    assert parts[inside].mean() == pytest.approx(whole[inside].mean(), rel=0.05)
+
+
 def test_a_new_volume_without_error_bars_does_not_keep_those_of_the_old(scene, tmp_path):
     np.save(tmp_path / "tilts.npy", scene.images)
     np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)
