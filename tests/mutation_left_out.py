@@ -63,6 +63,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     ],
     "noiseflow/distributions/digitised.py": [
         ("like=torch.empty(0,", "numbers", KIND),
+        (
+            "if inside.shape == self.batch_shape",
+            "inside.shape == self.batch_shape",
+            "both ways give the same (test_clipping_alone_keeps_the_density_between_the_limits takes both shapes), one is faster",
+        ),
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
         ("_ROUNDINGS = 8", "numbers", "slack for rounding errors, of which one or two occur"),
         ("_MOST_LEVELS = 2**16", "numbers", SPEED),
@@ -94,6 +99,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "size < len(SIZES)",
             "the first table of residuals would be the first of levels again, which was too coarse: the next finer one is taken",
         ),
+        ("math.isfinite(low + high)", "low + high", "like a sum, a difference is finite where both are"),
         ("stalled = size %", "numbers", SPEED),
         ("stalled = size %", "size % len(SIZES) > 0", SPEED),
         ("stalled = size %", "size - 1", SPEED),

@@ -46,7 +46,7 @@ def test_a_measured_offset_is_a_normal_prior(levels):
 def test_nothing_outside_the_priors_is_possible(levels):
     posterior = LogPosterior(levels, offset=(99.0, 0.7))
     low, high = READ_NOISE_RANGE
-    sets = np.array([[2.0, 99.0, 0.99 * low], [2.0, 99.0, 1.01 * high], [2.0, posterior.brightest + 1, 1.5]])
+    sets = np.array([[2.0, 99.0, 0.99 * low], [2.0, 99.0, 1.01 * high], [2.0, posterior.brightest, 1.5]])
     assert np.isneginf(posterior(posterior.coordinates(*sets.T))).all()
     assert np.isfinite(posterior(posterior.coordinates(2.0, 99.0, 1.01 * low))).all()
 
