@@ -194,3 +194,14 @@ def test_denoiser_named_in_the_guide_takes_an_image() -> None:
     (named,) = re.findall(r"--denoiser (\S+)", code)
     images = np.random.default_rng(0).random((2, 12, 14), dtype=np.float32)
     assert find_denoiser(named, images)(images[0]).shape == (12, 14)
+
+
+def test_benchmark_pages_name_the_commit_of_their_figures() -> None:
+    add = runpy.run_path(str(ROOT / "docs" / "page_dates.py"))["add"]
+    for page in sorted((ROOT / "docs" / "benchmarks").glob("*.md")):
+        source = [page.read_text(encoding="utf-8")]
+        add(None, f"benchmarks/{page.stem}", source)
+        assert re.search(r"commit [0-9a-f]{7}", source[0]), page.name
+    untouched = ["text"]
+    add(None, "guide/files", untouched)
+    assert untouched == ["text"]
