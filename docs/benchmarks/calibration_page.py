@@ -129,8 +129,9 @@ def _emva(found: Part) -> str:
     ]
     text = (
         f"`python docs/benchmarks/calibration_emva.py`, commit {found['commit']}. The packages emva1288 (the standard's "
-        f"reference implementation) and getframes measure the same frames: flats at {found['levels']} levels up to 1.2 saturation "
-        f"capacities, {found['frames']} frames each, and {found['darks']} dark frames, 200² pixels; levels of which half the "
+        f"reference implementation) and getframes measure the same frames: flats at {found['levels']} levels up to 1.2 "
+        f"saturation capacities, {found['frames']} frames each, and {found['darks']} dark frames, 200² pixels; "
+        "levels of which half the "
         "pixels are at the converter's end are left out. The emva1288 package takes two frames of each level for temporal "
         "noise; its linearity error is the mean of the absolute deviations over the standard's range, and it reports their "
         "extremes. Saturation is the level of largest variance, so that it comes in steps of the levels (7.5 %). noiseflow's "
