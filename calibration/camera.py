@@ -119,7 +119,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
         add(
             "few levels",
             "doubtful",
-            f"{len(figures.levels)} level(s) of light cannot show a bent line; give three or more.",
+            f"{len(figures.levels)} level{'s' * (len(figures.levels) > 1)} of light cannot show a bent line; give three or more.",
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level reaches saturation: capacity and dynamic range are lower bounds.")

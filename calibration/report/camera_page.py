@@ -25,7 +25,7 @@ def describe_camera_verdict(camera: Camera) -> list[str]:
     if grade == "good":
         return ["Verdict: good. The figures can be believed within their intervals; no assumption fails its test."]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"{one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.reasons)]
+    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.reasons)]
 
 
 def write_camera_report(

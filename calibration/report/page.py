@@ -226,7 +226,7 @@ def describe_verdict(findings: Findings) -> list[str]:
             "Verdict: good. Gain, offset and read noise can be believed within their intervals; no assumption fails its test."
         ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"{one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
+    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:

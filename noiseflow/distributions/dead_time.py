@@ -116,7 +116,7 @@ class DeadTimeDistribution(PoissonDistribution):
     def variance(self) -> Tensor:
         """m − m² + 2m·Σ_k M_k."""
         mean = self.rate.double()
-        most = int(torch.nan_to_num(mean + 12 * (torch.sqrt(mean) + 1)).max()) if mean.numel() else 0
+        most = int(torch.nan_to_num(mean + 12 * (torch.sqrt(mean) + 1)).detach().max()) if mean.numel() else 0
         total = torch.zeros_like(mean)
         for count in range(1, most + 1):
             total = total + self._excess(torch.full_like(mean, float(count)), early=True)

@@ -1,6 +1,7 @@
 """A counter with dead time: its law is exact, its sampler agrees, and a fit finds the dead time."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -79,3 +80,11 @@ def test_fit_finds_the_dead_time_and_counts_at_once_is_better_than_poisson():
 def test_dead_time_out_of_range_is_refused():
     with pytest.raises(ValueError, match="between 0 and 1"):
         noiseflow.DeadTimeCounter(1.5)
+
+
+def test_variance_with_a_gradient_warns_of_nothing() -> None:
+    signal = torch.tensor([2.0, 10.0], requires_grad=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        slope = torch.autograd.grad(noiseflow.DeadTimeCounter(0.02)(signal).variance.sum(), signal)[0]
+    assert bool((slope > 0).all())
