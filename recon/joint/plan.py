@@ -106,6 +106,7 @@ class FitStage:
     fits: int = 1
 
 
+_DESCRIBE = 600  # misfit of a quiet series spans three decades: 60 steps left a needle's noise model ten times too wide
 _START = (
     10  # steps of a noise model that is measured rather than fitted: of one parameter, or one width at every signal
 )
@@ -129,7 +130,7 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     usual = schedule.quiet if facts.quiet else schedule.whole
     stages += _on_the_whole(facts, schedule, usual if num_steps is None else num_steps)
     if facts.quiet and facts.simple_is_final and not facts.settled:
-        stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.learn, standardise=True))
+        stages.append(FitStage("describe noise", "noise", "whole", "chosen", _DESCRIBE, standardise=True))
     return stages
 
 

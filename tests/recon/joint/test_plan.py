@@ -106,7 +106,7 @@ PLANS = {
         whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
         whole  go on                        signal      60  simple, rate 0.6, offset held, half resolution
         whole  fit                          signal      120  simple, rate 0.6, offset held
-        whole  describe noise               noise       60  chosen
+        whole  describe noise               noise       600  chosen
         """,
     ),
 }

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
+from recon.benchmarks.needle import load as load_needle
 from recon.commands.measure import measure
 from recon.fields.fields import VoxelField
 from recon.fields.regularisers import Regulariser
@@ -195,6 +196,16 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     (tmp_path / "v_bias.mrc").unlink()
     with pytest.raises(ValueError, match="missing"):
         measure_volume(tmp_path / "v.mrc")
+
+
+def test_noise_model_of_a_quiet_series_is_as_wide_as_what_the_fit_leaves():
+    series = load_needle()
+    found = reconstruct(series, method="joint", weight=0.34, num_steps=60)
+    signal, seen = (torch.from_numpy(np.asarray(each, np.float32).ravel()) for each in (found.projections, series.images))
+    bright = signal > signal.quantile(0.8)
+    with torch.no_grad():
+        width = found.noise_model.model(signal[bright]).variance.mean().sqrt()
+    assert 0.5 < float(width / (seen - signal)[bright].std()) < 2
 
 
 def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
