@@ -124,6 +124,7 @@ def test_rows_grow_where_signals_leave_them_and_not_for_a_few_strays() -> None:
     assert (found.low, found.high) == (0.0, 1.0)
     found.cover(model, torch.full((100,), math.nan))
     assert (found.low, found.high) == (0.0, 1.0)
+    found.cover(model, torch.linspace(0.0, 1.0, 4000).repeat(2))  # many signals on the outermost rows are within them
     assert found.state()["laid_out_for"] is laid_out_for
     found.cover(model, torch.cat([torch.zeros(10), torch.linspace(0.0, 1.5, 1000)]))
     assert found.low == 0.0  # many signals on the first row are not below it

@@ -129,6 +129,11 @@ def test_written_values_come_back_exactly(tmp_path: Path, dtype: str) -> None:
         np.testing.assert_array_equal(io.read(tmp_path / "a.mrc").data, values)
 
 
+def test_whole_numbers_in_single_precision_stay_so(tmp_path: Path) -> None:
+    io.write(tmp_path / "a.mrc", np.array([[1.0, 2.0]], np.float32))
+    assert io.read(tmp_path / "a.mrc").data.dtype == np.float32
+
+
 def test_integers_that_would_lose_digits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="lose digits"):
         io.write(tmp_path / "a.mrc", np.array([[2**24 + 1, 0]]))
