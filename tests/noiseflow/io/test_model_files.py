@@ -1,6 +1,9 @@
 """Noise-model files: the same model comes back, and nothing else is let in."""
 
+import inspect
 import json
+import os
+import resource
 from pathlib import Path
 
 import pytest
@@ -8,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 import noiseflow
-from noiseflow.io.model_files import kinds, read_metadata
+from noiseflow.io.model_files import FORMAT_VERSION, kinds, read_metadata
 
 SIGNAL = torch.linspace(0, 1, 7)[None]
 WRAPPERS = {
@@ -129,3 +132,26 @@ def test_registered_model_is_saved_and_loaded_inside_others_too(tmp_path: Path) 
 def test_only_noise_models_of_a_free_name_are_registered(kind: type, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         noiseflow.register(kind)
+
+
+@pytest.mark.parametrize("kind", sorted(kinds()))
+def test_no_size_that_a_file_claims_costs_memory(kind: str, tmp_path: Path) -> None:
+    """Every whole number as large as any may be without parameters for it, and every list long: refused, or small."""
+    noiseflow.load(noiseflow.save(noiseflow.SplineFlow(), tmp_path / "usual.safetensors"))  # imports what loading needs
+    defaults = {name: each.default for name, each in inspect.signature(kinds()[kind].__init__).parameters.items()}
+    claims = {name: 1024 for name, value in defaults.items() if type(value) is int}
+    claims |= {name: [1024] * 1024 for name, value in defaults.items() if isinstance(value, (list, tuple))}
+    metadata = {"format": "noiseflow noise model", "format_version": str(FORMAT_VERSION), "units": "counts"}
+    metadata["model"] = json.dumps({"kind": kind, "arguments": claims})
+    save_file({"a": torch.zeros(1)}, tmp_path / "claims.safetensors", metadata)
+    child = os.fork()
+    if child == 0:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        try:
+            noiseflow.load(tmp_path / "claims.safetensors")
+        except ValueError:
+            small = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024  # KiB
+            os._exit(0 if small else 1)
+        finally:
+            os._exit(2)
+    assert os.waitpid(child, 0)[1] == 0
