@@ -12,6 +12,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from noiseflow.distributions.pixels import broadcast_shapes
+
 
 class Transform(Protocol):
     """An increasing map of the real line."""
@@ -201,7 +203,7 @@ class Spline:
         if self.between is not None:
             (row, weight), (_, count) = self.between, knots.shape
             return between_rows(knots.reshape(-1), row * count + index, weight, step=count)
-        index = index.broadcast_to(torch.broadcast_shapes(index.shape, knots.shape[:-1]))
+        index = index.broadcast_to(broadcast_shapes(index.shape, knots.shape[:-1]))
         return knots.expand(*index.shape, knots.shape[-1]).gather(-1, index[..., None]).squeeze(-1)
 
 
