@@ -160,7 +160,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
     chosen, found = Settings(**settings), find_method(method)
     if chosen.noise_model is not None and not found.keeps_noise_model:
         able = [name for name in method_names() if find_method(name).keeps_noise_model]
-        raise ValueError(f"--noise-model: method {method} has no use for one; use --method {', '.join(able)}")
+        raise ValueError(f"--noise-model: method {method} takes none; use --method {', '.join(able)}")
     wanted = {
         "defocus": chosen.defocus,
         "regulariser": chosen.regulariser != DEFAULT,
