@@ -124,8 +124,8 @@ class ExcessNoise(ElectronCounter):
             climber.zero_grad()
             value: Tensor = -model(seen).log_prob(values).clamp(min=-60.0).mean()
             value.backward()  # type: ignore[no-untyped-call]
-            if float(value) < best:
-                best, kept = float(value), self.change.detach().clone()
+            if float(value.detach()) < best:
+                best, kept = float(value.detach()), self.change.detach().clone()
             return value
 
         with torch.enable_grad():
