@@ -201,11 +201,15 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
 def test_noise_model_of_a_quiet_series_is_as_wide_as_what_the_fit_leaves():
     series = load_needle()
     found = reconstruct(series, method="joint", weight=0.34, num_steps=60)
-    signal, seen = (torch.from_numpy(np.asarray(each, np.float32).ravel()) for each in (found.projections, series.images))
+    signal, seen = (
+        torch.from_numpy(np.asarray(each, np.float32).ravel()) for each in (found.projections, series.images)
+    )
     bright = signal > signal.quantile(0.8)
     with torch.no_grad():
         width = found.noise_model.model(signal[bright]).variance.mean().sqrt()
     assert 0.5 < float(width / (seen - signal)[bright].std()) < 2
+    assert found.caution is None
+    assert "upper limit" in replace(found, uncertainty=Uncertainty(found.volume, found.volume, 2)).caution
 
 
 def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
