@@ -85,6 +85,16 @@ class Reconstruction:
         return math.nan if self.signal_model is None else float(self.signal_model.weight)
 
     @property
+    def caution(self) -> str | None:
+        """What readers of the error bars must know, where the series is quiet."""
+        if self.uncertainty is None or self.likelihood is None:
+            return None
+        return (
+            "error bars of a quiet series are an upper limit: the fit was least squares with one width for all pixels, "
+            "which is too wide where the sample is dark"
+        )
+
+    @property
     def weights_tried(self) -> dict[float, float]:
         """Weight of the regulariser → held-out negative log-likelihood, nats per pixel; empty where it was not chosen."""
         return {} if self.weight_choice is None else self.weight_choice.tried

@@ -90,6 +90,8 @@ class Targets:
         output.line(f"volume: {self.volume}")
         for path in bars.values():
             output.line(f"error bars: {path}")
+        if outcome.caution is not None:
+            output.line(outcome.caution)
         if outcome.uncertainty is not None and outcome.uncertainty.shells is not None:
             reach = outcome.uncertainty.shells.in_words(outcome.volume.voxel_size)
             output.line(f"expected resolution (correlation of 0.5 with the truth): {reach}")

@@ -69,6 +69,8 @@ def reconstruction_report(
     _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
     if outcome.uncertainty is not None:
         add_error_bars(report, tilt_series, outcome.volume, outcome.uncertainty, _UNITS[tilt_series.mode])
+        if outcome.caution is not None:
+            report.text(f"{outcome.caution[0].upper()}{outcome.caution[1:]}.")
     _add_tilts(report, tilt_series, outcome)
     _add_response(report, tilt_series, outcome)
     _add_noise(report, tilt_series, outcome)

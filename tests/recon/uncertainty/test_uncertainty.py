@@ -208,6 +208,8 @@ def test_noise_model_of_a_quiet_series_is_as_wide_as_what_the_fit_leaves():
     with torch.no_grad():
         width = found.noise_model.model(signal[bright]).variance.mean().sqrt()
     assert 0.5 < float(width / (seen - signal)[bright].std()) < 2
+    assert found.caution is None
+    assert "upper limit" in replace(found, uncertainty=Uncertainty(found.volume, found.volume, 2)).caution
 
 
 def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
