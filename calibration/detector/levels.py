@@ -206,11 +206,11 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS
 
     Example:
         >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Pixel values
+        >>> from calibration.detector.levels import Readings
         >>> rng = np.random.default_rng(0)
         >>> electrons = np.linspace(20, 400, 20_000)
         >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Pixel values(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
         >>> levels.signal.shape
         (16,)
     """

@@ -46,11 +46,11 @@ class PhotonTransfer:
 
     Example:
         >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Pixel values
+        >>> from calibration.detector.levels import Readings
         >>> rng = np.random.default_rng(0)
         >>> electrons = np.linspace(20, 400, 20_000)
         >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Pixel values(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
         >>> line = calibration.fit_photon_transfer([levels])
         >>> round(line.gain, 1), line.signal.shape
         (2.0, (16,))
@@ -85,11 +85,11 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
 
     Example:
         >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Pixel values
+        >>> from calibration.detector.levels import Readings
         >>> rng = np.random.default_rng(0)
         >>> electrons = np.linspace(20, 400, 20_000)
         >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Pixel values(counts, 100 + 2 * electrons, electrons, step=0.0)])
+        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
         >>> line = calibration.fit_photon_transfer([levels])
         >>> round(line.gain, 1)
         2.0
