@@ -57,12 +57,12 @@ covered). Column "wider by" is the factor on the half-width at which 90 % of the
 covered."""
 _LEFT_OUT = """Goal: 87 to 93 % of the pixels, and uniform ranks. A Gaussian's intervals hold the right share of clipped pixels
 by chance; the ranks show what is wrong: a distance below 0.02 under the right kind of noise, 0.17 and more
-under a Gaussian. On the real needle the check still fails: intervals are too wide. Two causes were found. The noise
+under a Gaussian. On the real needle the check still fails: intervals are too wide. One cause was found. The noise
 model that describes a quiet series was not fitted to the end and was up to ten times too wide (a standard deviation of
 4900 against 720 detector units among bright pixels; now 630, and 88 % of the fitted pixels are covered): mended, which
-took the share from 98.2 to the one below. The other is open: a quiet series is fitted and sampled by least squares,
-one width for all pixels, though what the volume leaves is about thirty times smaller where the sample is dark, so that
-samples spread too much there. What it leaves is also misfit and no noise: it has a shape, and ranks need not be
+took the share from 98.2 to the one below. Another is likely, and was not tested: a quiet series is fitted and sampled by
+least squares, one width for all pixels, though what the volume leaves is about thirty times smaller where the sample is
+dark, so that samples would spread too much there. What it leaves is also misfit and no noise: it has a shape, and ranks need not be
 uniform under any noise model. Do not take the error bars of a quiet series for more than an upper limit."""
 _LOW, _HIGH = 0.85, 0.95
 _GAP = 8  # every eighth tilt is left out

@@ -52,12 +52,13 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         return reconstructor(settings, options).plan(tilt_series, grid)
 
     def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
-        fit = reconstructor(settings, options)
-        settled = fit.settle(tilt_series, grid, progress=settings.progress)
+        fit, level = reconstructor(settings, options), _level(tilt_series, settings)
+        settled = fit.settle(lowered_by(tilt_series, level), grid, progress=settings.progress)
         solve = FittedBlock(
             fit,
             settled.portable(),
             grid,
+            level,
             settings.progress,
             settled.signal_model,
             settings.uncertainty,
@@ -67,6 +68,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
             result = Reconstruction(volume, projections, name, *known)
+            result = _raised(result, level, chosen="noise_model" not in options(settings))
             return replace(result, choices=_choices(result, settings, tilt_series))
 
         def forget(block: Block) -> None:
@@ -95,6 +97,7 @@ class FittedBlock:
         fit: the joint fit.
         settled: by it, for all slices.
         grid: of the whole volume.
+        level: that is taken off the images.
         progress: called with the steps done, those expected, and a note; None on another machine.
         near: a signal model whose projector can be used again; None on another machine.
         num_samples: that error bars come from; 0 for none.
@@ -104,13 +107,14 @@ class FittedBlock:
     fit: JointReconstructor
     settled: Settled
     grid: VolumeGrid
+    level: float = 0.0
     progress: Progress | None = None
     near: TomographySignal | None = None
     num_samples: int = 0
     run_stage: RunStage = run_stage
 
     def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, ...]:
-        fit = replace(self.fit, prefix=self.prefix_of(block))
+        fit, tilt_series = replace(self.fit, prefix=self.prefix_of(block)), lowered_by(tilt_series, self.level)
         grid = replace(self.grid, height=block.wide.stop - block.wide.start)
         projector = None if self.near is None else self.near.projector
         found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)
@@ -148,9 +152,12 @@ def _level(tilt_series: TiltSeries, settings: Settings) -> float:
 
 @torch.no_grad()
 def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruction:
-    """The result of lowered images in the units of those given; noise models that were `chosen` may depend on the level."""
+    """The result of lowered images in the units of those given; noise models that were `chosen` may depend on the level.
+    Projections are raised where they are."""
     if not level:
         return result
+    for image in result.projections:
+        image += np.float32(level)
     model, noise_model = result.signal_model, result.noise_model
     if model is not None and isinstance(model.image_formation, Linear):
         response = model.image_formation
@@ -158,7 +165,7 @@ def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruc
     if chosen and noise_model is not None:
         noise_model = at_level(as_noise_model(noise_model), level)
     # the likelihood, where it is another, is least squares: the same at every level
-    return replace(result, projections=result.projections + np.float32(level), noise_model=noise_model)
+    return replace(result, noise_model=noise_model)
 
 
 def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries) -> dict[str, float | str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 
 _TWINS = 0.1  # of the mean step: tilts so near to each other show the same view
@@ -85,10 +86,10 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
     """Images minus a level, subtracted in float64 and kept in float32; the series itself where the level is zero."""
     if not level:
         return tilt_series
-    lowered = np.empty(tilt_series.images.shape, dtype=np.float32)
-    for image, result in zip(tilt_series.images, lowered, strict=True):
-        result[...] = image.astype(np.float64) - level
-    return replace(tilt_series, images=lowered)
+    images = tilt_series.images
+    lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
+    kept = mapped.mapped_copy(lowered, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+    return tilt_series.with_images(kept, tilt_series.mask)
 
 
 def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
