@@ -35,6 +35,10 @@ SURE = 10.0
 """Standard errors by which the pixels' variances must differ: the logarithm of a variance of two frames has heavier tails than
 that error allows for."""
 
+COARSE = 0.5
+"""Rounding steps of read noise below which the variance of rounded values depends by over 3 % on where between two codes a
+pixel's mean lies, so that the pixels would differ though their noise does not."""
+
 LEAST_READ = 0.01
 """Share of the usual variance below which no pixel's read noise is put: rounding hides less."""
 
@@ -167,11 +171,12 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
 
 
 def read_variance(figures: CameraFigures, step: float) -> Image | None:
-    """(y, x) read-noise variance, counts², as well as the dark frames tell it; None where the pixels do not differ, or without
-    dark frames.
+    """(y, x) read-noise variance, counts², as well as the dark frames tell it; None where the pixels do not differ, where
+    rounding hides it, or without dark frames.
 
     A variance of few frames scatters by itself. Its logarithm scatters by more where the pixels differ; the scaled inverse χ²
-    distribution of that spread is the prior, and the posterior's mean is returned (doi:10.2202/1544-6115.1027).
+    distribution of that spread is the prior, and the inverse of the posterior mean of 1/variance is returned, whose average is a
+    little below that of the variances (doi:10.2202/1544-6115.1027).
 
     Args:
         figures: of the camera.
@@ -180,10 +185,11 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     from scipy.optimize import brentq
     from scipy.special import digamma, polygamma
 
-    if figures.dark is None:
+    dark = figures.dark
+    if dark is None or dark.variance - step**2 / 12 < (COARSE * step) ** 2:
         return None
-    freedom = figures.dark.frames - 1
-    measured = np.maximum(figures.dark.noise, max(step**2 / 12, 1e-6 * float(figures.dark.noise.mean())))
+    freedom, drift = dark.frames - 1, max(float(dark.noise.mean()) - dark.variance, 0.0)
+    measured = np.maximum(dark.noise - drift, max(step**2 / 12, 1e-6 * dark.variance))
     logarithm = np.log(measured) - digamma(freedom / 2) + np.log(freedom / 2)
     own = float(polygamma(1, freedom / 2))
     excess, error = float(np.var(logarithm)) - own, own * np.sqrt(2 / measured.size)

@@ -60,7 +60,9 @@ class ArrayDistribution:
         for value in values:
             _, numbers, masked = _taken_apart(value)
             if masked is not None:
-                numbers = np.where(masked, np.float32("nan"), np.asarray(numbers))
+                numbers = np.asarray(numbers)
+                unknown = numbers.dtype.type("nan") if numbers.dtype.kind == "f" else np.float32("nan")
+                numbers = np.where(masked, unknown, numbers)
             tensor = as_tensor(numbers).to(self._like.device)
             narrow = (
                 tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype

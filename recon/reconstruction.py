@@ -90,8 +90,8 @@ class Reconstruction:
         if self.uncertainty is None or self.likelihood is None:
             return None
         return (
-            "error bars of a quiet series are an upper limit: the fit was least squares with one width for all pixels, "
-            "which is too wide where the sample is dark"
+            "error bars of a quiet series cannot be relied on: the fit was least squares with one width for all pixels, "
+            "which is too wide where the sample is dark, and misalignment is in no error bar"
         )
 
     @property

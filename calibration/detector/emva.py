@@ -162,7 +162,8 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     used = (signal > 0.05 * (top - offset)) & (signal < 0.95 * (top - offset))
     if used.sum() < 3:
         raise NotMeasurable(
-            f"{int(used.sum())} of {len(signal)} levels between 5 % and 95 % of the brightest; linearity needs three: give more"
+            f"{int(used.sum())} of {len(signal)} levels lie between 5 % and 95 % of the brightest; linearity needs three: "
+            "give more"
         )
     signal, time = signal[used], time[used]
     weight = 1 / signal**2  # relative departures count (EMVA 1288, release 3.1, section 6.7)

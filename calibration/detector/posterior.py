@@ -110,6 +110,8 @@ class DetectorPosterior:
         return self._by_both_priors(2)
 
     def _by_both_priors(self, column: int) -> Interval:
+        if not self.levels:
+            return _interval(self.samples[:, column])
         gain, offset, read_noise = self.samples.T
         values, read = self.samples[:, column], (gain * read_noise) ** 2
         shot = gain * np.maximum(self._reference() - offset, 0.0)

@@ -62,8 +62,9 @@ model that describes a quiet series was not fitted to the end and was up to ten 
 4900 against 720 detector units among bright pixels; now 630, and 88 % of the fitted pixels are covered): mended, which
 took the share from 98.2 to the one below. Another is likely, and was not tested: a quiet series is fitted and sampled by
 least squares, one width for all pixels, though what the volume leaves is about thirty times smaller where the sample is
-dark, so that samples would spread too much there. What it leaves is also misfit and no noise: it has a shape, and ranks need not be
-uniform under any noise model. Do not take the error bars of a quiet series for more than an upper limit."""
+dark, so that samples would spread too much there. What it leaves is also misfit and no noise: it has a shape, and ranks
+need not be uniform under any noise model; misalignment is in no error bar. The program says that the error bars of a quiet series
+cannot be relied on."""
 _LOW, _HIGH = 0.85, 0.95
 _GAP = 8  # every eighth tilt is left out
 Row = dict[str, Any]

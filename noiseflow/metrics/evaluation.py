@@ -159,6 +159,8 @@ def divergence(
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
     low, high = np.quantile(residual, (0.001, 0.999))
+    if not high > low:  # nearly all residuals are equal, as of counts: bins of a few hundredths of a count
+        low, high = low - 1.0, low + 2.0
     edges = np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]])
     counts = np.histogram(residual, edges)[0]
     masses = residual_masses(noise_model, signal, torch.from_numpy(edges))
@@ -190,7 +192,8 @@ def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> int:
         return _SIGNAL_GROUPS
     bins = edges[torch.isfinite(edges)].diff()
     lengths = [float(getattr(module, "step", 0.0)) for module in noise_model.modules()]
-    least = min([float(bins.median()) if bins.numel() else math.inf, *(each for each in lengths if each > 0)])
+    widths = [float(bins.median()) if bins.numel() else math.inf, *lengths]
+    least = min((width for width in widths if width > 0), default=math.inf)
     wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * least)
     return int(min(max(wanted, _SIGNAL_GROUPS), _MOST_SIGNAL_GROUPS))
 

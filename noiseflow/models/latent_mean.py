@@ -24,9 +24,8 @@ class LatentMean:
     """Latent shifts at chosen signals, kept from call to call while the detector and the range of signals stay as they are.
 
     With F(o) = Φ(T(z(o) − c)) the mean pixel value is o_last − ∫F do up to the last node; z(o), the detector's latent, is
-    computed once on nodes fine enough for the detector's read noise, and c follows by Newton's method. Signals are dense
-    where the law
-    changes fastest: just above the offset, on a logarithmic scale, and on a scale of the square root of the rate.
+    computed once on nodes fine enough for the detector's read noise, and c follows by Newton's method. Signals are dense where
+    the law changes fastest: just above the offset, on a logarithmic scale, and on a scale of the square root of the rate.
     """
 
     _shift: Tensor

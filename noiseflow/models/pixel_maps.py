@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -56,6 +58,10 @@ class WithMaps(ModelAround):
         shape: Sequence[int] | None = None,
     ) -> None:
         super().__init__(model)
+        if variance is not None and np.ndim(variance) == 0:
+            variance = float(variance)
+            if not 0 < variance < math.inf:
+                raise ValueError(f"a variance of {variance} is not positive; give a positive number or a map")
         given = [each for each in (gain, offset, variance) if each is not None and not isinstance(each, (int, float))]
         sizes = [tuple(each.shape) for each in given] or [tuple(shape or ())]
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:
@@ -91,7 +97,10 @@ class WithMaps(ModelAround):
     def _of_pixels(values: Tensor, signal: Signal) -> Tensor:
         """A map at the pixels of a signal."""
         found = values.reshape(-1)[signal.place] if isinstance(signal, PickedSignal) else values
-        return found.to(values_of(signal).dtype)
+        kind = values_of(signal).dtype
+        return found.to(
+            torch.promote_types(kind, torch.float32) if kind.is_floating_point else torch.get_default_dtype()
+        )
 
     def _at(self, signal: Signal) -> tuple[Tensor, Tensor]:
         """Gain and offset at the pixels of a signal."""

@@ -109,16 +109,17 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
 
 
 def read_shell_band(path: Path) -> ShellBand | None:
-    """The expected shell correlation beside the file of a volume; None where there is none.
+    """The expected shell correlation beside the file of a volume; None where noiseflow has written none.
 
     Raises:
-        ValueError: another table stands there.
+        ValueError: its table was changed.
     """
+    from noiseflow.io.ownership import is_own
     from recon.uncertainty.result import shell_band_path
     from recon.uncertainty.shell_band import ShellBand
 
     beside = shell_band_path(path)
-    return ShellBand.read(beside) if beside.exists() else None
+    return ShellBand.read(beside) if beside.exists() and is_own(beside) else None
 
 
 def _ends(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

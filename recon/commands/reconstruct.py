@@ -157,10 +157,12 @@ def reconstruct(
     from recon.report.page import read_reference
     from recon.scale.cluster import client_of
     from recon.series.tilt_series import VolumeGrid
+    from recon.uncertainty.result import error_bar_paths, shell_band_path
 
     output = Output(json)
     targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
-    require_other(out, tilts, angles, transforms, mask, reference, noise_model)
+    for path in (out, *error_bar_paths(out).values(), shell_band_path(out)):
+        require_other(path, tilts, angles, transforms, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)

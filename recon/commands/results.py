@@ -118,7 +118,7 @@ class Targets:
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
             | prepared.as_dict()
-            | ({"uncertainty": bars} if bars else {})
+            | ({"uncertainty": bars, "caution": outcome.caution} if bars else {})
             | {"slices_at_once": outcome.slices_at_once}
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
@@ -127,7 +127,9 @@ class Targets:
 
     def _remove_former(self, written: dict[str, Path], output: Output) -> None:
         """Error bars of a volume that is no longer there would be read as those of the new one."""
-        beside = error_bar_paths(self.volume) | {"fsc": shell_band_path(self.volume)}
+        pair, band = error_bar_paths(self.volume), shell_band_path(self.volume)
+        whole = all(path.exists() for path in pair.values())  # one of the two alone is another volume of such a name
+        beside = (pair if whole else {}) | {"fsc": band}
         for path in (path for name, path in beside.items() if name not in written and path.exists()):
             if not is_own(path):
                 output.line(f"{path} was not written by noiseflow: it does not belong to the new volume")

@@ -54,7 +54,7 @@ class Schedule:
         refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
         learn: noise-model steps on the whole volume of a quiet series.
         trial: signal steps that compare weights, after the first quarter of those of the volume; in a quiet series as many as
-            the volume takes.
+            the volume takes by default, whatever this number says.
         whole: signal steps of the volume, unless the user gives their number.
         quiet: the same where noise is small: there is more to fit.
         rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.

@@ -67,7 +67,8 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
-            result = Reconstruction(volume, projections, name, *known)
+            quiet = settled.facts.quiet and settled.facts.simple_is_final
+            result = Reconstruction(volume, projections, name, *known, likelihood=settled.simple if quiet else None)
             result = _raised(result, level, chosen="noise_model" not in options(settings))
             return replace(result, choices=_choices(result, settings, tilt_series))
 
@@ -146,8 +147,11 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
-    """What is taken off the images before the fit; nothing under a calibrated noise model, which knows its detector's level."""
-    return 0.0 if settings.noise_model is not None else dark_level(tilt_series)
+    """What is taken off the images before the fit; nothing under a calibrated noise model, which knows its detector's level, and
+    nothing off integers that reach the end of their type, which tells where the detector saturates."""
+    kind = tilt_series.images.dtype
+    saturated = np.issubdtype(kind, np.integer) and tilt_series.images.max() == np.iinfo(kind).max
+    return 0.0 if settings.noise_model is not None or saturated else dark_level(tilt_series)
 
 
 @torch.no_grad()

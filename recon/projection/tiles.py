@@ -19,6 +19,12 @@ from recon.projection.tile import Tile, neighbours_of
 from recon.projection.tile_variation import TileVariation
 
 _TOGETHER, _MOST_TILES = 16, 8
+_ALIKE = 32  # slices fewer apart than this part of the width hold nearly the same columns; each tile copies a part of the matrix
+
+
+def slices_of_a_tile(height: int, width: int) -> int:
+    """How many neighbouring slices share the columns that they list, for a voxel grid of so many slices and columns along x."""
+    return max(_TOGETHER, -(-height // _MOST_TILES), width // _ALIKE)
 
 
 class Tiles:
@@ -42,7 +48,7 @@ class Tiles:
     def __init__(self, mask: Tensor, projector: Projector, *, known: Tiles | None = None) -> None:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
-        together = max(_TOGETHER, -(-height // _MOST_TILES))
+        together = slices_of_a_tile(height, width)
         flat = mask.reshape(depth * width, height)
         rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]

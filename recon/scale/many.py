@@ -136,7 +136,9 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
     with io.atomic_path(path) as partial:
         if path.suffix.lower() == ".json":
             partial.write_text(
-                json.dumps({"written_by": signature(), "series": list(rows)}, indent=1) + "\n", encoding="utf-8"
+                json.dumps({"written_by": signature(), "series": list(rows)}, indent=1) + "\n",
+                encoding="utf-8",
+                newline="\n",
             )
             return
         names = list(dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)]))

@@ -7,13 +7,15 @@ import os
 from pathlib import Path
 from typing import Any
 
+from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 64, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
+_TILE = 0.3  # of the projector's matrix, that each tile of slices copies (`recon.projection.tiles`): 512³, shells and a full slab
 _BASE = 400 * 2**20
-_SHARE = 0.6  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
+_SHARE = 0.7  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
 _STEP = 8  # slices: blocks of a few more or fewer cost as much
 PLENTY = 4 * 2**30
 """Bytes: a whole volume that needs more is reconstructed in blocks, as good and hardly slower (at 256³, 55 s of processor time in
@@ -24,7 +26,7 @@ _TALL = (
 
 
 def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
-    """Bytes that a reconstruction takes at its peak, within some 20 % (measured on 48³ to 160³ voxels).
+    """Bytes that a reconstruction takes at its peak, within some 20 % (measured on 48³ to 1000³ voxels).
 
     Args:
         tilt_series: the images.
@@ -35,8 +37,9 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
     per_voxel, per_pixel = (_PER_VOXEL, _PER_PIXEL) if fitted else (_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL)
     volume = depth * height * width
-    needed: int = _BASE + per_voxel * volume + per_pixel * tilt_series.images.size + _PER_RAY_STEP * ray_steps
-    return needed
+    tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
+    matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
+    return int(_BASE + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
 
 
 def choose_slices(

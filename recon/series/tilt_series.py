@@ -114,15 +114,16 @@ class TiltSeries:
         images are mapped and large.
         """
         tilts = evenly(tilts, self.num_tilts)
-        if not isinstance(tilts, slice) and is_mapped(self.images) and self.images.nbytes > mapped.IN_MEMORY:
-            numbers = np.arange(self.num_tilts)[tilts]
-            shape = (len(numbers), *self.images.shape[1:])
-            images = mapped.mapped_copy((self.images[number] for number in numbers), shape, self.images.dtype)
-        else:
-            images = self.images[tilts]
-        mask = None if self.mask is None else self.mask[tilts]
+        images, mask = _sections(self.images, tilts), None if self.mask is None else _sections(self.mask, tilts)
         beam = None if self.beam is None else self.beam[tilts]
         return replace(self, images=images, tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
+
+
+def _sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:
+    if isinstance(chosen, slice) or not is_mapped(stack) or stack.nbytes <= mapped.IN_MEMORY:
+        return stack[chosen]
+    numbers = np.arange(len(stack))[chosen]
+    return mapped.mapped_copy((stack[number] for number in numbers), (len(numbers), *stack.shape[1:]), stack.dtype)
 
 
 @described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")
@@ -247,7 +248,7 @@ def read_tilt_series(
     if empty.any() and len(tilt_angles) == len(images):
         named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
         warnings.warn(f"{int(empty.sum())} tilts have no usable pixel and are left out: {named}", stacklevel=2)
-        images, mask, tilt_angles = images[~empty], mask[~empty], tilt_angles[~empty]
+        return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(~empty)
     return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis)
 
 

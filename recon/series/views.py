@@ -104,10 +104,11 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
 
 def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
-    """The median pixel value of linear images, or that at another quantile; zero for bright field."""
-    images = tilt_series.images
+    """The median of the used pixel values of linear images, or that at another quantile; zero for bright field."""
+    images, mask = tilt_series.images, tilt_series.mask
     if tilt_series.mode != "linear":
         return 0.0
     step = max(1, images.size // (_SAMPLE * len(images)))
-    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in images]).astype(np.float64)
+    used = images if mask is None else (image[part] for image, part in zip(images, mask, strict=True))
+    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in used]).astype(np.float64)
     return float(np.quantile(sample, quantile, method="nearest"))

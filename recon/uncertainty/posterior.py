@@ -123,7 +123,7 @@ class Posterior:
         """Standard deviation, bias and expected shell correlation from the samples so far."""
         parts = self.moments.std, self.moments.mean - self.energy.start
         std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
-        shells = None if self.sums is None else self.sums.band(self.energy.volume(self.moments.mean))
+        shells = None if self.sums is None else self.sums.band()
         return Uncertainty(std, bias, self.done, shells)
 
 

@@ -98,24 +98,22 @@ class ShellSums:
         self.spectrum = torch.fft.rfftn(volume)
         self.cross: list[Tensor] = []  # one entry per sample: (shells + 1,)
         self.power: list[Tensor] = []
+        self.total = torch.zeros_like(self.spectrum)
 
     def add(self, sample: Tensor) -> None:
         """Take a sample in, (z, y, x)."""
         spectrum = torch.fft.rfftn(sample)
         self.cross.append(self._by_shell((spectrum * self.spectrum.conj()).real))
         self.power.append(self._power(spectrum))
+        self.total += spectrum
 
-    def band(self, mean: Tensor) -> ShellBand | None:
-        """The band; None of a volume that is fewer than four voxels thick.
-
-        Args:
-            mean: of the samples, (z, y, x).
-        """
+    def band(self) -> ShellBand | None:
+        """The band; None of a volume that is fewer than four voxels thick."""
         if 2 * self.shells < _FEWEST or not self.power:
             return None
         cross, power = (torch.stack(sums).numpy() for sums in (self.cross, self.power))
-        own, common = (self._power(spectrum).numpy() for spectrum in (self.spectrum, torch.fft.rfftn(mean)))
         count = len(power)
+        own, common = (self._power(spectrum).numpy() for spectrum in (self.spectrum, self.total / count))
         norm = np.sqrt(power * own)
         curves = np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
         spread = np.maximum(power.mean(0) - common, 0) * count / max(1, count - 1)
@@ -126,11 +124,11 @@ class ShellSums:
 
     def state(self) -> dict[str, Any]:
         """What `load_state` takes."""
-        return {"cross": self.cross[:], "power": self.power[:]}
+        return {"cross": self.cross[:], "power": self.power[:], "total": self.total.clone()}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from there."""
-        self.cross, self.power = state["cross"][:], state["power"][:]
+        self.cross, self.power, self.total = state["cross"][:], state["power"][:], state["total"].clone()
 
     def _power(self, spectrum: Tensor) -> Tensor:
         return self._by_shell(spectrum.abs().square())

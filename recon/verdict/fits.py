@@ -51,5 +51,9 @@ def _weight(tried: dict[float, float]) -> list[Finding]:
         return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
     if best == max(tried):  # nothing but the regulariser helps: what is left is misfit, and the volume turns blocky
         words = f"held-out pixels want more of the regulariser than the highest weight tried, {best:.2g}"
-        return [Finding("weight", 2.0, words, "give --weight, about 1 to 10, and compare with --method l2")]
+        return [
+            Finding(
+                "weight", 2.0, words, "compare with --method l2, and align: what is left is misfit rather than noise"
+            )
+        ]
     return []

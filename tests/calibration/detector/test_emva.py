@@ -125,6 +125,7 @@ def test_saved_model_of_an_scmos_camera_has_the_read_noise_of_each_pixel(tmp_pat
     model = noiseflow.load(noiseflow.save(found.model, tmp_path / "camera.safetensors", units="counts"))
     truth, again = (2 * read) ** 2, model.variance.numpy()
     assert np.corrcoef(np.log(again).ravel(), np.log(truth).ravel())[0, 1] > (0.7 if number == 4 else 0.9)
+    assert 0.6 < again.mean() / truth.mean() < 1.1
     signal = torch.full((64, 64), float(found.figures.offset) + 2 * 2.0, dtype=torch.float64)
     held_out = torch.from_numpy(frames(2.0, 2).frames[0])
     measured = np.maximum(found.maps["variance"] - 1 / 12, 0.04)
@@ -142,6 +143,30 @@ def test_saved_model_of_an_scmos_camera_has_the_read_noise_of_each_pixel(tmp_pat
 
 def test_pixels_of_equal_read_noise_get_no_map_of_it():
     assert calibrate_camera(camera(2)[0], camera(2)[1][:1]).model.variance is None
+
+
+def test_rounding_makes_no_pixels_differ_in_read_noise():
+    """The variance of rounded values depends on where between two codes their mean lies."""
+    generator = np.random.default_rng(4)
+    offset = 10 + generator.random((64, 64))
+
+    def frames(electrons: float, number: int) -> Burst:
+        made = [generator.poisson(electrons, offset.shape) + generator.normal(offset, 0.3) for _ in range(number)]
+        return Burst(np.round(np.stack(made)), calibration=True)
+
+    found = calibrate_camera([frames(level, 4) for level in (20.0, 100.0, 500.0)], [frames(0.0, 50)])
+    assert found.model.variance is None
+
+
+def test_light_that_leaks_into_dark_frames_adds_to_no_pixels_read_noise():
+    generator = np.random.default_rng(4)
+    frames, _ = uneven_camera(generator)
+    flats, dark = [frames(level, 4) for level in (20.0, 200.0, 1000.0)], frames(0.0, 32)
+    drift = 4 * generator.standard_normal((32, 1, 1))
+    found, drifted = (
+        calibrate_camera(flats, [Burst(each, calibration=True)]) for each in (dark.frames, dark.frames + drift)
+    )
+    assert drifted.model.variance.mean() == pytest.approx(float(found.model.variance.mean()), rel=0.05)
 
 
 def test_levels_are_stacks_or_runs_of_equal_single_frames(tmp_path):

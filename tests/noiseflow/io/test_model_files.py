@@ -4,6 +4,7 @@ import inspect
 import json
 import os
 import resource
+import signal
 from pathlib import Path
 
 import pytest
@@ -140,12 +141,15 @@ def test_no_size_that_a_file_claims_costs_memory(kind: str, tmp_path: Path) -> N
     noiseflow.load(noiseflow.save(noiseflow.SplineFlow(), tmp_path / "usual.safetensors"))  # imports what loading needs
     defaults = {name: each.default for name, each in inspect.signature(kinds()[kind].__init__).parameters.items()}
     claims = {name: 1024 for name, value in defaults.items() if type(value) is int}
+    claims |= {"shape": [1024, 1024]} if "shape" in defaults else {}
     claims |= {name: [1024] * 1024 for name, value in defaults.items() if isinstance(value, (list, tuple))}
     metadata = {"format": "noiseflow noise model", "format_version": str(FORMAT_VERSION), "units": "counts"}
-    metadata["model"] = json.dumps({"kind": kind, "arguments": claims})
+    inner = {"model": {"kind": "Gaussian", "arguments": {}}} if "model" in defaults else {}
+    metadata["model"] = json.dumps({"kind": kind, "arguments": claims, "models": inner})
     save_file({"a": torch.zeros(1)}, tmp_path / "claims.safetensors", metadata)
     child = os.fork()
     if child == 0:
+        signal.alarm(60)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         try:
             noiseflow.load(tmp_path / "claims.safetensors")

@@ -23,6 +23,13 @@ def test_divergences_of_known_vectors() -> None:
     assert float(metrics.bhattacharyya(half, half)) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("model", [noiseflow.Poisson(), noiseflow.Digitised(noiseflow.Gaussian(1e-3), step=1.0)])
+def test_residuals_that_are_all_equal_are_told_by_a_model_that_says_so(model: torch.nn.Module) -> None:
+    level = torch.zeros(5000) if isinstance(model, noiseflow.Poisson) else torch.full((5000,), 7.0)
+    found = metrics.divergence(model, level, level)
+    assert found.jsd < 0.01
+
+
 def noisy(seed: int, scale: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     signal = torch.rand(40_000, generator=generator)

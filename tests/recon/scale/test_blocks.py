@@ -178,6 +178,26 @@ def test_a_large_series_that_is_changed_before_the_fit_goes_to_a_file(scene, tmp
         assert is_mapped(large.mask)
 
 
+def test_the_dark_level_of_linear_images_is_taken_off_blocks_and_put_back_once(tmp_path):
+    density = shells(28, generator=np.random.default_rng(1), count=10)
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0))
+    integrals = -np.log(clean.images.astype(np.float64))
+    images = integrals + 0.01 * integrals.max() * np.random.default_rng(2).standard_normal(integrals.shape)
+    series = replace(clean, images=(images + 300 * images.max()).astype(np.float32), mode="linear")
+    contrast = float(np.ptp(series.images))
+    options = {"method": "l2", "weight": 0.5, "num_steps": 20}
+    whole = reconstruct(series, **options)
+    kept = tmp_path / "blocks"
+    for name in ("first", "resumed"):
+        blocks = reconstruct(
+            series, scratch=tmp_path / f"{name}.npy", slices_at_once=14, keep=lambda _: kept, **options
+        )
+        difference = blocks.projections - whole.projections
+        assert abs(float(np.median(difference))) < 0.05 * contrast  # the level is 300 times it
+        assert np.sqrt(np.mean(difference**2)) < 0.05 * contrast
+        np.testing.assert_allclose(blocks.response["offset"], whole.response["offset"], atol=0.05 * contrast)
+
+
 def test_even_and_odd_tilts_are_reconstructed_in_blocks_too(scene, tmp_path, run):
     _, noisy = scene
     write_tilt_series(tmp_path / "tilts.mrc", noisy)

@@ -20,7 +20,7 @@ from recon.reconstruction import Reconstruction
 from recon.series.orientation import Orientation
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.series.views import every_nth_view, in_order, view_numbers, without_level
+from recon.series.views import dark_level, every_nth_view, in_order, view_numbers, without_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
@@ -273,3 +273,9 @@ def test_a_volume_in_a_file_is_flipped_there_as_one_in_memory_is(tmp_path, flips
     assert Orientation(*flips).volume(in_file) is in_file
     in_file.flush()
     assert np.array_equal(np.load(tmp_path / "volume.npy"), expected)
+
+
+def test_masked_pixels_have_no_part_in_the_dark_level(small: TiltSeries) -> None:
+    mask = np.random.default_rng(0).random(small.images.shape) < 0.97
+    spoilt = replace(small, images=np.where(mask, small.images, np.float32(-1e6)), mask=mask)
+    assert abs(dark_level(spoilt) - dark_level(small)) < 0.05 * float(np.ptp(small.images))
