@@ -248,7 +248,9 @@ def read_tilt_series(
     if empty.any() and len(tilt_angles) == len(images):
         named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
         warnings.warn(f"{int(empty.sum())} tilts have no usable pixel and are left out: {named}", stacklevel=2)
-        return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(np.flatnonzero(~empty))
+        return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(
+            np.flatnonzero(~empty)
+        )
     return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis)
 
 
