@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: demo test test-shard test-slow fuzz soak mutation check docs clean
+.PHONY: demo test test-shard test-slow fuzz soak mutation check lint docs clean
 
 demo: .venv/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
@@ -38,7 +38,9 @@ mutation: NUMBER ?= 60
 mutation: .venv/test-ready
 	$(BIN)/python -m tests.mutation --number $(NUMBER)
 
-check: docs
+check: lint docs
+
+lint: .venv/test-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

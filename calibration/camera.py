@@ -119,11 +119,22 @@ def judge_camera(figures: CameraFigures) -> Verdict:
             "doubtful",
             "without dark frames offset, dark noise, dynamic range, DSNU and PRNU are not determined.",
         )
-    if len(figures.levels) < 3:
+    elif figures.dark.clipped:
+        text = f"{figures.dark.clipped:.1%} of the dark frames' pixel values lie at the converter's end: offset, dark noise, "
+        text += (
+            "dynamic range and DSNU are not those of the camera, and the gain is from the flats alone. Raise the offset"
+        )
+        add("clipped darkness", "doubtful", text + " setting.")
+    elif figures.dark.coarse:
+        text = "the noise of the dark frames is finer than the converter's codes, which hide it: dark noise and dynamic range"
+        add("coarse codes", "doubtful", text + " are not determined. The gain is from the flats alone.")
+    number = len(figures.linear)
+    if number < 3:
+        below = " below saturation" if number < len(figures.levels) else ""
         add(
             "few levels",
             "doubtful",
-            f"{len(figures.levels)} level{'s' * (len(figures.levels) > 1)} of light cannot show a bent line; give three or more.",
+            f"{number} level{'s' * (number > 1)} of light{below} cannot show a bent line; give three or more.",
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level reaches saturation: capacity and dynamic range are lower bounds.")
@@ -159,8 +170,8 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
         )
     else:
         inner = noiseflow.PoissonGaussian(figures.gain.median, offset, max(read, 1e-3))
-    ends = [float(level.image.max()) for level in figures.levels if level.clipped]
-    digitised = noiseflow.Digitised(inner, step=step, high=max(ends, default=np.inf)) if step or ends else inner
+    end = min(level.end for level in figures.levels)
+    digitised = noiseflow.Digitised(inner, step=step, high=end) if step or np.isfinite(end) else inner
     response = np.clip(maps["response"], 0.01, None)
     return noiseflow.WithMaps(
         digitised,

@@ -71,7 +71,7 @@ def calibrate(
     check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
     require_other(output, *inputs)
     if report is not None:
-        check_folder(report, holds=["report.html"], overwrite=overwrite)
+        check_folder(report, holds=["report.html"], beside=[output], overwrite=overwrite)
     require_kind(kind)
     chosen_device = _device(device)
     if not short:

@@ -20,7 +20,7 @@ from calibration.exposures.frames import Burst, ExposurePair, Image
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
-from calibration.verdict import Reason, Verdict, judge_calibration, verdict_of
+from calibration.verdict import Reason, Verdict, compression, judge_calibration, verdict_of
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -30,6 +30,11 @@ if TYPE_CHECKING:
 
 Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
 """``bar(title, total)``: a context that gives a progress callback."""
+
+CONTRADICTED = (
+    "the pixel values contradict every Poisson-Gaussian detector; give raw frames, neither compressed nor rescaled"
+)
+"""Why likelihoods have no curvature left."""
 
 
 @described()
@@ -131,6 +136,9 @@ def measure_exposures(
 ) -> Findings:
     """Align exposures, measure the detector and judge its figures, without fitting noise models. As `calibrate_exposures`."""
     pattern = None
+    for frames in (dark, flat):
+        if frames is not None:
+            frames.require_unsaturated()
     if dark is not None:
         pattern = dark_pattern(exposures, dark)
         exposures = exposures if pattern is None else without_pattern(exposures, pattern)
@@ -150,9 +158,10 @@ def measure_exposures(
             detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         verdict = judge_calibration(pairs, detector, figures, correlation, repairs)
-    except NotMeasurable as error:
-        reason = str(error)
-        verdict = verdict_of([Reason("not measurable", "bad", f"the detector was not measured: {reason}.")])
+    except (NotMeasurable, np.linalg.LinAlgError) as error:
+        reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
+        refused = Reason("not measurable", "bad", f"the detector was not measured: {reason}.")
+        verdict = verdict_of([refused, *compression(pairs)])
     return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 
 

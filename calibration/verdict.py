@@ -19,6 +19,7 @@ from calibration.detector.figures import (
 )
 from calibration.detector.measure import Detector
 from calibration.detector.repair import LEAST_SHARE, Repairs
+from calibration.detector.shape import field_deviation
 from calibration.exposures.compression import block_compressed
 from calibration.exposures.frames import rails
 from calibration.registration.aligned import AlignedPair
@@ -41,6 +42,10 @@ BIAS = 0.02
 MOST_UNEVEN_CODES = 0.05
 """Relative deviation of the converter's code widths, from which on a user should know: good converters keep within a few
 percent of a step, and the entropy of the noise moves by half its square, a thousandth of a nat."""
+
+MOST_UNEVEN_FIELD = 0.04
+"""Relative deviation of the noise's variance across the field, from which on one gain does not describe it: twice the goal, since
+residuals at levels of few electrons are standardised to 2 %."""
 
 MOST_CHANGED = 0.005
 """Share of the pixels in places that change, from which on the user should know that they were left out."""
@@ -167,9 +172,7 @@ def _correlation(
         else:
             grade, text = "bad", text + ", which no short filter explains. Give raw frames, or remove the interference"
         found.append(Reason("correlated pixels", grade, text + "."))
-    if any(block_compressed(pair.short) for pair in pairs[:1]):
-        text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
-        found.append(Reason("compressed", "bad", text + ". Give raw frames."))
+    found += compression(pairs)
     if correlation.period:
         text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled "
         if correlation.step != 1 and correctable(correlation, repairs):
@@ -179,6 +182,14 @@ def _correlation(
             text, grade = text + "or compressed, so that the gain is not the camera's", "bad"
         found.append(Reason("periodic noise", grade, text + ". Give raw frames."))
     return found
+
+
+def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
+    """Whether the first frame went through block compression."""
+    if not block_compressed(pairs[0].short):
+        return []
+    text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
+    return [Reason("compressed", "bad", text + ". Give raw frames.")]
 
 
 def _shape(detector: Detector, figures: Figures) -> list[Reason]:
@@ -221,6 +232,11 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures) -
     if half > WIDEST_GAIN:
         text = f"the gain is known to ±{half:.0%} only; give more exposures, more contrast, or flats at several levels"
         found.append(Reason("gain uncertain", "doubtful", text + "."))
+    field = field_deviation(pairs)
+    if field > MOST_UNEVEN_FIELD:
+        text = f"at equal signal the noise's variance differs by {field:.0%} rms across the field: the frames were divided by a "
+        text += "flat field or corrected for shading, so that the gain is not one"
+        found.append(Reason("uneven field", "doubtful", text + ". Give frames as they were before."))
     shares = [full_share(pair) for pair in pairs]
     if max(shares) > 0.001:
         text = (

@@ -207,6 +207,25 @@ benchmark --phantom unicorn --quick --out {out}/b | unicorn
 sample {good}/model.safetensors {good}/clean.mrc -o /proc/n.mrc | not writable
 reconstruct {good}/tilts.mrc -o /proc/v.mrc | not writable
 simulate /proc/s | not writable
+sample {bad}/pipe {good}/clean.mrc -o {out}/n.mrc | is no file
+evaluate {bad}/pipe --signal {good}/clean.mrc --observation {good}/small.mrc | is no file
+reconstruct {good}/tilts.mrc --noise-model {bad}/pipe -o {out}/v.mrc | is no file
+reconstruct {good}/tilts.mrc --method wbp --report {out}/v.mrc -o {out}/v.mrc | another folder
+reconstruct {good}/tilts.mrc --method wbp --report {out}/v.mrc/page -o {out}/v.mrc | another folder
+reconstruct {good}/tilts.mrc --method wbp --tilt-axis 1e300 -o {out}/v.mrc | within ±360
+reconstruct {good}/tilts.mrc --method wbp --tilt-axis nan -o {out}/v.mrc | within ±360
+calibrate --short {good}/050ms.tif --long {good}/long.tif --report {out}/m.safetensors -o {out}/m.safetensors | another folder
+measure {bad}/nan.npy | NaN
+measure {good}/tilts.mrc --line 0,0,0:99,0,0 | leaves the volume
+measure {good}/tilts.mrc --region 0:2 | --region
+measure {good}/clean.mrc | three axes
+batch {bad}/binary.tlt -o {out} | is no CSV table
+batch {good}/tilts.mrc -o {out} | is no CSV table
+batch {bad}/folder -o {out} | no stack with tilt angles
+batch {good} -o {bad}/empty.mrc | is a file
+batch {good} -o {out} --options "--method 'wbp" | --options
+batch {good} -o {out} --options '-o {out}/x.mrc' | among the options
+batch {good} -o {out} --options '--output={out}/x.mrc' | among the options
 demo --out /proc/demo | not writable
 demo --out {bad}/empty.mrc | is a file
 demo --out {bad}/empty.mrc/below | empty.mrc

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import struct
 from pathlib import Path
@@ -61,6 +62,7 @@ def make_bad_files(folder: Path) -> None:
     for name, text in texts.items():
         (folder / name).write_text(text)
     (folder / "binary.tlt").write_bytes(bytes(range(256)))
+    os.mkfifo(folder / "pipe")
 
 
 def _images(folder: Path) -> None:

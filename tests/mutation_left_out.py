@@ -83,6 +83,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("math.isfinite(edge) else 0.0", "numbers", SAFE),
         ("value.numel() else 0.0", "numbers", "of no values, none is moved"),
         (
+            "if first.numel() else 1",
+            "numbers",
+            "sums over the levels of no pixels: there are none, of however many levels",
+        ),
+        (
             "* _SHARE_OF_STEP <= self.step",
             "torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step",
             "from where on double precision is taken: both are exact there",
@@ -111,12 +116,22 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("manual_seed(0)", "numbers", RNG),
         ("nan=-1e30", "numbers", "less than any log-likelihood"),
         ("torch.linspace(self.low, self.high, 64", "numbers", FINER),
+        (
+            "+ jitter.to(coarse)",
+            "coarse[row.to(coarse.device)] + jitter.to(coarse)",
+            "it is as likely to be of either sign: another draw of the same signals",
+        ),
         ("self._observation, self._tolerance, self._size = ", "numbers", "set again before it is used"),
     ],
     "noiseflow/models/digitised.py": [
         ("_LEAST_KEPT, _RAILED = 256, 0.02", "numbers", "where a fit begins; it goes on from there"),
         ("torch.tensor_split(torch.argsort(signal), 64)", "numbers", "where a fit begins; it goes on from there"),
         ("max(_LEAST_KEPT, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
+        (
+            "railed.float().mean()) > _RAILED",
+            "float(railed.float().mean()) > _RAILED",
+            "no share in single precision is 0.02: that number lies between two of them",
+        ),
         ("self.forward(signal[:0]).edges[1]", "0", "the edges are those of the converter, whatever the signals"),
     ],
     "noiseflow/metrics/evaluation.py": [
@@ -126,6 +141,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_SHIFT_WITHIN_GROUP = 1 / 16", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),
+        (
+            "low, high = low - 1.0, low + 2.0",
+            "numbers",
+            "where the bins of residuals lie that are all equal: any hold them all",
+        ),
     ],
     "noiseflow/io/angles.py": [("stacklevel=", "numbers", WARNED)],
     "noiseflow/io/mrc.py": [
@@ -144,8 +164,16 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
         ("(share > 0)", "share > 0", "entries of weight 0 change no sum"),
     ],
-    "recon/projection/sparse.py": [("_WIDEST = 256", "numbers", SPEED)],
+    "recon/projection/sparse.py": [
+        ("_WIDEST = 256", "numbers", SPEED),
+        ("widest = _WIDEST if", "dense.device.type == 'cpu'", SPEED),
+    ],
     "recon/metrics/metrics.py": [
+        (
+            "product += float(np.sum(centred * (other - means[1])))",
+            "other - means[1]",
+            "centred sums to nothing, so that any constant may be added to the other: it is taken off for its rounding errors",
+        ),
         ("/ power if power > 0 else 0.0", "0.0", "a flat result minus its mean is zero, whatever the gain"),
         (
             "/ (high - low) if high > low else 0.0",

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ import recon.commands.results
 import recon.simulate.streaming
 from noiseflow import io
 from noiseflow.commands import cli, console
-from recon.commands.running import StopSignal
+from recon.commands.running import StopSignal, stoppable
 from recon.joint.checkpoint import Journal
 from tests.bad_files import make_good_files
 from tests.processes import finish, start
@@ -209,3 +210,24 @@ def test_ctrl_c_while_a_line_is_written_is_told(monkeypatch: pytest.MonkeyPatch,
         signal.raise_signal(signal.SIGINT)
     assert journal.stop_requested
     assert "finishing this step" in (tmp_path / "told").read_text()
+
+
+def test_a_second_ctrl_c_while_signals_are_handed_back_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exit_of_signals = StopSignal.__exit__
+
+    def interrupted(self: StopSignal, *error: object) -> None:
+        exit_of_signals(self, *error)
+        raise KeyboardInterrupt
+
+    journal = Journal(tmp_path / "journal", {})
+    monkeypatch.setattr(StopSignal, "__exit__", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as end, stoppable(journal, Mock()):
+            pass
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert end.value.code == 130
+    assert re.search("go on with: noiseflow reconstruct|starts again", capsys.readouterr().err)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shlex
 import shutil
 import signal
+import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -240,6 +243,61 @@ def test_a_full_disk_stops_with_one_line_and_the_run_goes_on_when_there_is_room(
     finish(shlex.split(told.partition("go on with: noiseflow ")[2]), tmp_path / "log")
     np.testing.assert_allclose(np.load(out), np.load(expected), rtol=0, atol=1e-5 * np.abs(np.load(expected)).max())
     assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "whole.npy", "log"}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare {files}/new/truth.mrc {files}/new/clean8.mrc --report {out}/new/page",
+        "reconstruct {files}/new/tilts.mrc -o {out}/v.npy --method l2 --weight 0.4 --steps 3 --checkpoint-interval 0",
+        "simulate {out}/a/b --size 8 --tilts=-60:60:30",
+        "batch {files}/series.csv -o {out}/a/b --options '--method wbp'",
+        CALIBRATE.replace("camera.safetensors", "c.safetensors"),
+    ],
+)
+def test_folders_made_for_outputs_that_found_no_room_are_gone(line: str, files: Path, tmp_path: Path, refused) -> None:
+    with no_file_larger_than(100):
+        message = refused(*shlex.split(line.format(files=files, out=tmp_path)))
+    assert "ulimit -f" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems tell no process that its parent died")
+def test_a_killed_batch_leaves_no_process_that_holds_its_outputs(files: Path, tmp_path: Path) -> None:
+    options = "--method l2 --weight 0.4 --steps 1000000"
+    words = ["batch", files / "series.csv", "-o", tmp_path / "out", "--options", options]
+    process, lock = start(words, tmp_path / "log"), tmp_path / "out" / ".tilts.mrc.lock"
+    wait_for(lambda: lock.exists() and lock.stat().st_size > 0, process)
+    holder = json.loads(lock.read_text())["process"]
+    kill(process)
+    deadline = time.monotonic() + 60
+    try:
+        while lock.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not lock.exists()
+        with io.locked(tmp_path / "out" / "tilts.mrc"):
+            assert json.loads(lock.read_text())["process"] == os.getpid()
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(holder, signal.SIGKILL)
+
+
+def test_a_batch_that_is_stopped_tells_how_far_it_came(files: Path, tmp_path: Path) -> None:
+    words = [
+        "batch",
+        files / "series.csv",
+        "-o",
+        tmp_path / "out",
+        "--options",
+        "--method l2 --weight 0.4 --steps 5000",
+    ]
+    process = start(words, tmp_path / "log")
+    wait_for(lambda: any(tmp_path.glob("out/*.checkpoint")) or any(tmp_path.glob("out/.*.lock")), process)
+    os.kill(process.pid, signal.SIGINT)
+    process.join(120)
+    assert process.exitcode == 130
+    told = (tmp_path / "log").read_text().strip().splitlines()[-1]
+    assert told.endswith("0 of 1 series are done; --resume goes on with the others")
 
 
 def test_an_output_folder_that_is_deleted_is_told(files: Path, tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Pa
     monkeypatch.setattr(console, "_LOG_SECONDS", -1.0)
     for more in ([], ["--json"]):
         with pytest.raises(SystemExit) as ended:
-            main([*words(name, good, tmp_path), *more])
+            main([*words(name, good, tmp_path), *more, "--debug"])  # an error shows where it comes from
         printed = capsys.readouterr()
         assert not ended.value.code, printed.err
         lines = re.findall(r"^\S.*: \d+/\d+, [\d.e-]+ steps/s, [\d.]+ (?:s|min|h) left.*$", printed.err, re.MULTILINE)

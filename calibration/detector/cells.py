@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.detector.levels import REACH, Levels, Readings, constants, gathered, with_darkest
+from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
 
 LEVEL_WIDTH = 0.8
@@ -30,8 +31,15 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
     Args:
         readings: of exposure pairs, each with its scale.
         guess: gain, offset and read noise, to lay out the levels and to find the regression.
+
+    Raises:
+        NotMeasurable: no level has `LEAST_READINGS`.
     """
     rows = [row for one in readings for row in _cell_levels(one, *guess)]
+    if not rows:
+        raise NotMeasurable(
+            "too few pixels of each brightness are left to compare; give larger frames, or more of them below saturation"
+        )
     cells = max(len(row["histogram"]) for row in rows)
     for row in rows:
         row["histogram"] = np.pad(row["histogram"], (0, cells - len(row["histogram"])))

@@ -79,11 +79,15 @@ class CameraFigures:
     chi_squared: float
 
     @property
+    def linear(self) -> list[Level]:
+        """The levels below saturation, which tell gain and response."""
+        return _linear(self.levels, self.offset or 0.0)
+
+    @property
     def response(self) -> Image:
         """(y, x) relative response of each pixel, mean 1, from all linear levels."""
         dark = self.dark.image if self.dark else np.full(self.levels[0].image.shape, self.offset or 0.0)
-        used = _linear(self.levels, self.offset or 0.0)
-        signal = np.sum([level.image - dark for level in used], axis=0)
+        signal = np.sum([level.image - dark for level in self.linear], axis=0)
         return np.asarray(signal / signal.mean())
 
 
@@ -97,25 +101,31 @@ def measure_camera(
     """Measure a camera by photon transfer on even illumination.
 
     Args:
-        flats: one burst of two or more equal frames for each level of light; levels in any order.
+        flats: one burst of two or more equal frames for each level of light; levels in any order, saturated ones among them.
         darks: bursts without light, the one with the flats' exposure time first.
         flat_times, dark_times: exposure time of each, s.
 
     Raises:
         ValueError: no levels, sizes or numbers of times that differ.
-        NotMeasurable: too few levels, or noise that does not grow with the signal.
+        NotMeasurable: too few levels, all of them saturated, or noise that does not grow with the signal.
     """
     _require_equal(flats, darks, flat_times, dark_times)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
-    levels = tuple(level_of(flats[int(index)]) for index in order)
+    ordered = [flats[int(index)] for index in order]
+    levels = tuple(map(level_of, ordered))
     dark_levels = [level_of(dark) for dark in darks]
     dark = dark_levels[0] if dark_levels else None
     offset = dark.mean if dark else None
     used = _linear(levels, offset or 0.0)
-    points = [*([dark] if dark else []), *used]
+    if not used:
+        raise NotMeasurable(
+            "every level of the flat frames is saturated, so that their noise is cut off; give levels of less light"
+        )
+    points = [level for level in ([dark, *used] if dark else used) if not (level.clipped or level.coarse)]
     if len(points) < LEAST_LEVELS:
         raise NotMeasurable(
-            "flats at one level tell no gain; give dark frames with them, or flats at several levels of light"
+            "flats at one level tell no gain; give dark frames with them, or flats at several levels of light (levels whose "
+            "noise is cut off or finer than the rounding do not count)"
         )
     slope, error, intercept, chi_squared = _line(points, dark)
     if not slope > 3 * error:
@@ -123,7 +133,8 @@ def measure_camera(
             "the noise of the flats does not grow with their signal, so the gain cannot be measured; give levels of light that "
             "differ by more"
         )
-    residuals = [one for index in order for one in _residuals(flats[int(index)])]
+    unsaturated = [flat for flat, level in zip(ordered, levels, strict=True) if any(level is one for one in used)]
+    residuals = [one for flat in unsaturated for one in _residuals(flat)]
     correlation = correlation_of_residuals(residuals)
     dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
     zero = offset if offset is not None else 0.0
@@ -176,8 +187,8 @@ def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
     top = levels[int(np.argmax([level.variance for level in levels]))]
     limit = offset + LINEAR_RANGE * (top.mean - offset)
     seen = top.mean < levels[-1].mean or any(level.clipped for level in levels)
-    used = [level for level in levels if not level.clipped and (not seen or level.mean <= limit)]
-    return used or [levels[0]]
+    free = [level for level in levels if not level.clipped]
+    return [level for level in free if not seen or level.mean <= limit] or free[:1]
 
 
 def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
@@ -265,6 +276,8 @@ def _require_equal(
         raise ValueError(
             f"flat and dark frames have the sizes {sorted(shapes)}; take all with the same binning and region"
         )
+    for dark in darks:
+        dark.require_unsaturated()
     for name, times, bursts in (("flat", flat_times, flats), ("dark", dark_times, darks)):
         if times is not None and len(times) != len(bursts):
             raise ValueError(

@@ -61,7 +61,7 @@ def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -
         repairs: what was modelled.
     """
     found = detector.posterior
-    figures = Figures(found.gain, found.offset, found.read_noise)
+    figures = Figures(_with_line(detector), found.offset, found.read_noise)
     if not poisson_gaussian(detector):
         figures = _by_line(detector)
     if correctable(correlation, repairs):
@@ -84,6 +84,18 @@ def correctable(correlation: Correlation, repairs: Repairs) -> bool:
     """Whether the correlation is that of a short filter, and not of a scene that does not fit."""
     still = not repairs.refitted and repairs.changed < 0.5
     return correlation.found and correlation.local and still and correlation.factor > 3 * correlation.factor_error
+
+
+def _with_line(detector: Detector) -> Interval:
+    """The posterior's gain; where nothing but the noise tells the offset, with an interval that holds photon transfer's too.
+
+    There the prior of read noise narrows the gain by what the noise's skewness says, to intervals that held the truth in 83 to
+    86 % of simulated pairs. The line's own held it in 91 %, and knows no prior.
+    """
+    gain, line = detector.posterior.gain, _normal(detector.line.gain, detector.line.gain_error)
+    if detector.offset is not None or any(one.common.any() for one in detector.levels):
+        return gain
+    return Interval(gain.median, min(gain.q05, line.q05), max(gain.q95, line.q95))
 
 
 def _by_line(detector: Detector) -> Figures:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,33 +73,33 @@ class Weighted:
 
 def importance_sample(
     log_density: Callable[[Image], Image],
-    start: Image,
-    covariance: Image,
+    starts: Sequence[tuple[Image, Image]],
     generator: np.random.Generator,
     progress: Callable[[int, str], None] | None = None,
 ) -> Weighted | None:
     """Draw from a density by a mixture of kernels that adapts to it (doi:10.1111/j.1467-9469.2011.00756.x).
 
-    The first round draws around `start`; each further one from Student kernels around draws that are likely. All draws are
+    The first rounds draw around the `starts`; each further one from Student kernels around draws that are likely. All draws are
     weighted by the mixture of all rounds' proposals, so that none is lost.
 
     Args:
         log_density: (W, 3) -> (W,) nats.
-        start: (3,) the maximum.
-        covariance: (3, 3) of the first round.
+        starts: (3,) points, the maximum first, and (3, 3) covariances, of a round each. A narrow peak gives no draws outside.
         generator: of the draws.
         progress: called with the evaluations done and a note.
 
     Returns:
         The draws, or None where `ROUNDS` rounds are not worth `ENOUGH` samples.
     """
-    kernels: list[tuple[Image, Image]] = [(start[None], _factor(2.0 * covariance))]
+    kernels: list[tuple[Image, Image]] = [(start[None], _factor(2.0 * covariance)) for start, covariance in starts]
     draws, values, proposal = np.empty((0, 3)), np.empty(0), np.empty(0)
     for number in range(ROUNDS):
-        centres, factor = kernels[-1]
+        centres, factor = kernels[number]
         fresh = centres[generator.integers(len(centres), size=DRAWS)] + _student(generator, DRAWS) @ factor.T
         earlier = np.logaddexp(proposal, _log_mixture(draws, centres, factor))
-        proposal = np.concatenate([earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels])])
+        proposal = np.concatenate(
+            [earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: number + 1]])]
+        )
         draws = np.concatenate([draws, fresh])
         values = np.concatenate([values, _in_parts(log_density, fresh)])
         log_weight = np.where(np.isfinite(values), values - proposal, -np.inf)
@@ -109,7 +109,9 @@ def importance_sample(
         found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2)
         if progress is not None:
             progress(len(draws), f"{found.effective:.0f} effective samples")
-        if number >= 2 and found.effective > ENOUGH:
+        if number + 1 < len(kernels):
+            continue
+        if number > len(starts) and found.effective > ENOUGH:
             return found
         kernels.append(_next_kernels(found, generator, kernels[0][1]))
     return None

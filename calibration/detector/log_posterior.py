@@ -18,14 +18,19 @@ NUM_RESCALINGS = 6
 READ_NOISE_RANGE = (0.1, 300.0)
 """Electrons rms: the prior, flat in the logarithm; from under the best detectors made to beyond the worst."""
 
+UNRESOLVED = 0.1, 0.4
+"""Read noise below which single electrons would show between the codes of a converter: in its steps, and at most so many
+electrons, beyond which no electron shows. The prior ends there. Coarser codes than electrons cannot tell less, and the
+likelihood would be a field of peaks where electrons and codes keep step."""
+
 
 class LogPosterior:
     """log p(parameters | levels) for rows of (log gain, offset or log variance, log read noise).
 
     The data fix the line of variance against signal; along it the read noise and the offset trade places. Where nothing
     else tells the offset, the second coordinate is the log variance at the mean signal, in which that ridge is straight. The
-    priors are flat in log gain, in log read noise within `READ_NOISE_RANGE`, and in the offset below the brightest
-    level; or the offset's is normal where it was measured.
+    priors are flat in log gain, in log read noise within `READ_NOISE_RANGE` and above `UNRESOLVED`, and in the offset below the
+    brightest level; or the offset's is normal where it was measured.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -39,6 +44,7 @@ class LogPosterior:
         count = np.concatenate([one.count[one.dark == 0] for one in levels])
         self.reference = float(np.average(signal, weights=count))
         self.brightest = float(signal.max())
+        self.step = float(max(one.step.max() for one in levels))
         self.by_offset = offset is not None or any(one.common.any() for one in levels)
 
     def __call__(self, coordinates: Image) -> NDArray[np.float64]:
@@ -47,7 +53,7 @@ class LogPosterior:
         low, high = np.log(READ_NOISE_RANGE)
         inside = (coordinates[:, 2] > low) & (coordinates[:, 2] < high) & (np.abs(coordinates[:, 0]) < 50)
         gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
-        inside &= offset < self.brightest
+        inside &= (offset < self.brightest) & (read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1]))
         result = np.full(len(coordinates), -np.inf)
         if inside.any():
             result[inside] = self.likelihood(gain[inside], offset[inside], read_noise[inside])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -127,7 +128,8 @@ def measure_detector(
     levels = [collect_levels(plain)] if plain else []
     start = None
     if cells:
-        levels, start = _with_cells(levels, cells, offset, _guess(pairs))
+        with suppress(NotMeasurable) if plain else nullcontext():  # a few pixels beside many are left out
+            levels, start = _with_cells(levels, cells, offset, _guess(pairs))
     posterior = sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress)
     levels = list(posterior.levels)
     noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.exposures.frames import Burst, Image, rounding_step
+from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from noiseflow.described import described
+
+MOST_CLIPPED = 1e-3
+"""Share of the pixel values at an end of the converter that leaves a variance as it is: cut three standard deviations out, it
+loses 0.3 %."""
+
+COARSE = 0.24
+"""Variance in squared rounding steps, rounding's included, below which that of rounded values depends on where between two codes
+they lie (EMVA 1288, release 3.1, section 6.5)."""
 
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
@@ -26,7 +34,9 @@ class Level:
         noise: (y, x) variance of each pixel over time, counts².
         frames: number of frames.
         flicker: relative deviation of the frames' means beyond what their noise explains.
-        clipped: share of pixel values at the converter's end.
+        clipped: share of pixel values at either end of the converter.
+        coarse: whether the noise is finer than the rounding, which hides its variance.
+        end: upper end of the converter, counts; infinite where no pixel value reaches it.
     """
 
     mean: float
@@ -40,6 +50,8 @@ class Level:
     frames: int
     flicker: float
     clipped: float
+    coarse: bool
+    end: float
 
 
 def level_of(burst: Burst) -> Level:
@@ -59,8 +71,8 @@ def level_of(burst: Burst) -> Level:
         cubes = (residual**3).mean(axis=0) * scale
         third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
     spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
-    end = frames.max()
-    clipped = float(np.mean(frames == end)) if np.mean(frames == end) > 1e-3 else 0.0
+    low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))
+    clipped = float(np.mean((frames <= low) | (frames >= end)))
     flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
     return Level(
         float(image.mean()),
@@ -73,5 +85,7 @@ def level_of(burst: Burst) -> Level:
         noise,
         number,
         flicker,
-        clipped,
+        clipped if clipped > MOST_CLIPPED else 0.0,
+        bool(variance < COARSE * 12 * rounding),
+        end,
     )

@@ -11,6 +11,7 @@ import numpy as np
 from calibration.detector.importance import DRAWS, ROUNDS, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 from noiseflow.described import described
 
@@ -32,10 +33,14 @@ LEAST_STEPS = DRAWS * ROUNDS // NUM_WALKERS
 """Steps of the chain that cost what importance sampling may; where fewer are allowed, only the chain is tried."""
 
 LARGEST_NUM_STEPS = 4000
-"""Steps of the chain: 64 000 evaluations, up to two minutes where single electrons show; then the posterior is refused."""
+"""Steps of the chain: 64 000 evaluations, up to two minutes where single electrons show; then the posterior is refused, and
+earlier where the autocorrelation time found so far would take more."""
 
 NUM_SAMPLES = 2000
 """Equally weighted samples that are kept."""
+
+SMOOTH_SPREAD = 0.5
+"""Standard deviation of the logarithm of read noise in the draws about the photon-transfer line: it is hardly known there."""
 
 BURN_IN = 60
 """Steps that only find out where the posterior lies."""
@@ -169,8 +174,8 @@ def sample_posterior(
     generator = np.random.default_rng(seed)
     walkers = _walkers(log_posterior, best, generator)
     if len(walkers) > 3 and largest_num_steps > LEAST_STEPS:
-        spread = np.cov(walkers.T)
-        drawn = importance_sample(log_posterior, best, spread, generator, progress)
+        starts = [(best, np.cov(walkers.T)), *_smooth_start(log_posterior)]
+        drawn = importance_sample(log_posterior, starts, generator, progress)
         if drawn is not None and drawn.disagreement() < LARGEST_RHAT:
             number, rhat = len(drawn.draws), drawn.disagreement()
             samples = np.column_stack(log_posterior.parameters(drawn.resampled(NUM_SAMPLES, generator)))
@@ -213,7 +218,7 @@ def _chain(
             progress(len(chain), f"{len(chain) / time:.0f} autocorrelation times")
         if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
             return sampler, time, rhat
-        if 2 * len(chain) > largest_num_steps:
+        if max(2 * len(chain), NUM_TIMES * time) > largest_num_steps:  # a short chain underestimates its time
             raise ValueError(_not_converged(len(chain), time, rhat))
 
 
@@ -251,7 +256,7 @@ def _not_converged(num_steps: int, time: float, rhat: float) -> str:
     return (
         f"the posterior has not converged after {num_steps} steps (autocorrelation time {time:.0f}, R-hat {rhat:.3f}); it "
         f"needs about {needed - num_steps} more: raise largest_num_steps to {2 * needed}, or give dark frames, which fix "
-        "the offset"
+        "the offset; pixel values that were gamma-encoded or rescaled never get there: give raw frames"
     )
 
 
@@ -272,6 +277,24 @@ def potential_scale_reduction(chain: Image) -> float:
         between = z.mean(axis=0).var(ddof=1)
         found.append(np.sqrt((half - 1) / half + between / within))
     return float(max(found))
+
+
+def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
+    """The best of some points on the photon-transfer line and the line's own spread, where nothing else tells the offset.
+
+    There the maximum may be a narrow peak, where a comb of single electrons fits the pixel values by chance.
+    """
+    if log_posterior.by_offset:
+        return []
+    line = fit_photon_transfer(log_posterior.levels)
+    variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
+    fraction = np.array([0.02, 0.1, 0.3, 0.6, 0.9])
+    read_noise = np.sqrt(fraction * variance) / line.gain
+    gain = np.full_like(fraction, line.gain)
+    points = log_posterior.coordinates(gain, log_posterior.reference - (1 - fraction) * variance / gain, read_noise)
+    point = points[int(np.argmax(log_posterior(points)))]
+    relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
+    return [(point, np.diag(np.square([line.gain_error / line.gain, relative, SMOOTH_SPREAD])))]
 
 
 def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Generator) -> Image:

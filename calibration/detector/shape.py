@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
+from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
@@ -37,9 +38,14 @@ PER_LEVEL = 5000
 CUT = 5.0
 """Standard deviations at which differences are cut, so that single outliers do not speak for all pixels."""
 
+CHANCE = 40.0
+"""χ² of five terms that chance exceeds once in 10⁷ frames."""
+
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
     """χ² per degree of freedom of the histograms, over cells where at least `least` pixel values are expected.
+
+    Residuals of a burst share their mean, which takes less than one degree of freedom from each level.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -52,8 +58,7 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, 
         if one.absolute and merged > 1:
             histogram, expected = (_merged(values, merged) for values in (histogram, expected))
         used = expected > least
-        departure = one.weight[:, None] * (histogram - expected) ** 2
-        squares += float(np.sum(departure[used] / expected[used]))
+        squares += float(np.sum((histogram - expected)[used] ** 2 / expected[used]))
         freedom += int(used.sum()) - len(histogram) - int(np.sum(one.scale < 0))
     return squares / max(freedom, 1)
 
@@ -123,6 +128,29 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
         error = power / np.sqrt(independent) * float(np.sqrt(np.sum(weight**2)) / weight.sum())  # of even pixels
         found = max(found, mean if mean > CLEAR_PIXELS * error else 0.0)
     return float(np.sqrt(found))
+
+
+def field_deviation(pairs: Sequence[AlignedPair]) -> float:
+    """Relative deviation (rms) over the field of the noise's variance at equal signal, as a polynomial of second order in the
+    position has it; 0 where that is within what chance gives.
+
+    A flat-field division changes the gain with the place, a camera does not.
+    """
+    gram, moment, power, number = np.zeros((5, 5)), np.zeros(5), 0.0, 0
+    for pair in pairs:
+        residual = residual_of(pair)
+        y, x = (
+            index / max(size - 1, 1) - 0.5 for index, size in zip(np.nonzero(pair.mask), pair.mask.shape, strict=True)
+        )
+        terms = np.stack([x, y, x * x, x * y, y * y])
+        terms -= terms.mean(axis=1, keepdims=True)
+        squares = residual.z[pair.mask] ** 2
+        squares = squares / squares.mean() - 1
+        gram, moment = gram + terms @ terms.T, moment + terms @ squares
+        power, number = power + float(np.sum(squares**2)), number + squares.size
+    explained = float(moment @ np.linalg.solve(gram, moment))
+    usual = power / number
+    return float(np.sqrt(explained / number - len(moment) * usual / number)) if explained > CHANCE * usual else 0.0
 
 
 def _products(frames: Image, spread: Image) -> tuple[Image, float]:

@@ -77,7 +77,7 @@ class Burst:
     Args:
         frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
         name: how messages call the burst.
-        calibration: dark or flat frames, which need no scene.
+        calibration: dark or flat frames, which need no scene; flat ones may be saturated.
 
     Raises:
         ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
@@ -107,20 +107,35 @@ class Burst:
                 )
             )
         least = 1 if self.calibration else MINIMUM_SIDE
-        checked = [checked_frame(frame, f"{self.name}, frame {i}", least_side=least) for i, frame in enumerate(frames)]
+        checked = [
+            checked_frame(frame, f"{self.name}, frame {i}", least_side=least, may_saturate=self.calibration)
+            for i, frame in enumerate(frames)
+        ]
         for i, (first, second) in enumerate(pairwise(checked)):
-            if np.array_equal(first, second):
+            if np.array_equal(first, second) and np.ptp(first) > 0:  # saturated frames are equal as a matter of course
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} hold identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
 
+    def require_unsaturated(self) -> None:
+        """Refuse calibration frames whose noise is cut off, where that is needed.
 
-def checked_frame(data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SIDE) -> Image:
+        Raises:
+            ValueError: a frame is flat, or half of it saturated.
+        """
+        for i, frame in enumerate(self.frames):
+            _require_unsaturated(frame, f"{self.name}, frame {i}")
+
+
+def checked_frame(
+    data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SIDE, may_saturate: bool = False
+) -> Image:
     """One grey frame as float64, refused where calibration could not use it.
 
     Args:
         data: (y, x), or (1, y, x); any real number type.
         name: how the message calls it.
         least_side: pixels that each side needs.
+        may_saturate: accept a frame that is saturated, or flat.
 
     Raises:
         ValueError: not one grey image, smaller than `least_side`, NaN, flat, or half of it saturated.
@@ -137,6 +152,12 @@ def checked_frame(data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SI
     if min(data.shape) < least_side:
         raise ValueError(f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} per side are needed")
     require_finite(data, name)
+    if not may_saturate:
+        _require_unsaturated(data, name)
+    return data.astype(np.float64)
+
+
+def _require_unsaturated(data: NDArray[Any], name: str) -> None:
     rail = saturation_level(data)
     saturated = float(np.mean(data >= rail))
     if saturated > 0.5 and (saturated < 1 or rail == _largest_value(data)):
@@ -144,7 +165,6 @@ def checked_frame(data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SI
             f"{name} is saturated: {saturated:.0%} of its pixels read {rail:g}; expose it for a shorter time"
         )
     require_contrast(data, name)
-    return data.astype(np.float64)
 
 
 def saturation_level(frame: NDArray[Any]) -> float:

@@ -103,7 +103,14 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         >>> aligned.registration.motion, bool(aligned.mask.mean() > 0.9)
         ('translation', True)
     """
-    return align_with(pair, register(pair.short, pair.long, names=(pair.short_name, pair.long_name)))
+    names = (pair.short_name, pair.long_name)
+    return align_with(pair, register(_saturated_alike(pair.short, pair.long), pair.long, names=names))
+
+
+def _saturated_alike(short: Image, long: Image) -> Image:
+    """The short exposure cut off at the brightness at which the long one saturates: edges that only one shows would mislead."""
+    share = float(np.mean(saturated(long)))
+    return np.minimum(short, np.quantile(short, 1 - share)) if share else short
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:

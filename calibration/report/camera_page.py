@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.camera import Camera, rows_of
 from calibration.report.figures import correlation_figure
+from noiseflow.io import output_folder
 from noiseflow.report import Report, new_figure, provenance, show_image
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ def write_camera_report(
         inputs: files that were read, for their checksums.
         seed: of the random choices.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     page = Report("Camera calibration (EMVA 1288)")
     page.facts(
         [("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])]
@@ -68,7 +67,8 @@ def write_camera_report(
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance")
     page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
-    return page.save(folder / "report.html")
+    with output_folder(folder) as made:
+        return page.save(made / "report.html")
 
 
 def transfer_figure(camera: Camera) -> Figure:

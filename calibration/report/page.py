@@ -24,6 +24,7 @@ from calibration.report.figures import (
     residual_figure,
     snr_figure,
 )
+from noiseflow.io import output_folder
 from noiseflow.report import Report, provenance
 
 LARGEST_MISALIGNMENT = 0.1
@@ -192,8 +193,6 @@ def write_report(
         >>> path.name
         'report.html'
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     page = Report(title)
     page.facts(_facts(findings))
     page.heading("Verdict")
@@ -204,7 +203,8 @@ def write_report(
     _add_registration(page, findings)
     page.heading("Provenance")
     page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
-    return page.save(folder / "report.html")
+    with output_folder(folder) as made:
+        return page.save(made / "report.html")
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:

@@ -81,7 +81,7 @@ def registration_trial(kind: str, seed: int, size: int = 256) -> dict[str, Any]:
 def run(trial: Trial, seeds: range, workers: int, minutes: float, rows: Path) -> list[dict[str, Any]]:
     """Results of the trials of some seeds, as many as end in time, and of all that are kept from before.
 
-    Each is kept as a line of the file `rows`, so that a run that was stopped goes on where it was.
+    Each is kept as a line of the file `rows`, so that interrupted runs resume.
     """
     rows.parent.mkdir(parents=True, exist_ok=True)
     found = [json.loads(line) for line in rows.read_text().splitlines()] if rows.exists() else []
@@ -108,7 +108,7 @@ def _results(trial: Trial, seeds: list[int], workers: int) -> Iterator[dict[str,
 
 
 def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict[str, Any]:
-    """Error against the known transform, success rate, and failures that no message told."""
+    """Error against the known transform, success rate, and failures that no message reported."""
     results = {}
     for kind, limit in (("textured", 0.1), ("sparse", 0.3)):
         found = run(partial(registration_trial, kind), seeds, workers, minutes / 2, rows / f"{kind}.jsonl")

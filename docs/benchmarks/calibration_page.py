@@ -24,7 +24,7 @@ def page(content: Part) -> str:
     head = (
         "# Calibration: registration, detector parameters, real detectors, speed\n\n"
         f"Written by `{COMMAND} page` from `results/calibration.json`. Trials are kept line by line in "
-        "`results/calibration_rows`; a run that was stopped goes on where it was."
+        "`results/calibration_rows`; interrupted runs resume."
     )
     parts = {"registration": _registration, "parameters": _parameters, "real": _real, "emva": _emva, "speed": _speed}
     return "\n\n".join([head, *(_part(name, make, content) for name, make in parts.items())]) + "\n"
@@ -38,7 +38,7 @@ def _part(name: str, make: Any, content: Part) -> str:
 
 def _registration(found: Part) -> str:
     header = ["scene", "trials", "goal (px)", "rms error (px)", "median", "largest", "predicted rms", "success"]
-    header += ["failures told", "failures silent", "by SIFT"]
+    header += ["failures reported", "failures silent", "by SIFT"]
     rows = [
         [
             *(kind, str(one["trials"]), f"{one['limit_px']:g}", f"{one['rms_error_px']:.4f}"),
@@ -51,14 +51,14 @@ def _registration(found: Part) -> str:
     ]
     text = (
         f"`{COMMAND} registration`. Pairs of 256² pixels, exposure ratio 16, SNR 2 to 5 in the short one, turned by up to 3° and "
-        "shifted by up to 10 %. Error: rms over the frame against the known transform. A failure is told (`register` "
+        "shifted by up to 10 %. Error: rms over the frame against the known transform. A failure is reported (`register` "
         "refuses), or silent (it answers, with an error above the goal)."
     )
     return f"## Registration\n\n{text}\n\n{table(header, rows)}"
 
 
 def _parameters(found: Part) -> str:
-    header = ["parameter", "coverage of 90 % intervals", "lower rail clips", "does not clip", "median error"]
+    header = ["parameter", "coverage of 90 % intervals", "lower limit clips", "does not clip", "median error"]
     header += ["identifiable", "median error where identifiable"]
     rows = [
         [
@@ -75,7 +75,7 @@ def _parameters(found: Part) -> str:
     text = (
         f"`{COMMAND} parameters`. {number} simulated Poisson-Gaussian pairs of 384² pixels, {failed} refused: gain 0.5 to 20 "
         "counts per electron, read noise 0.2 to 10 e⁻, mean level 1 to 500 e⁻, all uniform in the logarithm, 8 to 16 bits; "
-        "half of them with offset 0, so that the lower rail clips. Identifiable: the 90 % interval spans less than a factor "
+        "half of them with offset 0, so that the lower limit clips. Identifiable: the 90 % interval spans less than a factor "
         f"of 1.5. A perfect interval's coverage scatters by {error:.1%} over so many trials. Goals: coverage 87 to 93 %, "
         "median error of gain 1 %, of read noise 5 % where identifiable."
     )

@@ -1,4 +1,4 @@
-"""Accuracy of the joint fit: against the oracle that is told the true noise, and least squares + TV at its best weight."""
+"""Accuracy of the joint fit: against the oracle that is given the true noise, and least squares at its best weight."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _slab(scene: Scene) -> Scene:
 
 
 def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int, kept: Row | None = None) -> Row:
-    """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares + TV at its best weight; the
+    """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares at its best weight; the
     best weights are those of a kept row, where one is given."""
     scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
     row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
@@ -120,7 +120,7 @@ FIELDS: dict[str, Callable[..., Field]] = {"voxels": VoxelField, "sum of grids":
 
 
 def fields(phantom: str, *, size: int, tilts: str, seed: int, noise: str = "clipped") -> Row:
-    """One row: every field at its own best weight of total variation, told the true noise."""
+    """One row: every field at its own best weight, given the true noise."""
     scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
     row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
     for name, make in FIELDS.items():

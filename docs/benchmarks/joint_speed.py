@@ -110,20 +110,21 @@ def skipping(
     the field has one resolution. Equal steps, noise known and weight given; whole runs."""
     scene = make_scene(size, phantom=phantom, tilts=tilts)
     everything = JointReconstructor(weight=_WEIGHT, make_field=make_field, noise_model=lambda: scene.noise_model)
-    fits = {"everything": everything, "nothing": replace(everything, skip_vacuum=False, coarse_to_fine=False)}
+    on, off = "all accelerations on", "all accelerations off"
+    fits = {on: everything, off: replace(everything, skip_vacuum=False, coarse_to_fine=False)}
     if make_field is MultiresolutionField:
-        fits["vacuum alone"] = replace(everything, coarse_to_fine=False)
-        fits["resolution alone"] = replace(everything, skip_vacuum=False)
+        fits["skipping vacuum alone"] = replace(everything, coarse_to_fine=False)
+        fits["skipping resolution alone"] = replace(everything, skip_vacuum=False)
     found = dict(
         zip(fits, in_turn([partial(each, scene.noisy) for each in fits.values()], repeats=repeats), strict=True)
     )
-    occupancy = found["everything"][1].signal_model.occupancy
+    occupancy = found[on][1].signal_model.occupancy
     row: Row = {"scene": scene.name, "vacuum": float((scene.truth == 0).mean())}
     row["occupied"] = 1.0 if occupancy is None else occupancy.share
     for name, (seconds, result) in found.items():
-        row[f"skipping {name}"] = seconds
-        row[f"skipping {name}, volume PSNR"] = compare(result.volume.attenuation, scene.truth).psnr
-    return row | {"ratio": found["nothing"][0] / found["everything"][0]}
+        row[name] = seconds
+        row[f"{name}, volume PSNR"] = compare(result.volume.attenuation, scene.truth).psnr
+    return row | {"ratio": found[off][0] / found[on][0]}
 
 
 def steps(phantom: str, size: int, repeats: int = 3) -> Row:
@@ -133,7 +134,8 @@ def steps(phantom: str, size: int, repeats: int = 3) -> Row:
     noise_model = scene.noise_model.requires_grad_(False)
     observed = torch.from_numpy(np.ascontiguousarray(scene.noisy.images.transpose(0, 2, 1), dtype=np.float32))
     skipping, everywhere = (
-        JointReconstructor(weight=_WEIGHT, skip_vacuum=skip).prepare(scene.noisy, scene.grid) for skip in (True, False)
+        JointReconstructor(weight=_WEIGHT, skip_vacuum=skip).signal_model(scene.noisy, scene.grid)
+        for skip in (True, False)
     )
 
     def run(signal_model: TomographySignal) -> None:

@@ -180,8 +180,8 @@ def _speed(content: dict[str, Any]) -> str:
             "## Speed",
             "Medians of calls that take turns in one run, `python docs/benchmarks/noise_models.py speed`; the first call makes "
             "our tables. Goals, of the later calls: `sample` at most 1.5 × NumPy's Poisson generator, `log_prob` at most 3 × "
-            "torch's normal density; a fit of 512² pixels to within 0.005 nats in at most 5 s. Rivals' likelihoods are timed "
-            "on 10⁶ pixels.",
+            "torch's normal density; a fit of 512² pixels to within 0.005 nats in at most 5 s. Other packages' likelihoods are "
+            "timed on 10⁶ pixels.",
             table(header, body) + note,
             "Fit of a 512² pair with gamma-skewed noise:",
             table(["model", "fit (s)", "KL ± s.e. (nats)"], fitted),
@@ -192,7 +192,7 @@ def _speed(content: dict[str, Any]) -> str:
 def _rivals(content: dict[str, Any]) -> str:
     rows: list[Row] = content.get("search", [])
     text = (
-        "## The rivals\n\n"
+        "## The other packages\n\n"
         "- **zuko**: `zuko.flows.NSF` of one feature and one context. **normflows**: `ConditionalNormalizingFlow` of "
         "autoregressive rational-quadratic splines (its coupling layers need two features or more). Residuals and signals are "
         "standardised as their documentation asks; 16 bins, two hidden layers of 64, 500 steps of Adam in the same loop as "
@@ -202,7 +202,7 @@ def _rivals(content: dict[str, Any]) -> str:
         "summed likelihood of 16 patches of 16² pixels at rate 5e-7 (the paper's, where the clean image is known; 5e-5 "
         "diverges here), for 1500 steps where the authors take 400 000. *As published* takes each layer's log-derivative at "
         "its output while it learns: the last column of the tables above is the integral of what it then calls a density. It is "
-        "judged by the density of what it samples, behind the detected rounding and rails."
+        "judged by the density of what it samples, behind the detected rounding and clipping limits."
     )
     if not rows:
         return text

@@ -7,7 +7,7 @@
     noiseflow benchmark needle --out docs/benchmarks/results                                       # a real series
     python docs/benchmarks/rivals.py                                                               # the pages
 
-A stopped run goes on where it was; `--again joint` computes the rows of the joint fits anew. Pages tell what is measured and
+Interrupted runs resume; `--again joint` computes the rows of the joint fits anew. Pages tell what is measured and
 what is not.
 """
 
@@ -17,6 +17,8 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import dots
 
 from noiseflow.io import atomic_path
 from recon.benchmarks import ablations as benchmark_ablations
@@ -42,6 +44,12 @@ def main() -> None:
             title = f"clipped noise, {size}³, 79 tilts"
             picture = benchmark_rivals.draw(_curves(RESULTS, size), title)
             picture.savefig(partial, format="png", dpi=110, facecolor="white")
+    for _, content in _named_files(RESULTS, "needle-"):
+        dots.save(HERE / "needle.png", _needle_panels(content["cells"]), columns=2)
+    for name, content in _named_files(RESULTS, "paper-table-"):
+        dots.save(HERE / _picture(name), _paper_panels(content["cells"]), columns=2)
+    for name, content in _named_files(RESULTS, "ablations-"):
+        dots.save(HERE / _picture(name), _ablation_panels(content["cells"]), columns=2)
 
 
 def run_time(folder: Path) -> str:
@@ -148,7 +156,8 @@ def paper_table(folder: Path) -> str:
     for name, content in _named_files(folder, "paper-table-"):
         header, rows = benchmark_paper.table(content["cells"])
         absent = [method for method in benchmark_paper.METHODS if method not in content["cells"]]
-        parts += [f"## {_scene(name)}", _table(header, rows), _standing(content["cells"]), _absent(absent)]
+        picture = f"![Min–max PSNR of projections and volume, measured here and published]({_picture(name)})"
+        parts += [f"## {_scene(name)}", picture, _table(header, rows), _standing(content["cells"]), _absent(absent)]
         parts += [_command("paper-table", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "paper-table", " --size 96 --phantom cell")])
 
@@ -180,13 +189,16 @@ def ablations(folder: Path) -> str:
         f"{benchmark_search.STEPS} steps, and fields take as many; *parts* and "
         "*flow layers* fit a radial flow at the same weight "
         f"of {benchmark_ablations.WEIGHT:g}. The networks are the paper's nine layers, evaluated on the "
-        "whole lattice for all tilts "
+        "whole voxel grid for all tilts "
         "at once, with 300 steps of Adam and no total variation, on a scene half as wide.",
     ]
     for name, content in _named_files(folder, "ablations-"):
         cells = content["cells"]
         header, rows = benchmark_ablations.table(cells)
-        parts.append(f"## {_scene(name)}")
+        parts += [
+            f"## {_scene(name)}",
+            f"![PSNR of volume and projections, one panel for each table below]({_picture(name)})",
+        ]
         for group in dict.fromkeys(row[0] for row in rows):
             parts += [
                 f"### {group[0].upper() + group[1:]}",
@@ -218,6 +230,7 @@ def needle(folder: Path) -> str:
     """The page of the real series."""
     parts = [
         "# A real tilt series with tilts left out",
+        "![PSNR of the left-out tilts for every method, in four panels by noise and left-out tilts, best first](needle.png)",
         "The needle, a HAADF-STEM series of 91 tilts of 64 × 64 pixels that ships with the library "
         "(`noiseflow/data/tilt_needle`). "
         "Methods see some tilts and predict the others, with the one gain and offset that suit the given tilts: by least "
@@ -237,13 +250,50 @@ def needle(folder: Path) -> str:
         header, rows = benchmark_needle.table(cells)
         for noise, left_out in dict.fromkeys(row[:2] for row in rows):
             chosen = [row[2:] for row in rows if row[:2] == (noise, left_out)]
-            words = "every fifth tilt" if left_out == "every fifth" else f"tilts {left_out}"
-            parts += [f"## {noise.capitalize()}, {words} left out", _table(header[2:], chosen)]
+            parts += [f"## {noise.capitalize()}, {_tilts(left_out)} left out", _table(header[2:], chosen)]
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
             likeliest = min(chosen, key=lambda row: float(row[2]))
             parts += [f"Best by PSNR: {chosen[0][0]}; by NLL: {likeliest[0]}.", _absent(absent)]
         parts += [_command("needle", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "needle")])
+
+
+def _tilts(left_out: str) -> str:
+    return "every fifth tilt" if left_out == "every fifth" else f"tilts {left_out}"
+
+
+def _needle_panels(cells: Content) -> list[dots.Panel]:
+    """PSNR of every method, best first, for each noise and gap."""
+    panels: dict[str, dict[str, float]] = {}
+    for noise, left_out, method, psnr, *_ in benchmark_needle.table(cells)[1]:
+        panels.setdefault(f"{noise}, {_tilts(left_out)} left out", {})[method] = float(psnr)
+    return [(title, "PSNR of the left-out tilts (dB)", {"": values}) for title, values in panels.items()]
+
+
+def _paper_panels(cells: Content) -> list[dots.Panel]:
+    """Min–max PSNR as measured here and as published, of projections and volume."""
+    panels = []
+    for words, key, place in (("projections", "2d psnr min-max", 0), ("volume", "psnr min-max", 3)):
+        ranked = sorted(cells, key=lambda name: -cells[name][key])
+        ours = {name: float(cells[name][key]) for name in ranked}
+        published = {
+            name: benchmark_paper.PUBLISHED[name][place] for name in ranked if name in benchmark_paper.PUBLISHED
+        }
+        panels.append((words, "PSNR, min–max scaled (dB)", {"measured here": ours, "published": published}))
+    return panels
+
+
+def _ablation_panels(cells: Content) -> list[dots.Panel]:
+    """PSNR of volume and projections, one panel a table."""
+    panels: dict[str, dict[str, dict[str, float]]] = {}
+    for group, what, volume, _, projections, *_ in benchmark_ablations.table(cells)[1]:
+        series = panels.setdefault(group, {"volume": {}, "projections": {}})
+        series["volume"][what], series["projections"][what] = float(volume), float(projections)
+    return [(group, "PSNR (dB)", series) for group, series in panels.items()]
+
+
+def _picture(name: str) -> str:
+    return f"{name.removesuffix('-full').replace('-', '_')}.png"
 
 
 _METHODS = tuple(benchmark_needle.methods(benchmark_needle.load(), lambda volume: 0.0))

@@ -29,6 +29,7 @@ from scale_measure import mapped, middle_rows, psnr, run, seams, seams_beside
 from noiseflow.commands.console import Output
 from recon.benchmarks.scenes import Results
 from recon.benchmarks.search import best_fit
+from recon.fields.regularisers._names import DEFAULT
 from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import fourier_shell_correlation, resolution
 from recon.scale.blocks import HALO
@@ -63,6 +64,7 @@ class Row:
 ROWS = {
     **{f"shells-{size}": Row("shells", size) for size in (64, 128, 192, 256, 512)},
     "start-512": Row("shells", 512, ("--steps", "1")),
+    "tv-512": Row("shells", 512, ("--regulariser", "total-variation")),
     "slab-512": Row("slab", 512),
     "sirt-512": Row("shells", 512, ("--method", "sirt")),
     "l2-512": Row("shells", 512, ("--method", "l2")),
@@ -151,7 +153,12 @@ def measure(row: Row, folder: Path, threads: int) -> Cell:
         judged = {"psnr": psnr(volume, truth), "psnr of the middle": psnr(volume, truth, rows=middle_rows(row.size))}
         judged |= {"fsc 0.5": resolution(*fourier_shell_correlation(volume, truth), 0.5)}
         judged |= seams(volume, truth, said["slices_at_once"])
-    keep = {"seconds inside": said["seconds"], "choices": said["choices"], "verdict": said["verdict"]["grade"]}
+    keep = {
+        "regulariser": said["choices"].get("regulariser", DEFAULT),
+        "seconds inside": said["seconds"],
+        "choices": said["choices"],
+        "verdict": said["verdict"]["grade"],
+    }
     return about | figures | judged | keep
 
 

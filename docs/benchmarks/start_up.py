@@ -18,6 +18,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from recon.benchmarks.provenance import origin
+
 FOLDER = Path(__file__).parent
 COMMANDS = {
     "python": [sys.executable, "-c", "pass"],
@@ -48,6 +50,7 @@ def main() -> None:
     torch = seconds["import torch"]
     result = {
         "machine": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        **origin(),
         "repeats": repeats,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "over import torch": {
@@ -67,7 +70,8 @@ def page_of(result: dict[str, Any]) -> str:
     return f"""# Starting
 
 `python docs/benchmarks/start_up.py` wrote this page: medians of {result["repeats"]} fresh processes each, taken in turns.
-{result["machine"]}. The goals are `import noiseflow` below 1.3 times `import torch`, and `noiseflow -h` below 0.5 s.
+{result["machine"]}; commit {result["commit"]}, {result["date"]}.
+The goals are `import noiseflow` below 1.3 times `import torch`, and `noiseflow -h` below 0.5 s.
 
 | command | seconds | over `import torch` |
 |---|---|---|

@@ -24,6 +24,7 @@ FOLDER = HERE / "generated"
 PAGES = sorted(page for page in HERE.glob("*.md") if page.stem != "index")
 NEEDS = "*A tutorial of noiseflow; its one requirement is `pip install noiseflow`.*"
 BLOCK = re.compile(r"^```(python|sh|\{literalinclude\})([^\n]*)\n(.*?)^```\n", flags=re.DOTALL | re.MULTILINE)
+INCLUDED = re.compile(r"^```\{include\} (\S+)\n:start-after: (.+)\n:end-before: \"?(.+?)\"?\n```", flags=re.MULTILINE)
 SAVED = re.compile(r'^figure\.savefig\("([^"]+)"', flags=re.MULTILINE)
 SHOW = '\n\nfrom IPython.display import Image\n\nImage("{}")'
 
@@ -80,7 +81,8 @@ def _code(block: re.Match[str], page: Path) -> str:
 
 
 def _words(text: str, page: Path) -> nbformat.NotebookNode:
-    """A text cell that stands alone: pictures inside it, other pages by their titles."""
+    """A text cell that stands alone: pictures inside it, other pages by their titles, included parts in full."""
+    text = INCLUDED.sub(lambda found: _part(page.parent / found[1], found[2], found[3]), text)
     pictures = re.findall(r"!\[[^\]]*\]\(([^):\s]+)\)", text)
     for path in pictures:
         text = text.replace(f"({path})", f"(attachment:{Path(path).name})")
@@ -90,6 +92,10 @@ def _words(text: str, page: Path) -> nbformat.NotebookNode:
     if pictures:
         cell.attachments = {Path(path).name: {"image/png": _encoded(page.parent / path)} for path in pictures}
     return cell
+
+
+def _part(page: Path, start: str, end: str) -> str:
+    return page.read_text(encoding="utf-8").split(start, 1)[1].split(end, 1)[0].strip()
 
 
 def _encoded(picture: Path) -> str:

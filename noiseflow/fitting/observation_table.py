@@ -134,8 +134,7 @@ class ObservationTable:
             last = max(levels.numel() - 1, 1)
             self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._observation.dtype) / last - 1
             self._rate, self._bounds = torch.zeros_like(self._offset), None
-            column = torch.cat([levels, levels]) if levels.numel() == 1 else levels
-            self._values = column[None, :].expand(num_rows, -1)
+            self._values = levels[None, :].expand(num_rows, -1)
         self.rebuild(noise_model)
         return self.measure_error(noise_model)
 

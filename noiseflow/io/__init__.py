@@ -12,6 +12,7 @@ from .checks import require_finite as require_finite
 from .files import atomic_path as atomic_path
 from .files import check_folder as check_folder
 from .files import check_output as check_output
+from .files import output_folder as output_folder
 from .files import require_other as require_other
 from .folder import files_of as files_of
 from .image_file import SUFFIXES as SUFFIXES

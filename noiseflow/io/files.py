@@ -64,17 +64,25 @@ def require_other(output: str | Path, *inputs: str | Path | None) -> None:
             raise ValueError(f"{output} is an input too and would be lost; name another output")
 
 
-def check_folder(path: str | Path, *, num_bytes: int = 0, holds: Sequence[str] = (), overwrite: bool = True) -> Path:
+def check_folder(
+    path: str | Path,
+    *,
+    num_bytes: int = 0,
+    holds: Sequence[str] = (),
+    beside: Sequence[Path | None] = (),
+    overwrite: bool = True,
+) -> Path:
     """Fail now, before long work, where results could not be written into a folder, which need not exist yet.
 
     Args:
         path: the folder.
         num_bytes: room that the results will take.
         holds: names of the files that will be written there.
+        beside: other files that will be written, whose name the folder cannot have.
         overwrite: replace files of these names whoever wrote them; otherwise only those that this program wrote.
 
     Raises:
-        ValueError: a file of that name, or a file above it.
+        ValueError: a file of that name, or a file above it, or there will be one.
         FileExistsError: without `overwrite`, one of the files is there and this program did not write it.
         PermissionError: it could not be made or written to.
         OSError: the disk has not as much room.
@@ -83,6 +91,9 @@ def check_folder(path: str | Path, *, num_bytes: int = 0, holds: Sequence[str] =
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ValueError(f"{existing} is a file; name a folder instead of {path}")
+    for other in beside:
+        if other is not None and other.resolve() in (path.resolve(), *path.resolve().parents):
+            raise ValueError(f"{other} will be a file; name another folder instead of {path}")
     for name in holds:
         require_own(path / name, overwrite=overwrite)
     _require_writable(existing)
@@ -143,6 +154,21 @@ def put_in_place(partial: Path, path: str | Path) -> None:
     """Rename a whole file that lies in a temporary folder beside an output onto it, or onto a link's target."""
     partial.chmod(0o666 & ~_umask())
     partial.replace(link_target(path))
+
+
+@contextlib.contextmanager
+def output_folder(path: str | Path, *, parents: bool = True) -> Iterator[Path]:
+    """A folder, made if need be, with those above it; what was made is gone again if the block fails and left nothing there."""
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=parents, exist_ok=True)
+    try:
+        yield path
+    except BaseException:
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 @contextlib.contextmanager

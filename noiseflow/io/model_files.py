@@ -198,6 +198,8 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
         raise FileNotFoundError(f"{path} does not exist; make a noise model with: noiseflow calibrate")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; give the noise-model file inside it")
+    if not path.is_file():  # a pipe could be waited on for ever
+        raise ValueError(f"{path} is no file; a noise model cannot be read from a pipe or a device")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = dict(file.metadata() or {})

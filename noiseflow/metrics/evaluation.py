@@ -26,6 +26,7 @@ from noiseflow.metrics.judged import judged_pixels
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
 _SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
+_GROUPS_OF_A_BIN = 64  # of signals of one bin out of sixteen: still four times as fine as those of all
 _SHIFT_WITHIN_GROUP = 1 / 16
 
 
@@ -124,7 +125,10 @@ def evaluate(
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
         per_signal=tuple(
-            divergence(noise_model, signal[g], observation[g], num_bins=num_bins, random=random) for g in groups
+            divergence(
+                noise_model, signal[g], observation[g], num_bins=num_bins, num_groups=_GROUPS_OF_A_BIN, random=random
+            )
+            for g in groups
         ),
         pit=np.histogram(u, bins=20, range=(0, 1), density=True)[0],
         ks=kolmogorov_smirnov(u),
@@ -152,9 +156,13 @@ def divergence(
     observation: Tensor | NDArray[Any],
     *,
     num_bins: int = 64,
+    num_groups: int = _SIGNAL_GROUPS,
     random: np.random.Generator | None = None,
 ) -> Divergence:
-    """Divergence between the residuals observation − signal and the model's exact masses in the same bins; both (N,)."""
+    """Divergence between the residuals observation − signal and the model's exact masses in the same bins; both (N,).
+
+    `num_groups` signals, at least, stand for all.
+    """
     signal, observation = floating(signal), floating(observation)
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
@@ -163,18 +171,25 @@ def divergence(
         low, high = low - 1.0, low + 2.0
     edges = np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]])
     counts = np.histogram(residual, edges)[0]
-    masses = residual_masses(noise_model, signal, torch.from_numpy(edges))
+    masses = residual_masses(noise_model, signal, torch.from_numpy(edges), num_groups=num_groups)
     return compare_histogram(counts, masses, random)
 
 
 @torch.no_grad()
 def residual_masses(
-    noise_model: nn.Module, signal: Tensor | NDArray[Any], edges: Tensor | NDArray[Any]
+    noise_model: nn.Module,
+    signal: Tensor | NDArray[Any],
+    edges: Tensor | NDArray[Any],
+    *,
+    num_groups: int = _SIGNAL_GROUPS,
 ) -> NDArray[np.float64]:
-    """Probability of each residual bin, averaged over the given (N,) signals, from the model's CDF; (K,) for (K+1,) edges."""
+    """Probability of each residual bin, averaged over the given (N,) signals, from the model's CDF; (K,) for (K+1,) edges.
+
+    `num_groups` signals, at least, stand for all.
+    """
     signal, edges = floating(signal), as_tensor(edges)
     order = torch.argsort(signal)
-    groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges), signal.numel()))
+    groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
     bounds = level[:, None] + edges.to(signal)[None, :]
@@ -182,20 +197,20 @@ def residual_masses(
     log_mass = torch.cat(
         [as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts]
     )
-    mass = torch.exp(log_mass.double()).cpu().T @ (weight / weight.sum())
+    mass = torch.exp(log_mass.double()).cpu().T @ weight
     return (mass / mass.sum()).numpy()
 
 
-def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor) -> int:
+def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int) -> int:
     """How many signals stand for all: single pixel values that have mass must not move across bins within a group."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
-        return _SIGNAL_GROUPS
+        return least
     bins = edges[torch.isfinite(edges)].diff()
     lengths = [float(getattr(module, "step", 0.0)) for module in noise_model.modules()]
     widths = [float(bins.median()) if bins.numel() else math.inf, *lengths]
-    least = min((width for width in widths if width > 0), default=math.inf)
-    wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * least)
-    return int(min(max(wanted, _SIGNAL_GROUPS), _MOST_SIGNAL_GROUPS))
+    finest = min((width for width in widths if width > 0), default=math.inf)
+    wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * finest)
+    return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 
 
 def compare_histogram(

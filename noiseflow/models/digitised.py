@@ -38,9 +38,9 @@ class Digitised(ModelAround):
     """
 
     describes_single_readings = True
-    step: float = 1.0
-    low: float = -math.inf
-    high: float = math.inf
+    step: float = math.nan  # set when a model is made; here they hide the inner model's
+    low: float = math.nan
+    high: float = math.nan
 
     def __init__(self, model: nn.Module, step: float = 1.0, low: float = -math.inf, high: float = math.inf) -> None:
         super().__init__(model)

@@ -67,7 +67,8 @@ class Report:
     def figure(self, figure: Figure, *, caption: str) -> None:
         """Add a matplotlib figure, embedded as PNG on white; use it for images, and `charts` for curves."""
         stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches="tight")
+        margins = None if figure.get_layout_engine() else "tight"  # which draws everything twice
+        figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
         data = base64.b64encode(stream.getvalue()).decode()
         text = _escape(caption)
         self._parts.append(

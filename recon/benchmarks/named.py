@@ -35,6 +35,7 @@ class Options:
         output: tells people what is going on.
         overwrite: replace figures whoever made them; otherwise only those that this program made.
         method: of `sabotage`; None for the joint fit, or least squares where quick.
+        in_turn: whether `sabotage` spoils one scene in each way, the next way the next scene.
     """
 
     size: int
@@ -45,6 +46,7 @@ class Options:
     output: Output
     overwrite: bool = False
     method: str | None = None
+    in_turn: bool = False
 
     def results(self, name: str) -> Results:
         """The kept results of a benchmark on this scene; another scene or effort has another file."""
@@ -168,6 +170,7 @@ def sabotage(options: Options) -> dict[str, Any]:
         method=method,
         seed=options.scene["seed"],
         quick=options.quick,
+        in_turn=options.in_turn,
     )
     return _told(options, results, benchmark_sabotage.table(results.cells))
 

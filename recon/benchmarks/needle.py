@@ -16,6 +16,7 @@ from noiseflow import Gaussian, SignalDependentGaussian, fit
 from recon.benchmarks.scenes import Cell, Results
 from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from recon.fields.fields import VoxelField
+from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace
 from recon.metrics.comparison import project
@@ -73,7 +74,7 @@ def split(series: TiltSeries, noise: str, gap: str, *, seed: int) -> Split:
 def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Callable[[], Best]]:
     """The best volume by method and score; the joint fits choose by themselves and come last."""
     grid = VolumeGrid.of(given)
-    least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS)
+    least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS, regulariser=TotalVariation())
     absolute = replace(least_squares, noise_model=Laplace)
     voxels = replace(least_squares, make_field=VoxelField)
 

@@ -23,6 +23,7 @@ from noiseflow import Gaussian
 from recon.benchmarks.external import astra_sirt, missing, quantem_inr
 from recon.benchmarks.scenes import Cell, Results, Scene, make_scene
 from recon.fields.fields import VoxelField
+from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem
 from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022
@@ -93,8 +94,10 @@ def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
         return scene.noise_model
 
     return {
-        "L2 + TV": JointReconstructor(noise_model=Gaussian),
-        "L2 + TV, voxels": JointReconstructor(noise_model=Gaussian, make_field=VoxelField),
+        "L2 + TV": JointReconstructor(noise_model=Gaussian, regulariser=TotalVariation()),
+        "L2 + TV, voxels": JointReconstructor(
+            noise_model=Gaussian, make_field=VoxelField, regulariser=TotalVariation()
+        ),
         "oracle": JointReconstructor(noise_model=truth),
     }
 

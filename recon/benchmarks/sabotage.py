@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from recon.benchmarks import further_ways  # noqa: F401  (registers its ways, after those of spoiling)
 from recon.benchmarks.needle import load
 from recon.benchmarks.scenes import Cell, Results, Scene, make_scene
-from recon.benchmarks.spoiling import WAYS, Source, Spoilt
+from recon.benchmarks.ways import WAYS, Source, Spoilt
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import compare
 from recon.series.screening import screen
@@ -33,13 +34,25 @@ _OTHER = 9  # added to the seed for another object of the same kind
 Result = tuple[TiltSeries, Any, Verdict]
 
 
-def run(results: Results, line: Callable[[str], None], *, size: int, method: str, seed: int, quick: bool) -> None:
-    """Fill a cell for each good series, and for each scene and way of spoiling it; what is there already is kept."""
+def run(
+    results: Results,
+    line: Callable[[str], None],
+    *,
+    size: int,
+    method: str,
+    seed: int,
+    quick: bool,
+    in_turn: bool = False,
+) -> None:
+    """Fill a cell for each good series, and for each scene and way of spoiling it; what is there already is kept.
+
+    In turn, each way spoils one scene, the next way the next one: a third of the time.
+    """
     for phantom, noise in SCENES if quick else STANDARD:
         _cell(results, line, f"good/{phantom}, {noise}", partial(_good, phantom, noise, size, method, seed))
     _cell(results, line, "good/needle", lambda: _graded(_result(load(), method, seed)[2]))
-    for phantom, noise in SCENES[:1] if quick else SCENES:
-        for name in WAYS:
+    for number, (phantom, noise) in enumerate(SCENES[:1] if quick else SCENES):
+        for name in list(WAYS)[number :: len(SCENES)] if in_turn else WAYS:
             key = f"{phantom}, {noise}/{name}"
             _cell(results, line, key, partial(_spoilt, phantom, noise, name, size, method, seed))
 

@@ -22,6 +22,10 @@ Candidate = tuple[str, Array]
 CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 FIRST_WEIGHT = 0.2
+_APART = (-1, 1, 2)
+"""Powers of `_FAR` times the first weight that are tried first: a search by neighbours alone stops at the first local best. On
+the needle with 10 counts and every fifth tilt left out, voxels had one at 0.4 (30.3 dB) beside the true one at 4.6 (35.5 dB)."""
+_FAR = 8.0
 STEPS = 360
 """Of the fits of other methods: three times those of the joint fit, so that they end where they would."""
 
@@ -87,7 +91,8 @@ def best_fit(
     *,
     first: float = FIRST_WEIGHT,
 ) -> Best:
-    """The fit at the weight of the total variation of the highest score: bracketed in steps of two, then interpolated.
+    """The fit at the weight of the total variation of the highest score: the best of a few that lie far apart, bracketed in
+    steps of two, then interpolated.
 
     Args:
         tilt_series: the data.
@@ -100,11 +105,13 @@ def best_fit(
     scores: dict[float, float] = {}
 
     def loss(weight: float) -> float:
-        found[weight] = replace(reconstructor, weight=weight)(tilt_series, grid).volume.attenuation
-        scores[weight] = score(found[weight])
+        if weight not in scores:
+            found[weight] = replace(reconstructor, weight=weight)(tilt_series, grid).volume.attenuation
+            scores[weight] = score(found[weight])
         return -scores[weight]
 
-    loss(choose_weight(loss, first).weight)
+    start = min((first * _FAR**power for power in (0, *_APART)), key=loss)
+    loss(choose_weight(loss, start).weight)
     weight = max(scores, key=lambda each: scores[each])
     tried = {f"weight {each:.3g}": scores[each] for each in sorted(scores)}
     return Best(f"weight {weight:.3g}", found[weight], tried)

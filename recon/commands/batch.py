@@ -49,6 +49,7 @@ def batch(
     from recon.scale.cluster import client_of
     from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, require_own_table, write_table
 
+    io.check_folder(out)
     output, table = Output(json), out / "batch.csv" if table is None else table
     if table.suffix.lower() not in (".csv", ".json"):
         raise ValueError(f"--table {table}: name a .csv or a .json file")
@@ -57,8 +58,7 @@ def batch(
     jobs, skipped = jobs_of(source, out, words), left_out(source)
     if skipped:
         output.line(f"left out, without tilt angles beside them or in them: {', '.join(skipped)}")
-    out.mkdir(parents=True, exist_ok=True)
-    with io.locked(table):
+    with io.output_folder(out), io.locked(table):
         rows = [row for row in read_table(table) if row["status"] == "done"] if resume else []
         known = {row["volume"] for row in rows if Path(row["volume"]).exists()}
         rows = [row for row in rows if row["volume"] in known]
@@ -69,11 +69,17 @@ def batch(
             client_of(None, scheduler) as client,
             progress_bar("series", max(1, len(left)), json_mode=json) as progress,
         ):
-            for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
-                rows.append(row)
-                write_table(table, _in_order(rows, jobs))
-                progress(done, Path(row["series"]).name)
-                output.line(_in_words(row))
+            try:
+                for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
+                    rows.append(row)
+                    write_table(table, _in_order(rows, jobs))
+                    progress(done, Path(row["series"]).name)
+                    output.line(_in_words(row))
+            except KeyboardInterrupt:
+                done = sum(row["status"] == "done" for row in rows)
+                raise KeyboardInterrupt(
+                    f"{done} of {len(jobs)} series are done; --resume goes on with the others"
+                ) from None
         write_table(table, rows := _in_order(rows, jobs))
     failed = [row for row in rows if row["status"] != "done"]
     output.line(f"{len(rows) - len(failed)} of {len(jobs)} series reconstructed; table: {table}")
@@ -83,7 +89,10 @@ def batch(
 
 
 def _shared_words(options: str, noise_model: Path | None, *, resume: bool, overwrite: bool) -> list[str]:
-    words = shlex.split(options)
+    try:
+        words = shlex.split(options)
+    except ValueError as error:
+        raise ValueError(f"--options {options}: {str(error).lower()}") from error
     if noise_model is not None:
         words += ["--noise-model", str(noise_model)]
     return words + ["--resume"] * resume + ["--overwrite"] * overwrite

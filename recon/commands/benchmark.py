@@ -26,6 +26,9 @@ def benchmark(
     method: Annotated[
         str | None, typer.Option(help="Method of sabotage: joint, or l2 with --quick, if not given.")
     ] = None,
+    in_turn: Annotated[
+        bool, typer.Option("--in-turn", help="Sabotage spoils one scene in each way, not three: a third of the time.")
+    ] = False,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
     again: Annotated[str, typer.Option(help="Recompute the kept results whose name contains this.")] = "",
@@ -53,12 +56,14 @@ def benchmark(
         raise ValueError(f"{out} is a file; name a folder with --out")
     _check_scene(size, noise, phantom)
     _check_method(method, names)
+    if in_turn and (names != ["sabotage"] or quick):
+        raise ValueError("--in-turn belongs to the benchmark sabotage without --quick")
     out.mkdir(parents=True, exist_ok=True)
     effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method)
+    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method, in_turn)
     check_figures(names, options)
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})

@@ -51,11 +51,11 @@ def compare(
         output.line(f"its error bars expect 0.5 to be reached at {reach}")
     page = None
     if report is not None:
-        report.mkdir(parents=True, exist_ok=True)
         pictures = comparison_report(
             first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
         )
-        page = pictures.save(report / "index.html")
+        with io.output_folder(report):
+            page = pictures.save(report / "index.html")
         output.line(f"report: {page}")
     found = comparison.as_dict()
     output.result({"errors": found.pop("volume"), **found, "report": page})

@@ -28,6 +28,8 @@ def measure(
 
     Error bars are the files VOLUME_std, VOLUME_bias and VOLUME_fsc.csv that `noiseflow reconstruct --uncertainty 16` writes.
     """
+    import numpy as np
+
     from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
     from recon.uncertainty.result import quantile
 
@@ -35,6 +37,11 @@ def measure(
     quantile(level)
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
+    if not np.isfinite(values[part]).all():
+        raise ValueError(
+            f"{volume} has NaN or infinite voxels in the region {region}; choose another one with --region"
+        )
+    profile = None if line is None else line_profile(values, *_ends(line), bars, level=level)
     mean = mean_of_region(values, part, bars, level=level)
     rows, result = [("mean attenuation per voxel", mean.in_words())], dict[str, Any](mean=vars(mean))
     if above is not None:
@@ -54,17 +61,18 @@ def measure(
         rows.append(("expected resolution, correlation of 0.5 with the truth", band.in_words(found.voxel_size)))
         result["resolution (cycles per voxel)"] = band.resolution()
     output.table(("figure", "value" if bars is None else f"value ({100 * level:g} % interval)"), rows)
-    profile = None
-    if line is not None:
-        distance, along, half = line_profile(values, *_ends(line), bars, level=level)
+    along_line = None
+    if profile is not None:
+        distance, along, half = profile
         columns = [distance, along] if half is None else [distance, along, along - half, along + half]
         names = ("distance (voxels)", "attenuation", "low", "high")[: len(columns)]
         output.table(names, [tuple(f"{value:.4g}" for value in row) for row in zip(*columns, strict=True)])
-        profile = dict(zip(names, columns, strict=True))
+        along_line = dict(zip(names, columns, strict=True))
     if bars is None:
         output.line(f"no error bars beside {volume}: noiseflow reconstruct --uncertainty 16 writes them")
     output.result(
-        {"volume": volume, "region": region, "level": level, **result, "line": profile, "error_bars": bars is not None}
+        {"volume": volume, "region": region, "level": level, **result}
+        | {"line": along_line, "error_bars": bars is not None}
     )
 
 

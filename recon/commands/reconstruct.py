@@ -65,8 +65,11 @@ def reconstruct(
     ] = None,
     weight: Annotated[float | None, typer.Option(help="Weight of the regulariser.")] = None,
     regulariser: Annotated[
-        str, typer.Option(help=f"What a fitted volume is expected to look like: {', '.join(regulariser_names())}.")
-    ] = DEFAULT,
+        str | None,
+        typer.Option(
+            help=f"What a fitted volume is expected to look like: {', '.join(regulariser_names())}; {DEFAULT} by default."
+        ),
+    ] = None,
     uncertainty: Annotated[
         int,
         typer.Option(
@@ -82,12 +85,12 @@ def reconstruct(
         ),
     ] = None,
     denoiser: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Of the denoised methods: nlm, tv, wavelet, wiener, bm3d, or one of your own, package.module:function "
-            "(module:function runs that code)."
+            help="Of the denoised methods: nlm (the default), tv, wavelet, wiener, bm3d, or one of your own, "
+            "package.module:function (module:function runs that code)."
         ),
-    ] = "nlm",
+    ] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
     save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
@@ -278,8 +281,8 @@ def _show_plan(tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any
         output.line(f"{method.name}: {method.description} It has no stages to plan.")
     else:
         made = {name: value for name, value in options.items() if name != "method"}
-        stages, slab = method.plan(tilt_series, grid, settings_of(method.name, **made))
-        seconds = expected_seconds(stages, tilt_series, grid, slab)
+        stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
+        seconds = expected_seconds(stages, tilt_series, grid, slab, share)
         output.line(f"slab: {slab} of {grid.height} slices")
         output.line(describe(stages))
         output.line(f"expected: about {seconds:.0f} s on this machine")

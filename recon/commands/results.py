@@ -56,7 +56,8 @@ class Targets:
         if self.noise_model is not None:
             io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
         if self.report is not None:
-            io.check_folder(self.report, holds=["index.html"], overwrite=self.overwrite)
+            files = (self.volume, self.noise_model)
+            io.check_folder(self.report, holds=["index.html"], beside=files, overwrite=self.overwrite)
 
     def write(
         self,
@@ -99,7 +100,6 @@ class Targets:
             output.line(line)
         page = None
         if self.report is not None:
-            self.report.mkdir(parents=True, exist_ok=True)
             content = reconstruction_report(
                 tilt_series,
                 outcome,
@@ -110,7 +110,8 @@ class Targets:
                 reference=reference,
                 verdict=verdict,
             )
-            page = content.save(self.report / "index.html")
+            with io.output_folder(self.report):
+                page = content.save(self.report / "index.html")
             output.line(f"report: {page}")
         fit = outcome.fit_result
         output.result(

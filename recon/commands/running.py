@@ -52,7 +52,7 @@ class StopSignal:
         journal = self._journal
         if journal.stop_requested or not journal.in_fit:
             journal.abandoned = True
-            raise KeyboardInterrupt("stopped at once")
+            raise KeyboardInterrupt
         journal.stop_requested = True
         with contextlib.suppress(OSError, ValueError, AttributeError):
             # past the buffer, which a line that was stopped may be writing to
@@ -68,16 +68,19 @@ def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
         BlockingIOError: another run holds the journal.
         OSError: the disk is full or gone; the error says how to go on where there is a state.
     """
-    with locked(journal.folder.with_suffix("")), StopSignal(journal):
-        try:
-            yield
-        except OSError as error:
-            if journal.resumed and journal.exists:
-                error.add_note(f"the last state is kept: when that is mended, go on with: {resume_command(context)}")
-            raise
-        except KeyboardInterrupt as stop:
-            advice = f"go on with: {resume_command(context)}" if journal.resumed else START_AGAIN
-            end_stopped(f"{str(stop) or 'stopped'}; {advice}")
+    try:  # around the signals too: the second Ctrl-C may come while they are handed back
+        with locked(journal.folder.with_suffix("")), StopSignal(journal):
+            try:
+                yield
+            except OSError as error:
+                if journal.resumed and journal.exists:
+                    error.add_note(
+                        f"the last state is kept: when that is mended, go on with: {resume_command(context)}"
+                    )
+                raise
+    except KeyboardInterrupt as stop:
+        advice = f"go on with: {resume_command(context)}" if journal.resumed else START_AGAIN
+        end_stopped(f"{str(stop) or ('stopped at once' if journal.abandoned else 'stopped')}; {advice}")
 
 
 def resume_command(context: typer.Context) -> str:

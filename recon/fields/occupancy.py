@@ -37,7 +37,7 @@ class Occupancy(nn.Module):
         self, rough: Tensor, shape: Sequence[int], *, least: float = 0.2, margin: int = 2, block: int = 4
     ) -> None:
         super().__init__()
-        self.block = block
+        self.least, self.block = least, block
         lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
         self.register_buffer("mask", _grown(lattice[0, 0].transpose(1, 2).contiguous() > least, margin))
         self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
@@ -51,15 +51,15 @@ class Occupancy(nn.Module):
     def rows(self, rows: slice) -> Occupancy:
         """The same for some slices."""
         depth, width, _ = self.mask.shape
-        part = Occupancy(torch.zeros(1, 1, 1), (depth, rows.stop - rows.start, width), block=self.block).to(
-            self.mask.device
-        )
+        part = Occupancy(
+            torch.zeros(1, 1, 1), (depth, rows.stop - rows.start, width), least=self.least, block=self.block
+        ).to(self.mask.device)
         part.mask = self.mask[..., rows].clone()
         return part
 
     def coarser(self, shape: Sequence[int]) -> Occupancy:
         """The same on a voxel grid (depth, height, width) half as fine."""
-        part = Occupancy(torch.zeros(1, 1, 1), shape, block=self.block).to(self.mask.device)
+        part = Occupancy(torch.zeros(1, 1, 1), shape, least=self.least, block=self.block).to(self.mask.device)
         part.mask = functional.adaptive_max_pool3d(self.mask.float()[None], part.mask.shape)[0] > 0
         return part
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
-from noiseflow.io import atomic_path
+from noiseflow.io import atomic_path, output_folder
 from noiseflow.io.ownership import is_own
 from noiseflow.io.partials import clear_all_leftovers
 from recon.joint.stages import Stage
@@ -219,9 +219,8 @@ class Journal:
 
     def _start(self) -> None:
         self.discard()
-        self.folder.mkdir(exist_ok=True)
         description = {"format": _FORMAT, "library_version": version("noiseflow"), "settings": self.settings}
-        with atomic_path(self.folder / _RUN) as partial:
+        with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
             partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
         self._fresh = False
 

@@ -24,6 +24,9 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 _COARSE = 24
 _LEAST_BINNING = 4
 _HIGHEST_RATE, _RATE = 0.4, 0.6
+# of noise relative to contrast, and its limits: noise of 0.5 or more leaves a haze of 0.2 of the scale in the coarse volume of a
+# vacuum; that of the raw needle, of noise 0.003, is clean, and its dim holder, at 0.1, must not be taken for vacuum
+_HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
 
 
 @dataclass(frozen=True)
@@ -34,11 +37,18 @@ class Start:
         rough: (z, y, x) the coarse volume of all slices, attenuation per voxel of the whole grid.
         response: the detector's, as it suits that volume.
         height: slices of the series.
+        noise: of single pixels relative to the contrast, see `recon.joint.task.noise_share`.
     """
 
     rough: Tensor
     response: Transmission | Linear
     height: int
+    noise: float
+
+    @property
+    def vacuum(self) -> float:
+        """Attenuation, in units of the scale, below which the coarse volume may be vacuum."""
+        return min(max(_HAZE * self.noise, _LEAST_VACUUM), _MOST_VACUUM)
 
     def rows(self, rows: slice | NDArray[np.int64]) -> Tensor:
         """The coarse volume of some slices, with as many layers along y as there are slices."""

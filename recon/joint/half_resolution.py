@@ -52,7 +52,7 @@ class HalfResolution:
             projector,
             signal_model.image_formation,
             weight=signal_model.weight,
-            regulariser=signal_model.regulariser,
+            regulariser=signal_model.regulariser.at_half_resolution(),
             learning_rate=signal_model.learning_rate,
             occupancy=None if occupancy is None else occupancy.coarser((field.depth, field.height, field.width)),
         )
@@ -68,5 +68,7 @@ class HalfResolution:
         coarse, full = self.signal_model, self._full
         if full.occupancy is not None:
             shape = full.field.depth, full.field.height, full.field.width
-            found = Occupancy(coarse.volume() / coarse.field.scale, shape, block=full.occupancy.block)
+            found = Occupancy(
+                coarse.volume() / coarse.field.scale, shape, least=full.occupancy.least, block=full.occupancy.block
+            )
             full.occupancy.mask = found.to(full.occupancy.mask.device).mask

@@ -17,6 +17,8 @@ from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
 from recon.fields.fields import Field, MultiresolutionField
 from recon.fields.occupancy import Occupancy
+from recon.fields.regularisers import find_regulariser
+from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
@@ -36,12 +38,18 @@ from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
+_WIDTH_OF_FIRST = (
+    128  # voxels; of wider volumes the best weight is lower: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+)
+_QUIET_FIRST = 6.4  # four rungs up, near to where real quiet series end (10 and 11): the same rungs in fewer fits
 _HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2  # of the pixels: those of a slab are few to tell weights apart
 _SLAB, _SLAB_VOXELS = (
     24,
     16 * 96**2,
 )  # slices; more where they are small: so many voxels tell weights apart as well as more do
+_QUIET_SLAB = 12  # of 256²: they choose 6.8 for the raw needle, 24 choose 5.7, which is 0.0001 nats likelier to them
 _QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
+_WIDE = 256  # voxels, where steps are as many as at 96
 _WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
 
 
@@ -57,7 +65,7 @@ class JointReconstructor:
         noise_model: a noise model to use, learning or not; None chooses a mean-preserving one behind the detector's rounding
             and clipping limits.
         make_field: makes the field from shape and scale.
-        regulariser: what is expected of a volume; total variation if None.
+        regulariser: what is expected of a volume; directional total variation if None.
         num_steps: signal steps of the whole volume; None as the schedule says.
         estimate_response: whether incident intensity or offset are learnt.
         skip_vacuum: whether voxels are left out where there is nothing; without defocus.
@@ -110,8 +118,8 @@ class JointReconstructor:
             ValueError: the grid does not match the images, or the fit found no finite step.
         """
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
-        whole = self.signal_model(tilt_series, grid)
-        run = self._slab(tilt_series, whole, progress)
+        start = self._start(tilt_series, grid)
+        run = self._slab(tilt_series, self._model(start, tilt_series, grid), start.noise, progress)
         return self._finish(run, tilt_series, grid)
 
     @kept_memory()
@@ -124,7 +132,7 @@ class JointReconstructor:
         rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
         start, part = self._start(tilt_series, grid), tilt_series.rows(rows)
         model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
-        run = self._slab(part, model, progress, share=noise_share(tilt_series.images))
+        run = self._slab(part, model, start.noise, progress)
         run.fit_whole()
         return run.settled(start)
 
@@ -159,11 +167,15 @@ class JointReconstructor:
             run.stages = []
         return self._finish(run, tilt_series, grid)
 
-    def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int]:
-        """The stages for a series, and the slices of the slab that choices are made on; arguments as of a call."""
+    def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int, float]:
+        """The stages for a series, the slices of the slab that choices are made on, and the share of the voxels that are not
+        skipped as vacuum; arguments as of a call."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
-        facts, rows, _ = self._facts(tilt_series, self.signal_model(tilt_series, grid))
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start
+        start = self._start(tilt_series, grid)
+        whole = self._model(start, tilt_series, grid)
+        facts, rows, _ = self._facts(tilt_series, whole, start.noise)
+        share = 1.0 if whole.occupancy is None else whole.occupancy.share
+        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The signal model before any fit: a coarse reconstruction on the scale of the data."""
@@ -188,7 +200,8 @@ class JointReconstructor:
             )
         response = estimate_response(tilt_series, estimate=self.estimate_response)
         generator = torch.Generator().manual_seed(self.seed)
-        return Start(coarse_start(tilt_series, response, grid, generator=generator), response, height)
+        rough = coarse_start(tilt_series, response, grid, generator=generator)
+        return Start(rough, response, height, noise_share(tilt_series.images))
 
     def _model(
         self,
@@ -204,7 +217,7 @@ class JointReconstructor:
         projector = self.projector(tilt_series, grid) if projector is None else projector
         rough = start.rough.to(self.device)
         scale = attenuation_scale(rough)
-        weight = _FIRST_WEIGHT if self.weight is None else self.weight
+        weight = _first_weight(grid.width) if self.weight is None else self.weight
         response = copy.deepcopy(start.response)
         if settled is not None:
             response.load_state_dict(settled.response)
@@ -220,24 +233,24 @@ class JointReconstructor:
             made.check_axes(rough)
         occupancy = None
         if self.skip_vacuum and projector.has_parts:
-            occupancy = Occupancy(rough / made.scale, grid.shape).to(self.device)
+            occupancy = Occupancy(rough / made.scale, grid.shape, least=start.vacuum).to(self.device)
             occupancy = occupancy if occupancy.share < _WORTHWHILE else None
         formation = response.to(self.device)
         kept: dict[str, Any] = {
             "weight": weight,
-            "regulariser": self.regulariser,
+            "regulariser": find_regulariser(DEFAULT) if self.regulariser is None else self.regulariser,
             "learning_rate": rate,
             "occupancy": occupancy,
         }
         return TomographySignal(made, projector, formation, **kept)
 
     def _facts(
-        self, tilt_series: TiltSeries, whole: TomographySignal, *, share: float | None = None
+        self, tilt_series: TiltSeries, whole: TomographySignal, noise: float
     ) -> tuple[Facts, slice, nn.Module | None]:
-        """What is known before any fit, the slices to choose on, and the given noise model; `share` is all slices' noise."""
+        """What is known before any fit, the slices to choose on, and the given noise model; `noise` is that of all slices."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
-        quiet = learning and (noise_share(tilt_series.images) if share is None else share) < _QUIET
+        quiet = learning and noise < _QUIET
         described = quiet and given is None  # by a noise model that no fit of the volume sees
         rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
         facts = Facts(
@@ -247,6 +260,7 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
+            wide=whole.field.width > _WIDE,
             can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),
         )
         return facts, rows, given
@@ -255,12 +269,11 @@ class JointReconstructor:
         self,
         tilt_series: TiltSeries,
         whole: TomographySignal,
+        noise: float,
         progress: Progress | None,
-        *,
-        share: float | None = None,
     ) -> PlannedRun:
         """A run whose choices are made."""
-        facts, rows, given = self._facts(tilt_series, whole, share=share)
+        facts, rows, given = self._facts(tilt_series, whole, noise)
         simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
@@ -290,7 +303,7 @@ class JointReconstructor:
             tasks,
             models,
             candidates=candidates,
-            first_weight=_FIRST_WEIGHT,
+            first_weight=_QUIET_FIRST if facts.quiet else _first_weight(tasks["whole"].signal_model.field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
             prefix=self.prefix,
@@ -329,11 +342,14 @@ class JointReconstructor:
         return self.coarse_to_fine and HalfResolution.possible(model)
 
     def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
-        """Of the slab: a few cannot tell weights apart where each has few pixels, and gaps of tilts need twice as many."""
+        """Of the slab: a few cannot tell weights apart where each has few pixels, and gaps of tilts need twice as many voxels.
+        The long trials of quiet series take no more of them than that."""
         if self.slab is not None:
             return self.slab
-        voxels = _SLAB_VOXELS * (2 if quiet else 1)
-        return _SLAB if self.weight is not None else max(_SLAB, -(-voxels // (made.depth * made.width)))
+        if self.weight is not None:
+            return _SLAB
+        voxels, fewest = (2 * _SLAB_VOXELS, _QUIET_SLAB) if quiet else (_SLAB_VOXELS, _SLAB)
+        return max(fewest, -(-voxels // (made.depth * made.width)))
 
     def _finish(self, run: PlannedRun, tilt_series: TiltSeries, grid: VolumeGrid) -> Reconstruction:
         """The volume, under what is chosen."""
@@ -345,6 +361,11 @@ class JointReconstructor:
             images = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
         found = Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
+
+
+def _first_weight(width: int) -> float:
+    """Of the regulariser, where the search for it begins and what steps before it take."""
+    return _FIRST_WEIGHT * min(1.0, _WIDTH_OF_FIRST / width)
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:

@@ -102,6 +102,8 @@ class Runner:
             "candidates": self._candidates,
             "weights": self._weights,
         }
+        for where in {stage.where for stage in stages if stage.afresh}:
+            self.tasks[where].remember()  # it takes as much memory as the field: only where it is asked for
         for stage in stages:
             before = self._done
             carry_out[stage.kind](stage, self.tasks[stage.where])

@@ -82,6 +82,7 @@ class PlannedRun:
     def settled(self, start: Start) -> Settled:
         """What some slabs have settled, which were the whole of this run."""
         model = self.runner.tasks["whole"].signal_model
+        model.let_go()  # blocks take its place in memory
         return Settled(
             simple=self.runner.models["simple"],
             noise_model=self.noise_model,

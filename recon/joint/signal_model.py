@@ -150,6 +150,13 @@ class TomographySignal(Described):
         if self._seen is not None:
             self._seen = self._seen[0], self._seen[1].detach()
 
+    def let_go(self) -> None:
+        """Let go of all that can be made again, matrices of tiles above all: no fit follows, but the model may be asked."""
+        self._values = self._seen = self._tiles = None
+        self._tiles_of, self._steps_follow = (None, 0), False
+        for parameter in self.parameters():
+            parameter.grad = None
+
     @property
     def _changes(self) -> tuple[object, ...]:
         tensors = [*self.parameters(), *self.buffers()]

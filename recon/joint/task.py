@@ -35,12 +35,20 @@ class Task:
     use: Tensor | None
     held_out: Tensor
     _tables: dict[nn.Module, TableKeeper] = field(default_factory=dict)
+    _rough: dict[str, Any] | None = None
 
-    def __post_init__(self) -> None:
+    def remember(self) -> None:
+        """Keep the volume as it is, for `restart`."""
         self._rough = copy.deepcopy(self.signal_model.state_dict())
 
     def restart(self) -> None:
-        """Go back to the volume that the task began with; the detector's response stays as it was learnt."""
+        """Go back to the volume that was remembered; the detector's response stays as it was learnt.
+
+        Raises:
+            ValueError: none was.
+        """
+        if self._rough is None:
+            raise ValueError("there is no volume to go back to; call remember() first")
         response = copy.deepcopy(self.signal_model.image_formation.state_dict())
         self.signal_model.load_state_dict(self._rough)
         self.signal_model.image_formation.load_state_dict(response)

@@ -18,7 +18,8 @@ def after_denoising(name: str, description: str, method: Method) -> Method:
     """A method that is another one on denoised images; a calibrated noise model tells the denoiser the noise level."""
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
-        denoise = find_denoiser(settings.denoiser, tilt_series.images, noise_model=settings.noise_model)
+        denoiser = settings.denoiser or "nlm"
+        denoise = find_denoiser(denoiser, tilt_series.images, noise_model=settings.noise_model)
 
         def clean_next(images: torch.Tensor, number: int) -> torch.Tensor:
             images[number] = torch.from_numpy(np.asarray(denoise(tilt_series.images[number]), dtype=np.float32))
@@ -27,8 +28,15 @@ def after_denoising(name: str, description: str, method: Method) -> Method:
         cleaned = Repeated(torch.zeros(tilt_series.images.shape), clean_next, tilt_series.num_tilts)
         settings.run_stage("denoising", cleaned)
         result = method.run(replace(tilt_series, images=cleaned.value.numpy()), grid, settings)
-        return replace(result, method=name, choices={"denoiser": settings.denoiser, **result.choices})
+        return replace(result, method=name, choices={"denoiser": denoiser, **result.choices})
 
     return replace(
-        method, name=name, description=description, run=run, keeps_noise_model=True, plan=None, blockwise=None
+        method,
+        name=name,
+        description=description,
+        run=run,
+        keeps_noise_model=True,
+        refuses=tuple(each for each in method.refuses if each != "denoiser"),
+        plan=None,
+        blockwise=None,
     )

@@ -13,7 +13,6 @@ from torch import nn
 from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.around import as_noise_model
 from noiseflow.models.at_level import at_level
-from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
@@ -33,13 +32,21 @@ Options = Callable[[Settings], dict[str, Any]]
 """From what a user settled to further options of a `JointReconstructor`."""
 
 
-def fitted(name: str, description: str, options: Options, *, keeps_noise_model: bool = False) -> Method:
+def fitted(
+    name: str,
+    description: str,
+    options: Options,
+    *,
+    keeps_noise_model: bool = False,
+    refuses: tuple[str, ...] = (),
+) -> Method:
     """A method that is a joint fit.
 
     Args:
         name, description: of the method.
         options: of the joint fit, besides what a user settled.
         keeps_noise_model: whether it takes a calibrated noise model.
+        refuses: settings that are part of the method.
     """
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
@@ -48,7 +55,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         result = _raised(result, level, chosen="noise_model" not in options(settings))
         return replace(result, method=name, choices=_choices(result, settings, tilt_series))
 
-    def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int]:
+    def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int, float]:
         return reconstructor(settings, options).plan(tilt_series, grid)
 
     def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
@@ -85,6 +92,7 @@ def fitted(name: str, description: str, options: Options, *, keeps_noise_model: 
         fitted=True,
         keeps_noise_model=keeps_noise_model,
         learns_noise=True,
+        refuses=("window", "denoiser", *refuses),
         plan=make_plan,
         blockwise=blockwise,
     )
@@ -142,7 +150,8 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit that a method makes of what a user settled."""
     names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
-    shared["regulariser"] = find_regulariser(settings.regulariser)
+    if settings.regulariser is not None:
+        shared["regulariser"] = find_regulariser(settings.regulariser)
     return JointReconstructor(**(shared | options(settings)))
 
 
@@ -182,7 +191,7 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
-    if settings.regulariser != DEFAULT:
+    if settings.regulariser is not None:
         choices["regulariser"] = settings.regulariser
     return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
 

@@ -17,7 +17,6 @@ from noiseflow.described import described
 from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
-from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
@@ -39,12 +38,13 @@ class Settings:
 
     Attributes:
         weight: of the regulariser, see `recon.joint.signal_model.TomographySignal`.
-        regulariser: what a fitted volume is expected to look like, one of `recon.fields.regularisers.regulariser_names`.
+        regulariser: what a fitted volume is expected to look like, one of `recon.fields.regularisers.regulariser_names`; None as
+            the method has it.
         uncertainty: samples that error bars of the volume come from; 0 for none.
         num_steps: steps or iterations.
         noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
         window: of the back-projection, one of `recon.projection.wbp.WINDOWS`.
-        denoiser: see `recon.denoise.denoisers.find_denoiser`.
+        denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur that fitted methods model, pixels per voxel out of the plane of focus.
         seed: of every random choice.
         device: where to compute.
@@ -61,12 +61,12 @@ class Settings:
     """
 
     weight: float | None = None
-    regulariser: str = DEFAULT
+    regulariser: str | None = None
     uncertainty: int = 0
     num_steps: int | None = None
     noise_model: nn.Module | None = None
     window: str | None = None
-    denoiser: str = "nlm"
+    denoiser: str | None = None
     defocus: float = 0.0
     seed: int = 0
     device: torch.device | str = "cpu"
@@ -84,7 +84,8 @@ class Settings:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
-        find_regulariser(self.regulariser)
+        if self.regulariser is not None:
+            find_regulariser(self.regulariser)
         if self.uncertainty < 0 or self.uncertainty == 1:
             raise ValueError(f"--uncertainty {self.uncertainty}: a spread needs at least 2 samples; 16 are usual")
         if self.window is not None and self.window not in WINDOWS:
@@ -92,8 +93,11 @@ class Settings:
 
 
 Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
-MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], int]]
+MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], int, float]]
 SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
+
+
+_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty")
 
 
 @described()
@@ -108,7 +112,9 @@ class Method:
         fitted: whether it fits a volume, and so knows ``weight``, ``defocus`` and what a fit takes of memory.
         keeps_noise_model: whether it takes a calibrated noise model; another refuses one.
         learns_noise: whether its result has a noise model.
-        plan: the stages of its fit, and the slices of the slab that choices are made on; None where nothing is planned.
+        refuses: settings that it has no use for, or that are part of it.
+        plan: the stages of its fit, the slices of the slab that choices are made on, and the share of the voxels that are not
+            skipped; None where nothing is planned.
         blockwise: settles what all slices share; None where slices cannot be reconstructed apart.
 
     Example:
@@ -124,8 +130,13 @@ class Method:
     fitted: bool = False
     keeps_noise_model: bool = False
     learns_noise: bool = False
+    refuses: tuple[str, ...] = ()
     plan: MakePlan | None = None
     blockwise: SettleBlocks | None = None
+
+    def takes(self, setting: str) -> bool:
+        """Whether it has a use for a setting."""
+        return setting not in self.refuses and (self.fitted or setting not in _OF_FITS)
 
 
 _Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
@@ -161,15 +172,18 @@ def settings_of(method: str, **settings: Any) -> Settings:
     if chosen.noise_model is not None and not found.keeps_noise_model:
         able = [name for name in method_names() if find_method(name).keeps_noise_model]
         raise ValueError(f"--noise-model: method {method} takes none; use --method {', '.join(able)}")
-    wanted = {
-        "defocus": chosen.defocus,
-        "regulariser": chosen.regulariser != DEFAULT,
-        "uncertainty": chosen.uncertainty,
+    given = {
+        "defocus": bool(chosen.defocus),
+        "weight": chosen.weight is not None,
+        "regulariser": chosen.regulariser is not None,
+        "uncertainty": bool(chosen.uncertainty),
+        "steps": chosen.num_steps is not None,
+        "window": chosen.window is not None,
+        "denoiser": chosen.denoiser is not None,
     }
-    for name in [name for name, value in wanted.items() if value and not found.fitted]:
-        able = [name for name in method_names() if find_method(name).fitted]
-        why = "models none" if name == "defocus" else "fits no volume"
-        raise ValueError(f"--{name}: method {method} {why}; use --method {', '.join(able)}")
+    for name in (name for name, is_given in given.items() if is_given and not found.takes(name)):
+        able = [other for other in method_names() if find_method(other).takes(name)]
+        raise ValueError(f"--{name}: method {method} has no use for it; use --method {', '.join(able)}")
     return chosen
 
 

@@ -1,10 +1,10 @@
-"""Least absolute deviations with total variation in the field of the joint fit."""
+"""Least absolute deviations in the field of the joint fit."""
 
 from recon.joint.laplace import Laplace
 from recon.methods._fitted import fitted
 
 METHOD = fitted(
     "l1",
-    "Least absolute deviations with total variation in the field of the joint fit.",
+    "Least absolute deviations, with the field and the regulariser of the joint fit.",
     lambda settings: {"noise_model": Laplace},
 )

@@ -1,10 +1,10 @@
-"""Least squares with total variation in the field of the joint fit."""
+"""Least squares in the field of the joint fit."""
 
 from noiseflow import Gaussian
 from recon.methods._fitted import fitted
 
 METHOD = fitted(
     "l2",
-    "Least squares with total variation in the field of the joint fit.",
+    "Least squares, with the field and the regulariser of the joint fit.",
     lambda settings: {"noise_model": Gaussian},
 )

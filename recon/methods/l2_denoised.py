@@ -1,8 +1,6 @@
-"""Images denoised one by one, then least squares with total variation."""
+"""Images denoised one by one, then least squares as of l2."""
 
 from recon.methods import l2
 from recon.methods._denoised import after_denoising
 
-METHOD = after_denoising(
-    "l2-denoised", "Images denoised one by one, then least squares with total variation.", l2.METHOD
-)
+METHOD = after_denoising("l2-denoised", "Images denoised one by one, then least squares as of l2.", l2.METHOD)

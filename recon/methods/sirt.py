@@ -36,4 +36,10 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
     )
 
 
-METHOD = Method("sirt", "SIRT; the number of iterations is chosen by tilts left out.", _run, blockwise=_blockwise)
+METHOD = Method(
+    "sirt",
+    "SIRT; the number of iterations is chosen by tilts left out.",
+    _run,
+    refuses=("window", "denoiser"),
+    blockwise=_blockwise,
+)

@@ -34,5 +34,9 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
 
 
 METHOD = Method(
-    "wbp", "Weighted back-projection; window and cutoff are chosen by tilts left out.", _run, blockwise=_blockwise
+    "wbp",
+    "Weighted back-projection; window and cutoff are chosen by tilts left out.",
+    _run,
+    refuses=("steps", "denoiser"),
+    blockwise=_blockwise,
 )

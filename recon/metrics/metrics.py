@@ -79,18 +79,19 @@ def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
 class Line:
     """(values − centre)·gain + level."""
 
-    centre: float = 0.0
-    gain: float = 1.0
-    level: float = 0.0
+    centre: float
+    gain: float
+    level: float
 
     def __call__(self, values: Array) -> Array:
-        return values if self == Line() else np.asarray((values - self.centre) * self.gain + self.level)
+        changes_nothing = self.gain == 1 and self.centre == self.level
+        return values if changes_nothing else np.asarray((values - self.centre) * self.gain + self.level)
 
 
 def matching_line(result: Array, reference: Array, scaling: Scaling) -> Line:
     """What brings a result to the scale of its reference; volumes are looked at section by section."""
     if scaling == "raw":
-        return Line()
+        return Line(0.0, 1.0, 0.0)
     if scaling == "min-max":
         (low, high), (least, most) = ((float(a.min()), float(a.max())) for a in (result, reference))
         return Line(low, (most - least) / (high - low) if high > low else 0.0, least)

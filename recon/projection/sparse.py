@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise
@@ -68,7 +69,7 @@ class PanelledMatrix:
         if dense.shape[0] != self.shape[1]:
             raise ValueError(f"{dense.shape[0]} rows do not match the matrix's {self.shape[1]} columns")
         result = dense.new_empty(self.shape[0], dense.shape[1])
-        widest = _WIDEST if dense.device.type == "cpu" else max(_WIDEST, dense.shape[1])
+        widest = _WIDEST if dense.device.type == "cpu" else sys.maxsize
         for start in range(0, dense.shape[1], widest):
             part = result[:, start : start + widest]
             for number, (panel, span) in enumerate(zip(self.panels, self._spans, strict=True)):

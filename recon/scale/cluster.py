@@ -66,4 +66,13 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
         library.Client(cluster, set_as_default=False) as client,
     ):
+        for number, worker in enumerate(
+            client.scheduler_info(-1)["workers"]
+        ):  # while the client settles what all blocks share
+            library.fire_and_forget(client.submit(_import_what_blocks_need, number, workers=[worker]))
         yield client
+
+
+def _import_what_blocks_need(number: int) -> None:
+    del number
+    import recon.joint.joint  # noqa: F401

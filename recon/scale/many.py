@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +25,8 @@ Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "seconds")
 """First columns of the table of results; the figures of `noiseflow reconstruct` follow."""
 _NOT_OPTIONS = ("tilts", "out")
+_PARENT_DEATH_SIGNAL = 1  # of prctl(2)
+_OUTPUT = ("-o", "--out", "--output")
 _JSON_START = '{\n "written_by": "noiseflow'
 
 
@@ -57,7 +61,7 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
 
     Raises:
         FileNotFoundError: there is no such folder or table, or no series in it.
-        ValueError: a table without the column, or two series of the same volume.
+        ValueError: a table without the column, two series of the same volume, or an option that names the volume.
     """
     if source.is_dir():
         jobs = [
@@ -70,6 +74,11 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
     if not jobs:
         raise FileNotFoundError(f"{source} holds no stack with tilt angles, beside it or of its own")
     targets = [job.out for job in jobs]
+    named = next((word for job in jobs for word in job.words if word.partition("=")[0] in _OUTPUT), None)
+    if named is not None:
+        raise ValueError(
+            f"{named} among the options would be the volume of every series; name volumes in the column 'out'"
+        )
     twice = next((target for target in targets if targets.count(target) > 1), None)
     if twice is not None:
         raise ValueError(f"{twice} would be the volume of two series; name them in a table with a column 'out'")
@@ -168,8 +177,13 @@ def _is_series(path: Path) -> bool:
 
 
 def _rows(path: Path) -> list[Row]:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        return list(csv.DictReader(stream))
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return list(csv.DictReader(stream))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(
+            f"{path} is no CSV table ({error}); give a folder of tilt series, or a table of them"
+        ) from error
 
 
 def _job_of_row(row: Row, folder: Path, out: Path, words: Sequence[str]) -> Job:
@@ -212,7 +226,12 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
         if running.stopped:
             return None, "not begun"
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, env=environment
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            preexec_fn=_ending_with_this(),
         )
         running.processes.add(process)
     said, told = process.communicate()
@@ -222,6 +241,18 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
     if process.returncode:
         return None, last or f"exit {process.returncode}"
     return json.loads(said.decode().strip().splitlines()[-1]), last
+
+
+def _ending_with_this() -> Callable[[], None] | None:
+    """What lets a new process end, its state saved, when this one is killed; else it would hold its output from the next run.
+
+    Only Linux tells processes that their parent has died. The library is loaded here, for a new process of a program with
+    threads may do little before it starts.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    tell = ctypes.CDLL(None).prctl
+    return lambda: tell(_PARENT_DEATH_SIGNAL, int(signal.SIGTERM)) and None
 
 
 def _row(job: Job, answer: Row | None, last: str) -> Row:

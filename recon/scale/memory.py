@@ -11,11 +11,14 @@ from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-_PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 64, 65, 32
+_PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 _TILE = 0.3  # of the projector's matrix, that each tile of slices copies (`recon.projection.tiles`): 512³, shells and a full slab
 _BASE = 400 * 2**20
-_SHARE = 0.7  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
+_MOST = 0.7  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
+_PLEASANT = (
+    0.5  # of the free memory, where blocks need not be less than half as high for it: other programs want room, too
+)
 _STEP = 8  # slices: blocks of a few more or fewer cost as much
 PLENTY = 4 * 2**30
 """Bytes: a whole volume that needs more is reconstructed in blocks, as good and hardly slower (at 256³, 55 s of processor time in
@@ -64,13 +67,19 @@ def choose_slices(
     Raises:
         MemoryError: not even a few slices fit.
     """
-    room = int(_SHARE * available / workers)
+    room = int(_MOST * available / workers)
     if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted) <= min(room, plenty):
         return None
     most = min(_TALL, -(-grid.height // workers))
-    for slices in range(most - most % _STEP or most, 0, -_STEP):
-        if needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted) <= room:
-            return slices
+    heights = range(most - most % _STEP or most, 0, -_STEP)
+    needed = {
+        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted)
+        for slices in heights
+    }
+    for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
+        fitting = [slices for slices in heights if needed[slices] <= limit and slices >= fewest]
+        if fitting:
+            return fitting[0]
     raise MemoryError(
         f"not even {_STEP} slices of this reconstruction fit into {_human(room)}; give a smaller --thickness, fewer --workers, "
         "or bin or crop the images"
@@ -113,15 +122,16 @@ def _linux_available() -> int | None:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
-def _group_available() -> int | None:
-    """What a control group, such as a container's, leaves."""
-    folder = Path("/sys/fs/cgroup")
+def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """What a control group, such as a container's, leaves; cached contents of files it has read count as free."""
     try:
-        limit = (folder / "memory.max").read_text(encoding="ascii").strip()
-        used = int((folder / "memory.current").read_text(encoding="ascii"))
+        limit, used, parts = (
+            (folder / f"memory.{name}").read_text(encoding="ascii").split() for name in ("max", "current", "stat")
+        )
+        held = int(used[0]) - int(parts[parts.index("inactive_file") + 1])
+        return None if limit[0] == "max" else int(limit[0]) - held
     except (OSError, ValueError):
         return None
-    return None if limit == "max" else int(limit) - used
 
 
 def _physical() -> int | None:

@@ -25,6 +25,7 @@ _KEPT = (6, 3)  # directions after the smallest size, and after the next ones
 _SAME = 20.0  # degrees: nearer axes are one solution in two states of convergence, and differ little in the volume
 _EDGE = 1.4  # pixels by which a trial turn moves the edge of an image
 _ROUNDS, _FEWER_ROUNDS = 15, 5
+_AGAIN = 3  # times that equal directions are refined before they count as equal: wrong ones move towards the true one
 
 
 class AxisUndetermined(ValueError):
@@ -103,7 +104,9 @@ class _Search:
         self.known = series.tilt_axis if tilt_axis is None else tilt_axis
         self.images = _line_integrals(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
-        self.binnings = _binnings(max(series.images.shape[1:]))
+        size = max(series.images.shape[1:])
+        self.binnings = _binnings(size)
+        self.searched = min(binning for binning in self.binnings if size // binning <= _SEARCHED)
 
     def run(self) -> tuple[Match, list[Evidence]]:
         """The alignment, and the evidence for its axis and for the other candidates."""
@@ -115,6 +118,9 @@ class _Search:
                 candidates = _distinct(self._first(matcher), _KEPT[0], _SPACING)
             elif matcher.size <= _SEARCHED:
                 candidates = self._refined(matcher, candidates)
+            for _ in range(_AGAIN if binning == self.searched else 0):
+                if self._equal(candidates):
+                    candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
                 chosen, *others = candidates if decided else self._ranked(candidates)
                 match = matcher.match(chosen.match.axis, chosen.match.shifts, rounds=_ROUNDS, free_axis=True)
@@ -150,7 +156,7 @@ class _Search:
     def _refined(self, matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
         """Shifts and axes at a finer size, best first; all but the best few are dropped."""
         best, *others = _distinct([self._matched(matcher, each) for each in candidates], _KEPT[1], _SAME)
-        rivals = [each for each in others if not best.evidence.is_clear_of(each.evidence)]
+        rivals = self._equal([best, *others])
         beaten = [each for each in others if each not in rivals]
         turned = [_turned(matcher, each) for each in (best, *rivals)]
         found = _distinct(
@@ -179,15 +185,20 @@ class _Search:
         chosen = self._decided(candidates)
         return [chosen, *(each for each in candidates if each is not chosen)]
 
+    def _equal(self, candidates: list[_Candidate]) -> list[_Candidate]:
+        """Those that the best one does not stand clear of."""
+        best, *others = candidates
+        return [each for each in others if not best.evidence.is_clear_of(each.evidence)]
+
     def _decided(self, candidates: list[_Candidate]) -> _Candidate:
         """The candidate that stands clear of all others, or that is known beforehand.
 
         Raises:
             AxisUndetermined: there is none.
         """
-        best, *others = candidates
+        best = candidates[0]
         known = next((each for each in candidates if each.known), None)
-        equal = [each for each in others if not best.evidence.is_clear_of(each.evidence)]
+        equal = self._equal(candidates)
         if known is not None and known is not best and known not in equal:
             advice = "the given direction is kept" if self.given is not None else "the images are believed"
             warnings.warn(
@@ -257,5 +268,5 @@ def _binnings(size: int) -> list[int]:
     """From about 16 pixels wide, finer by two each, to full size or to what is at most 160 wide."""
     binnings = [max(1, round(size / _COARSEST))]
     while binnings[-1] > max(1, math.ceil(size / _FINEST)):
-        binnings.append(max(binnings[-1] // 2, math.ceil(size / _FINEST)))
+        binnings.append(max(math.ceil(binnings[-1] / 2), math.ceil(size / _FINEST)))
     return binnings

@@ -96,8 +96,8 @@ def prepare(
         >>> recon.prepare(series).tilt_series.tilt_angles[0].item()  # by rising angle
         -60.0
     """
-    if tilt_axis is not None and not np.isfinite(tilt_axis):
-        raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees")
+    if tilt_axis is not None and not abs(tilt_axis) <= 360:  # a full turn; more is no angle but a slip
+        raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
     _warn_of_outliers(tilt_series)
     _warn_of_order(tilt_series.tilt_angles)
     alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.io import locked, partial_folder
+from noiseflow.io import locked, output_folder, partial_folder
 from noiseflow.io.files import reserve
 from noiseflow.io.ownership import signature
 from noiseflow.io.partials import link_target
@@ -77,16 +77,14 @@ class Simulation:
         Raises:
             ValueError: an unknown phantom, or an empty one.
         """
-        is_new = not folder.exists()
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
-                unit = _Writer(self, partial, progress).run()
-                for path in sorted(partial.iterdir()):
-                    path.replace(link_target(folder / path.name))
-        finally:
-            if is_new and not any(folder.iterdir()):
-                folder.rmdir()
+        with (
+            output_folder(folder),
+            locked(folder / "tilts.mrc"),
+            partial_folder(folder / "simulate") as partial,
+        ):
+            unit = _Writer(self, partial, progress).run()
+            for path in sorted(partial.iterdir()):
+                path.replace(link_target(folder / path.name))
         return unit
 
 

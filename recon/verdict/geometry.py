@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.verdict.coarse import Coarse
-from recon.verdict.gap_fit import GapFit
+from recon.verdict.gap_fit import GAP, GapFit
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
+_SINGLE = 0.3  # smoothness where one tilt is left out: less of it lets noise hide what does not belong
 _TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # to both sides
 _SMALL = 20.0  # degrees: turns up to here are compared with their mirror image, for both interpolate alike
 _LIKE_A_TURN = 0.211  # of a pixel: a shift by so much leaves as much noise as a turn: f² + (1 − f)² = 2/3
@@ -50,7 +51,13 @@ class Geometry:
         self.fit = self._fit(self.smoothness)
         self.errors = self.fit.errors(coarse.images)
 
-    def _fit(self, smoothness: float, *, offset: float = 0.0, **changes: Any) -> GapFit:
+    def single_errors(self) -> Array:
+        """(tilt, y, u) what the smoothest fit leaves of each angle when that angle alone is left out: neighbours predict it."""
+        angles = self.coarse.tilt_angles
+        each = float(np.ptp(angles)) / len(np.unique(np.round(angles, 3)))
+        return self._fit(_SINGLE, gap=each).errors(self.coarse.images)
+
+    def _fit(self, smoothness: float, *, offset: float = 0.0, gap: float = GAP, **changes: Any) -> GapFit:
         coarse = replace(self.coarse, **changes)
         return GapFit(
             coarse.tilt_angles,
@@ -59,6 +66,7 @@ class Geometry:
             detector_width=coarse.images.shape[2],
             detector_offset=coarse.detector_offset + offset,
             smoothness=smoothness,
+            gap=gap,
         )
 
     def axis(self) -> Gain:

@@ -23,6 +23,7 @@ from recon.verdict.geometry_findings import geometry_findings
 from recon.verdict.image_findings import image_findings
 from recon.verdict.pixels import pixel_findings
 from recon.verdict.residuals import Residuals
+from recon.verdict.sharpness import sharpness_findings
 from recon.verdict.tilts import tilt_findings
 from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
@@ -67,8 +68,9 @@ def judge(
     parts = [
         geometry_findings(geometry, gap, own, found),
         image_findings(residuals, found, gap),
-        tilt_findings(tilt_series, coarse, geometry.errors, screening),
+        tilt_findings(tilt_series, coarse, geometry, screening),
         pixel_findings(tilt_series, residuals),
+        sharpness_findings(tilt_series, residuals),
         fit_findings(result, alignment),
         _contrast(tilt_series),
         _faces(result.volume.attenuation),
@@ -119,7 +121,7 @@ def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
         return {"densest face": densest}, []
     words = f"the volume is {densest:.1f} times as dense at its top or bottom as on average: the object goes on beyond"
     advice = "leave out --thickness, or give a larger one"
-    return {"densest face": densest}, [Finding("thickness", min(2.9, densest / _FULL), words, advice)]
+    return {"densest face": densest}, [Finding("thickness", min(2.9, densest / _FULL), words, advice, "seen")]
 
 
 def _good(gap: Unexplained, residuals: Residuals) -> str:

@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.series.tilt_series import TiltSeries
+from recon.verdict.limits import cliff, saturation
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SATURATED = (
-    0.005  # share of pixels amid a full neighbourhood at a limit; noise about a limit fills nine with chance 2⁻⁹
-)
-_BLANK = 0.3  # the same at the end of vacuum, where a full neighbourhood loses nothing but weak contrast
 _SPIKE = 5.0  # ranges from the 0.5 to the 99.5 % quantile: noise with long tails reaches two
 _PATTERN, _PATTERN_CONTRAST = (
     1.6,
@@ -31,7 +28,10 @@ _STEADY_CHANCE, _STEADY_PART = (
 _SIGNALS = 16  # bins of equal counts: finer than any smooth misfit
 _STREAK = 8.0  # usual deviations of a line's mean residual from those beside it: chance gives four among thousands
 _STREAKS = 0.002  # of all lines: one in five hundred spoils nothing
+_REGION = 0.002  # of the pixels: one in five hundred spoils nothing, and no pixel is constant by chance
 _BORDERS = 0.1  # of the images: fewer are single faults, which the screening throws out
+_SEAM, _SEAM_STEP = 12.0, 0.25  # usual steps from column to column; spreads of all pixels, 0.13 at most in good series
+_BLOCK, _BLOCKS = 8, 1.6  # pixels along a block; steps at their borders over those inside, 1.15 in good series
 _DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
 
 
@@ -40,30 +40,11 @@ def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[
     images = residuals.images
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
-    for check in (_saturation, _spikes, _lines, _streaks, _borders, _pattern, _uneven):
+    for check in (saturation, cliff, _spikes, _lines, _region, _streaks, _borders, _seam, _blocks, _pattern, _uneven):
         found, finding = check(tilt_series, images, residuals)
         evidence |= found
         findings += finding
     return evidence, findings
-
-
-def _saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    ends = {"low": float(images.min()), "high": float(images.max())}
-    empty = "low" if tilt_series.mode == "linear" else "high"
-    shares = {name: float(np.mean(ndimage.minimum_filter(images == end, (1, 3, 3)))) for name, end in ends.items()}
-    noisy = residuals.noise > 1e-3 * (ends["high"] - ends["low"])
-    findings = []
-    for name, share in shares.items():
-        limit = _SATURATED if name != empty else _BLANK
-        if share > limit and (noisy or name != empty) and (name != empty or tilt_series.mode == "transmission"):
-            sentence = f"{share:.1%} of the pixels and all their neighbours stand at the {name} limit {ends[name]:.4g}"
-            strength = 1 + 2 * min(1.0, share / (10 * limit))
-            findings.append(
-                Finding(
-                    "saturation", strength, sentence, "use a series that is not saturated, or mask these parts", "seen"
-                )
-            )
-    return {"saturated": shares}, findings
 
 
 def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[str, Any], list[Finding]]:
@@ -89,6 +70,29 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
             sentence = f"{count} of {size} {name} hold one value in all tilts, unlike their neighbours"
             findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
     return {"dead lines": dead}, findings
+
+
+def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Pixels that hold one value in all tilts while others change: at a limit of the values, where vacuum or saturation may hold
+    them, only those that differ from the pixels around."""
+    ends = float(images.min()), float(images.max())
+    constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(
+        0
+    )  # residuals of masked pixels are zero
+    dead = constant & ~np.isin(images[0], ends)
+    span, mean = float(np.quantile(images, 0.99) - np.quantile(images, 0.01)), images.mean(0)
+    for end in ends:
+        regions, count = ndimage.label(constant & (images[0] == end))
+        for number in range(1, count + 1):
+            around = ndimage.binary_dilation(regions == number) & ~constant
+            if around.any() and abs(float(np.median(mean[around])) - end) > _STEP * span:
+                dead |= regions == number
+    share = float(dead.mean())
+    if constant.all() or share < _REGION:
+        return {"dead pixels": share}, []
+    sentence = f"{share:.1%} of the pixels hold one value in all tilts, unlike those around"
+    strength = 1.5 + min(1.4, 10 * share)
+    return {"dead pixels": share}, [Finding("lines", strength, sentence, "mask them with --mask FILE", "seen")]
 
 
 def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
@@ -141,6 +145,35 @@ def _dead(lines: Array, span: float) -> int:
     spread, mean = lines.std((1, 2)), lines.mean((1, 2))
     apart = np.abs(mean - ndimage.median_filter(mean, 5, mode="nearest")) > _STEP * span
     return int((apart & (spread < _DEAD * np.median(spread))).sum())
+
+
+def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """A step between two columns that stays where it is in the mean of all tilts, which smear every edge of an object."""
+    steps = np.diff(images.mean((0, 1), dtype=np.float64))
+    apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
+    usual, where = 1.4826 * float(np.median(apart)), int(np.argmax(apart))
+    size = float(apart[where] / max(float(images.std()), 1e-30))
+    evidence = {"largest step between columns": size}
+    if size < _SEAM_STEP or apart[where] < _SEAM * usual:
+        return evidence, []
+    words = f"all images step between columns {where} and {where + 1}, as where two parts of a detector meet"
+    return evidence, [Finding("pattern", 2.0, words, "correct the images with flats and darks first", "seen")]
+
+
+def _blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Steps at the borders of blocks of pixels, along y and u: what lossy compression of photographs leaves."""
+    ratios = []
+    for axis in (1, 2):
+        steps = np.abs(np.diff(images, axis=axis)).mean((0, 3 - axis), dtype=np.float64)
+        border = np.arange(len(steps)) % _BLOCK == _BLOCK - 1
+        ratios.append(float(steps[border].mean() / max(steps[~border].mean(), 1e-30)) if border.any() else 0.0)
+    evidence = {"steps at blocks": min(ratios)}
+    if min(ratios) < _BLOCKS:
+        return evidence, []
+    words = (
+        f"pixel values step at the borders of blocks of {_BLOCK} pixels, {min(ratios):.1f} times as much as inside them"
+    )
+    return evidence, [Finding("pattern", 2.9, words, "use images without lossy compression", "seen")]
 
 
 def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:

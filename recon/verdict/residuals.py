@@ -81,6 +81,6 @@ class Residuals:
 
 
 def neighbours(images: Array, axis: int) -> float:
-    """Mean product of neighbouring pixels of (tilt, y, u) images along y (1) or u (2); zero where there is one pixel alone."""
-    first, second = (images[:, 1:], images[:, :-1]) if axis == 1 else (images[:, :, 1:], images[:, :, :-1])
-    return float(np.mean(first * second)) if first.size else 0.0
+    """Mean product of neighbouring pixels of (tilt, y, u) images along an axis; zero where there is one pixel alone."""
+    along = np.moveaxis(images, axis, 0)
+    return float(np.mean(along[1:] * along[:-1])) if len(along) > 1 else 0.0

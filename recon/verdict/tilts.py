@@ -11,6 +11,8 @@ from scipy import ndimage
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import Coarse
+from recon.verdict.continuity import breaks, single_tilts
+from recon.verdict.geometry import Geometry
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
@@ -18,6 +20,7 @@ Array = NDArray[Any]
 _WEDGE, _GAP, _FEWEST = 90.0, 15.0, 20  # degrees without data: with more, most directions are guessed; tilts
 _LEFT_OUT = 0.1  # of the tilts: so many are no exceptions
 _FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of a tilt's own structure that the others predict; of the tilts
+_BLANK = 0.3  # of the structure of the tilts beside it: less is none, and nothing can be predicted
 _TWINS = 0.2  # of the structure: twins show the same object but for noise
 _JUMP, _AROUND = 3.0, 9  # times the change between the tilts around, and of how many; good series reach 0.9
 _JUMP_SHARE = 0.1  # of the images' structure; what an alignment leaves in a quiet needle is 0.001
@@ -26,9 +29,9 @@ _DRIFT = 0.2  # of the beam: the fit follows a drift, but not exactly
 
 
 def tilt_findings(
-    tilt_series: TiltSeries, coarse: Coarse, errors: Array, screening: Screening | None
+    tilt_series: TiltSeries, coarse: Coarse, geometry: Geometry, screening: Screening | None
 ) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about the tilts; `errors` are of left-out gaps, as `Geometry.errors`."""
+    """Evidence and findings about the tilts; `geometry` holds what others predict of them."""
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
     for found, finding in (
@@ -36,7 +39,9 @@ def tilt_findings(
         _repeats(tilt_series),
         _twins(coarse),
         _jumps(coarse),
-        _foreign(coarse, errors),
+        _foreign(coarse, geometry.errors),
+        single_tilts(coarse, geometry.single_errors()),
+        breaks(coarse),
         _screened(screening),
     ):
         evidence |= found
@@ -123,7 +128,8 @@ def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
     usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
     whole = max(neighbours(images - images.mean(), 1), 1e-30)
-    ratios = np.where(shared * steps**2 > _JUMP_SHARE * whole, (shared - 3 * chance) / usual, 0.0)
+    large = shared * steps**2 > _JUMP_SHARE * whole
+    ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # copies leave usual at zero
     largest = int(np.argmax(ratios))
     evidence = {"largest jump": float(ratios[largest])}
     if ratios[largest] < _JUMP:
@@ -145,7 +151,11 @@ def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Findin
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
-    foreign = agreement + 3 * chance < _FOREIGN * own
+    order = coarse.order
+    beside = np.empty_like(own)
+    beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
+    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _BLANK * beside
+    foreign = (agreement + 3 * chance < _FOREIGN * own) | blank
     share = float(foreign.mean())
     evidence = {"tilts unlike the others": int(foreign.sum())}
     if share <= _FOREIGN_SHARE:

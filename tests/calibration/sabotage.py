@@ -62,6 +62,84 @@ def _common_mode(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.
     return tuple(np.round(a + b) for a, b in zip(clean(generator, scene), wave, strict=True))  # type: ignore[return-value]
 
 
+def _lanczos(factor: float) -> Callable[[sim.Image], sim.Image]:
+    """Resampled as image editors do it, by OpenCV's Lanczos kernel of eight pixels."""
+    import cv2
+
+    return lambda image: np.asarray(
+        cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_LANCZOS4)  # type: ignore[call-overload]
+    )
+
+
+def _turned(order: int) -> Callable[[sim.Image], sim.Image]:
+    """Turned by 7° in software, and cropped to what is covered."""
+    return lambda image: np.asarray(ndimage.rotate(image, 7.0, reshape=False, order=order)[24:-24, 24:-24])
+
+
+def _hot(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """One pixel in a hundred has 50 to 500 electrons of dark current in the short exposure."""
+    dark = np.where(generator.random(scene.shape) < 0.01, generator.uniform(50, 500, scene.shape), 0.0)
+    return exposed(generator, scene + dark), exposed(generator, RATIO * (scene + dark))
+
+
+def corner_full(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """A beam so bright in one corner that the long exposure clips there."""
+    y, x = np.indices(scene.shape) / len(scene)
+    lit = scene * (1 + 6 * np.exp(-8 * (x**2 + y**2)))
+    return exposed(generator, lit), exposed(generator, RATIO * lit, top=8000.0)
+
+
+def _hum(period: float) -> Callable[[np.random.Generator, sim.Image], tuple[sim.Image, sim.Image]]:
+    """Mains hum: rows that rise and fall by 10 counts, at another phase in each exposure."""
+
+    def spoil(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+        rows = 2 * np.pi * np.arange(len(scene))[:, None] / period
+        short, long = clean(generator, scene, rounded=False)
+        return np.round(short + 10 * np.sin(rows)), np.round(long + 10 * np.sin(rows + 2.0))
+
+    return spoil
+
+
+def _dark_subtracted(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """One noisy dark frame taken off both exposures."""
+    short, long = clean(generator, scene)
+    dark = exposed(generator, 0 * scene)
+    return short - dark, long - dark
+
+
+def _flat_divided(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """Both exposures less the offset, over a flat field that falls by a third to the corners."""
+    y, x = np.indices(scene.shape) / len(scene) - 0.5
+    flat = 1 - (x**2 + y**2) * 2 / 3
+    flat /= flat.mean()
+    short, long = clean(generator, scene * flat, rounded=False)
+    return np.round((short - 100) / flat + 100), np.round((long - 100) / flat + 100)
+
+
+def _flyback(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+    """A scan whose even lines lie 1.5 pixels off in the short exposure."""
+    moved = scene.copy()
+    moved[::2] = ndimage.shift(scene, (0, 1.5), order=3, mode="mirror")[::2]
+    return exposed(generator, moved), exposed(generator, RATIO * scene)
+
+
+def _real_jpeg(quality: int) -> Callable[[np.random.Generator, sim.Image], tuple[sim.Image, sim.Image]]:
+    """8-bit frames that went through JPEG files."""
+    import cv2
+
+    def stored(image: sim.Image) -> sim.Image:
+        _, data = cv2.imencode(
+            ".jpg", np.round(image).clip(0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
+        )
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
+
+    def spoil(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+        short = exposed(generator, scene / 2, offset=20.0)
+        return stored(short), stored(np.mean([exposed(generator, scene / 2, offset=20.0) for _ in range(16)], 0))
+
+    return spoil
+
+
 CASES: dict[str, Maker] = {
     "clean": lambda s: replace(pair(s, clean), clean=True),
     "clean, ratio known": lambda s: replace(pair(s, clean, exposure_ratio=RATIO), clean=True),
@@ -109,6 +187,37 @@ CASES: dict[str, Maker] = {
     "averaged short (4 frames), unknown": lambda s: replace(
         pair(s, lambda g, x: (np.round(np.mean([exposed(g, x) for _ in range(4)], 0)), exposed(g, RATIO * x))), gain=0.5
     ),
+    "both resampled × 1.25, cubic": lambda s: pair(
+        s, both(lambda image: np.asarray(ndimage.zoom(image, 1.25, order=3)))
+    ),
+    "both resampled × 0.8, Lanczos": lambda s: pair(s, both(_lanczos(0.8))),
+    "both resampled × 1.25, Lanczos": lambda s: pair(s, both(_lanczos(1.25))),
+    "both turned by 7°, linear": lambda s: pair(s, both(_turned(1))),
+    "both turned by 7°, cubic": lambda s: pair(s, both(_turned(3))),
+    "both as logarithms": lambda s: pair(s, both(lambda image: 1000 * np.log(image.clip(1)))),
+    "both as square roots": lambda s: pair(s, both(lambda image: 64 * np.sqrt(image.clip(0)))),
+    "JPEG, quality 95": lambda s: pair(s, _real_jpeg(95)),
+    "JPEG, quality 75": lambda s: pair(s, _real_jpeg(75)),
+    "a noisy dark frame subtracted": lambda s: pair(s, _dark_subtracted),
+    "divided by a flat field": lambda s: pair(s, _flat_divided),
+    "hot pixels, 1 %": lambda s: pair(s, _hot),
+    "both averaged over 4 frames": lambda s: replace(
+        pair(s, lambda g, x: tuple(np.mean([exposed(g, t * x) for _ in range(4)], 0) for t in (1, RATIO))),  # type: ignore[arg-type,return-value]
+        gain=0.5,
+    ),
+    "short in electrons": lambda s: replace(
+        pair(s, lambda g, x: ((exposed(g, x) - 100) / 2, exposed(g, RATIO * x))), gain=1.0
+    ),
+    "long in electrons": lambda s: pair(s, lambda g, x: (exposed(g, x), (exposed(g, RATIO * x) - 100) / 2)),
+    "mains hum, 7.3 rows": lambda s: pair(s, _hum(7.3)),
+    "mains hum, 60 rows": lambda s: pair(s, _hum(60.0)),
+    "both binned 2 × 2 (sum)": lambda s: pair(s, both(lambda image: image.reshape(128, 2, 128, 2).sum((1, 3)))),
+    "short median-filtered 3 × 3": lambda s: pair(
+        s, lambda g, x: (np.asarray(ndimage.median_filter(exposed(g, x), 3)), exposed(g, RATIO * x))
+    ),
+    "two lowest bits missing": lambda s: pair(s, both(lambda image: 4 * np.floor(image / 4))),
+    "lines of the short scan off by 1.5 pixels": lambda s: pair(s, _flyback),
+    "exposures swapped": lambda s: pair(s, lambda g, x: clean(g, x)[::-1]),  # type: ignore[arg-type,return-value]
     "gamma-encoded": lambda s: pair(s, both(lambda image: 255 * (image.clip(0) / 4000) ** 0.45)),
 }
 

@@ -12,7 +12,7 @@ from calibration.exposures.frames import Burst, ExposurePair
 from calibration.pipeline import measure_exposures
 
 from . import simulators as sim
-from .sabotage import CASES
+from .sabotage import CASES, corner_full
 
 
 def measured(case):
@@ -41,6 +41,9 @@ def test_a_clean_pair_is_good_and_right():
         ("both resampled × 0.8, cubic", "periodic noise", None),
         ("both compressed (DCT)", "compressed", None),
         ("long drifted by 2 pixels", "scene misfit", 0.06),
+        ("divided by a flat field", "uneven field", 0.08),
+        ("JPEG, quality 75", "compressed", None),
+        ("mains hum, 7.3 rows", "row offsets", 0.04),
     ],
 )
 def test_what_is_wrong_is_flagged_and_modelled_where_it_can_be(name, reason, tolerance):
@@ -49,6 +52,13 @@ def test_what_is_wrong_is_flagged_and_modelled_where_it_can_be(name, reason, tol
     assert reason in [one.name for one in found.verdict.reasons]
     if tolerance is not None:
         assert found.figures.gain.median == pytest.approx(2.0, rel=tolerance)
+
+
+def test_a_long_exposure_saturated_in_a_corner_does_not_mislead_the_registration():
+    found = measured(sim.pair(3, corner_full))
+    assert found.verdict.grade == "good"
+    assert found.pairs[0].registration.error_px < 0.03
+    assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
 
 
 def test_excess_noise_is_flagged_and_photon_transfer_gives_the_product():
@@ -67,6 +77,10 @@ def test_every_case_is_right_or_flagged(name, seed):
     if name == "gamma-encoded":  # nothing in it is Poisson-Gaussian: either way of saying so will do
         with contextlib.suppress(ValueError):
             assert measured(case).verdict.grade == "bad"
+        return
+    if name == "exposures swapped":
+        with pytest.raises(ValueError, match="swap"):
+            measured(case)
         return
     found = measured(case)
     if found.figures is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -65,3 +66,15 @@ def test_rows_of_earlier_days_name_the_commit_that_recorded_them() -> None:
     assert record_commits.first_with("b", old, versions) == ("ccc", "day 3")
     with pytest.raises(ValueError, match="commit the results first"):
         record_commits.first_with("a", {"psnr": 3.0}, versions)
+
+
+def test_pictures_show_every_row_and_stand_on_their_page() -> None:
+    import rivals
+
+    ((_, content),) = rivals._named_files(rivals.RESULTS, "needle-")
+    panels = rivals._needle_panels(content["cells"])
+    assert sum(len(values) for _, _, series in panels for values in series.values()) == len(content["cells"])
+    for name in ("needle.md", "paper_table.md"):
+        text = (BENCHMARKS / name).read_text(encoding="utf-8")
+        assert all((BENCHMARKS / picture).is_file() for picture in re.findall(r"\]\((\w+\.png)\)", text))
+        assert ".png)" in text

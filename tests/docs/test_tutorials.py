@@ -74,14 +74,16 @@ def test_notebook_that_ran_holds_what_was_printed_and_drawn(
     assert Path.cwd() == before
 
 
-def assert_printed(shown: str, printed: str) -> None:
-    """The words are among those printed, with the same numbers to 2 %: another number of threads rounds differently."""
+def assert_printed(shown: str, printed: str) -> str:
+    """The words are among those printed, with the same numbers to 2 %: another number of threads rounds differently. Returns
+    what was printed after them."""
     words, printed = " ".join(shown.split()), " ".join(printed.split())
     pattern = "(.+?)".join(map(re.escape, NUMBER.split(words)))
     found = re.search(pattern.replace("(.+?)", f"({NUMBER.pattern})"), printed)
     assert found, f"not printed: {words!r}\n{printed}"
     numbers = [float(number) for number in NUMBER.findall(words)]
     assert [float(number) for number in found.groups()] == pytest.approx(numbers, rel=0.02, abs=0.02)
+    return printed[found.end() :]
 
 
 def test_check_of_printed_lines_finds_other_words_and_other_numbers() -> None:
@@ -96,9 +98,8 @@ def test_camera_page_shows_what_its_code_prints(monkeypatch: pytest.MonkeyPatch)
     run = runpy.run_path(str(FOLDER / "run.py"))
     with run["empty_folder"]():
         printed = "".join(run["run"](FOLDER / "camera.md"))
-    (shown,) = blocks(FOLDER / "camera.md", "text")
-    for line in shown.splitlines():
-        assert_printed(line.removesuffix("..."), printed)
+    for line in "".join(blocks(FOLDER / "camera.md", "text")).splitlines():
+        printed = assert_printed(line.removesuffix("..."), printed)
 
 
 @pytest.mark.slow
@@ -116,3 +117,10 @@ def test_raw_series_page_shows_what_its_commands_print(tmp_path: Path) -> None:
         ).stdout
     for shown in blocks(page, "text"):
         assert_printed(shown, printed)
+
+
+def test_included_tables_stand_in_the_notebook(notebooks: dict[str, Any]) -> None:
+    text = "".join(cell.source for cell in notebooks["notebook"](FOLDER / "blocks.md").cells)
+    assert "{include}" not in text
+    assert "| shells-1000" in text
+    assert "| slab-128" not in text

@@ -13,11 +13,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-# Pages in docs/benchmarks are written by scripts, and change with the next measurement.
 PAGES = sorted(
     [
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
-        *(page for page in (ROOT / "docs").rglob("*.md") if not {"benchmarks", "generated"} & set(page.parts)),
+        *(page for page in (ROOT / "docs").rglob("*.md") if "generated" not in page.parts),
     ]
 )
 SOURCES = sorted(path for package in ("noiseflow", "calibration", "recon") for path in (ROOT / package).rglob("*.py"))
@@ -38,7 +37,8 @@ WORDS = {
 }
 # What the patterns find and the field says itself.
 ALLOWED = re.compile(
-    r"(?:crystal|atomic|Bravais|reciprocal) lattices?|rivals, slow-rivals|the stage's own readings", re.IGNORECASE
+    r"(?:crystal|atomic|Bravais|reciprocal) lattices?|rivals, slow-rivals|docs/benchmarks/rivals\.py|the stage's own readings",
+    re.IGNORECASE,
 )
 
 

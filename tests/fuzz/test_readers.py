@@ -97,34 +97,44 @@ def _give_up(*_: object) -> None:
     pytest.fail(f"still reading after {SECONDS} s")
 
 
-def read_or_refuse(path: Path, content: bytes) -> None:
-    """What is read makes sense, or one line says which file does not."""
+def read(path: Path, content: bytes) -> torch.nn.Module | io.ImageFile | str:
+    """What a reader makes of a file, or the message with which it refuses it."""
     path.write_bytes(content)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    refused = None
     try:
-        found = noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
+        return noiseflow.load(path) if path.suffix == ".safetensors" else io.read(path)
     except ValueError as error:
-        refused = str(error)
+        return str(error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
-    if refused is None:
-        require_sense(found)
+
+
+def faults(found: torch.nn.Module | io.ImageFile | str, path: Path) -> list[str]:
+    """What is wrong with an answer: a refusal is one line that names the file, a noise model has a distribution, an image is of
+    numbers and has as many angles as sections."""
+    if isinstance(found, str):
+        wrong = {"names no file": str(path) not in found, "several lines": "\n" in found}
+    elif isinstance(found, torch.nn.Module):
+        wrong = {"no distribution": found(torch.ones(2)).batch_shape != (2,)}
     else:
-        assert str(path) in refused
-        assert "\n" not in refused
+        sections = len(found.data) if found.data.ndim == 3 else 1
+        wrong = {
+            "no numbers": found.data.dtype.kind not in "iuf",
+            "no image": found.data.ndim not in (2, 3) or found.data.size == 0,
+            "angles": found.tilt_angles is not None and len(found.tilt_angles) != sections,
+            "voxel size": found.voxel_size is not None and not all(0 < edge < np.inf for edge in found.voxel_size),
+        }
+    return [fault for fault, there in wrong.items() if there]
 
 
-def require_sense(found: torch.nn.Module | io.ImageFile) -> None:
-    """A noise model with a distribution, or an image of numbers with as many angles as it has sections."""
-    if isinstance(found, torch.nn.Module):
-        assert found(torch.ones(2)).batch_shape == (2,)
-        return
-    assert found.data.dtype.kind in "iuf"
-    assert found.data.ndim in (2, 3)
-    assert found.data.size > 0
-    assert found.tilt_angles is None or len(found.tilt_angles) == (len(found.data) if found.data.ndim == 3 else 1)
-    assert found.voxel_size is None or all(0 < edge < np.inf for edge in found.voxel_size)
+@pytest.mark.parametrize("suffix", [".mrc", ".npy", ".npz", ".png", ".tif", ".tiff", ".h5", ".safetensors"])
+def test_the_files_are_sound_before_they_are_damaged(suffix: str, sound: dict[str, bytes], tmp_path: Path) -> None:
+    found = read(tmp_path / f"a{suffix}", sound[suffix])
+    if suffix == ".safetensors":
+        assert isinstance(found, noiseflow.RadialFlow)
+    else:
+        assert isinstance(found, io.ImageFile)
+        np.testing.assert_array_equal(found.data, STACK[0] if suffix == ".png" else STACK)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -134,7 +144,8 @@ def require_sense(found: torch.nn.Module | io.ImageFile) -> None:
 def test_damaged_files_are_read_or_refused(
     suffix: str, wounds: list[tuple[str, float, int]], sound: dict[str, bytes], tmp_path: Path
 ) -> None:
-    read_or_refuse(tmp_path / f"a{suffix}", apply(sound[suffix], wounds))
+    path = tmp_path / f"a{suffix}"
+    assert faults(read(path, apply(sound[suffix], wounds)), path) == []
 
 
 @pytest.mark.skipif(not NEEDLE.exists(), reason="the raw needle series is not here")
@@ -142,7 +153,8 @@ def test_damaged_files_are_read_or_refused(
 @settings(parent=fuzz, max_examples=max(1, EXAMPLES // 20))
 @given(wounds=st.lists(damage, min_size=1, max_size=3))
 def test_damaged_dm3_files_are_read_or_refused(wounds: list[tuple[str, float, int]], tmp_path: Path) -> None:
-    read_or_refuse(tmp_path / "a.dm3", apply(NEEDLE.read_bytes(), wounds))
+    path = tmp_path / "a.dm3"
+    assert faults(read(path, apply(NEEDLE.read_bytes(), wounds)), path) == []
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -150,7 +162,8 @@ def test_damaged_dm3_files_are_read_or_refused(wounds: list[tuple[str, float, in
 @settings(parent=fuzz, max_examples=max(1, EXAMPLES // 6))
 @given(content=st.binary(min_size=1, max_size=3000))
 def test_any_bytes_are_refused_or_read(suffix: str, content: bytes, tmp_path: Path) -> None:
-    read_or_refuse(tmp_path / f"a{suffix}", content)
+    path = tmp_path / f"a{suffix}"
+    assert faults(read(path, content), path) == []
 
 
 @fuzz

@@ -26,7 +26,8 @@ def scaled(series, tmp_path_factory):
     return stack
 
 
-def require_volume_and_report(series, scaled, folder, method, *more):
+def psnr_of_volume_with_report(series, scaled, folder, method, *more):
+    """PSNR, dB, of the volume a command wrote; its file and its page are as they should be."""
     out, page = folder / "volume.mrc", folder / "report"
     result = run_command("reconstruct", scaled, "-o", out, "--method", method, *more, "--report", page)
     assert result["method"] == method
@@ -35,17 +36,18 @@ def require_volume_and_report(series, scaled, folder, method, *more):
         assert float(volume.voxel_size.z) == pytest.approx(7.5)
         assert np.isfinite(volume.data).all()
     assert 'data-widget="volume"' in (page / "index.html").read_text(encoding="utf-8")
-    assert run_command("compare", out, series / "truth.mrc")["errors"]["affine"]["psnr"] > 5
+    return run_command("compare", out, series / "truth.mrc")["errors"]["affine"]["psnr"]
 
 
 @pytest.mark.parametrize("method", ["l2", "tv", "sirt", "wbp"])
 def test_every_method_writes_a_volume_and_a_report(series, scaled, tmp_path, method):
-    require_volume_and_report(series, scaled, tmp_path, method, "--steps", 20)
+    few_steps = [] if method == "wbp" else ["--steps", 20]
+    assert psnr_of_volume_with_report(series, scaled, tmp_path, method, *few_steps) > 5
 
 
 def test_joint_fits_of_the_same_seed_write_the_same_volume(series, scaled, tmp_path):
     options = ["--weight", 0.4, "--steps", 5, "--seed", 3]
-    require_volume_and_report(series, scaled, tmp_path, "joint", *options)
+    assert psnr_of_volume_with_report(series, scaled, tmp_path, "joint", *options) > 5
     run_command("reconstruct", scaled, "-o", tmp_path / "again.mrc", *options)
     first, again = (io.read(tmp_path / name).data for name in ("volume.mrc", "again.mrc"))
     np.testing.assert_array_equal(first, again)

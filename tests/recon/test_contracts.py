@@ -9,7 +9,7 @@ import torch
 from recon.fields.coordinate_network import CoordinateNetwork
 from recon.fields.fields import Field, MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
-from recon.fields.regularisers import Regulariser, SecondOrderVariation, TotalVariation
+from recon.fields.regularisers import DirectionalVariation, Regulariser, SecondOrderVariation, TotalVariation
 from recon.projection.base import Projector
 from recon.projection.defocused_projector import DefocusedProjector
 from recon.projection.projector import SliceProjector
@@ -39,7 +39,12 @@ FIELDS = {
     "multiresolution": MultiresolutionField,
     "network": lambda shape, scale: CoordinateNetwork(shape, scale=scale, width=8, layers=2, frequencies=3, skip=0),
 }
-REGULARISERS = {"total variation": TotalVariation, "second order": SecondOrderVariation, "sum": SumOfAttenuation}
+REGULARISERS = {
+    "total variation": TotalVariation,
+    "directional": DirectionalVariation,
+    "second order": SecondOrderVariation,
+    "sum": SumOfAttenuation,
+}
 
 
 @pytest.mark.parametrize("name", PROJECTORS)

@@ -8,7 +8,8 @@ from pkgutil import iter_modules
 from noiseflow.plugins import plugins
 
 GROUP = "noiseflow.regularisers"
-DEFAULT = "total-variation"
+DEFAULT = "directional"
+"""In 25 scenes of 96³ it gains over total variation in every one (`docs/benchmarks/priors.md`)."""
 
 
 def regulariser_names() -> list[str]:

@@ -31,5 +31,9 @@ class Regulariser(ABC):
         """
         return self(tiles.spread(values), scale)
 
+    def at_half_resolution(self) -> Regulariser:
+        """What takes its place in a fit's first steps, at half the resolution; itself by default."""
+        return self
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"

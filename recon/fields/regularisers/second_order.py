@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.fields.regularisers._differences import add_adjoint, difference, inner, layers
 from recon.fields.regularisers.base import Regulariser
 from recon.projection.saved_gradient import SavedGradient
-
-_LAYERS = 8  # along z at a time: what is computed for them stays in the cache
 
 
 class SecondOrderVariation(Regulariser):
@@ -49,20 +48,20 @@ class _Variation(SavedGradient):
 
     @staticmethod
     def forward(ctx: Any, volume: Tensor, curvature: float, smoothing: float) -> Tensor:
-        gradient, total = torch.zeros_like(volume), volume.new_zeros(())
-        for start in range(0, len(volume), _LAYERS):
-            first, last = max(0, start - 1), start + _LAYERS + 1  # a term sees one layer on either side
+        gradient, total, count = torch.zeros_like(volume), volume.new_zeros(()), layers(volume)
+        for start in range(0, len(volume), count):
+            first, last = max(0, start - 1), start + count + 1  # a term sees one layer on either side
             part = volume[first:last]
             if bool(part.any()):
-                own = slice(start - first, start - first + _LAYERS)
-                total += _add(part, own, curvature, smoothing, gradient[first:last])
+                own = slice(start - first, start - first + count)
+                total += _add(part, own, gradient[first:last], curvature=curvature, smoothing=smoothing)
         ctx.save_for_backward(gradient)
         return total
 
 
-def _add(part: Tensor, own: slice, curvature: float, smoothing: float, gradient: Tensor) -> Tensor:
+def _add(part: Tensor, own: slice, gradient: Tensor, *, curvature: float, smoothing: float) -> Tensor:
     """The cost of the layers `own` of a part of a volume; its gradient is added to that of the part."""
-    slopes = [_difference(part, axis) for axis in range(3)]
+    slopes = [difference(part, axis) for axis in range(3)]
     pairs = [(first, second) for first in range(3) for second in range(first, 3)]
     bends = [_bend(slopes[first], first, second) for first, second in pairs]
     squared = torch.full_like(part, smoothing**2)
@@ -78,44 +77,23 @@ def _add(part: Tensor, own: slice, curvature: float, smoothing: float, gradient:
     for (first, second), bend, share in zip(pairs, bends, shares, strict=True):
         bend.mul_(inverse).mul_(share)
         if first == second:
-            flows[first].sub_(_difference(bend, first))
+            flows[first].sub_(difference(bend, first))
         else:
-            _add_adjoint(flows[first], bend, second)
+            add_adjoint(flows[first], bend, second)
     for axis, flow in enumerate(flows):
-        _inner(flow, axis, last=True).zero_()  # no difference leads beyond the edge
-        _add_adjoint(gradient, flow, axis)
+        inner(flow, axis, last=True).zero_()  # no difference leads beyond the edge
+        add_adjoint(gradient, flow, axis)
     return (magnitude - smoothing).sum()
-
-
-def _difference(array: Tensor, axis: int) -> Tensor:
-    """To the next along an axis; zero at its end."""
-    found = torch.zeros_like(array)
-    inner = _inner(found, axis)
-    torch.sub(array.narrow(axis, 1, inner.shape[axis]), _inner(array, axis), out=inner)
-    return found
 
 
 def _bend(slope: Tensor, first: int, second: int) -> Tensor:
     """The second difference: along one axis, centred; along two, that of the slope along the first."""
     if first != second:
-        return _difference(slope, second)
+        return difference(slope, second)
     found = slope.clone()
-    inner = _inner(slope, first)
-    found.narrow(first, 1, inner.shape[first]).sub_(inner)
+    within = inner(slope, first)
+    found.narrow(first, 1, within.shape[first]).sub_(within)
     return found
-
-
-def _add_adjoint(found: Tensor, flow: Tensor, axis: int) -> None:
-    """Add the adjoint of `_difference`, for a flow that is zero at the end of the axis."""
-    found.sub_(flow)
-    inner = _inner(flow, axis)
-    found.narrow(axis, 1, inner.shape[axis]).add_(inner)
-
-
-def _inner(array: Tensor, axis: int, *, last: bool = False) -> Tensor:
-    """All but the last along an axis, or the last alone."""
-    size = array.shape[axis]
-    return array.narrow(axis, size - 1, 1) if last else array.narrow(axis, 0, size - 1)
 
 
 REGULARISER = SecondOrderVariation

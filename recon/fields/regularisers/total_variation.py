@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
+from recon.fields.regularisers._differences import inner
 from recon.fields.regularisers.base import Regulariser
 from recon.projection.saved_gradient import SavedGradient
 from recon.projection.tiles import Tiles
@@ -69,8 +70,8 @@ class _TotalVariation(SavedGradient):
         differences = [torch.zeros_like(volume) for _ in range(3)]
         magnitude = torch.full_like(volume, smoothing**2)
         for axis, difference in enumerate(differences):
-            inner = _inner(difference, axis)
-            torch.sub(volume.narrow(axis, 1, inner.shape[axis]), _inner(volume, axis), out=inner)
+            within = inner(difference, axis)
+            torch.sub(volume.narrow(axis, 1, within.shape[axis]), inner(volume, axis), out=within)
             magnitude.addcmul_(difference, difference)
         magnitude.sqrt_()
         total = (magnitude - smoothing).sum()
@@ -78,14 +79,10 @@ class _TotalVariation(SavedGradient):
         for axis, difference in enumerate(differences):  # the gradient is minus the divergence of ∇v / |∇v|
             flow = difference.div_(magnitude)
             gradient.sub_(flow)
-            inner = _inner(flow, axis)
-            gradient.narrow(axis, 1, inner.shape[axis]).add_(inner)
+            within = inner(flow, axis)
+            gradient.narrow(axis, 1, within.shape[axis]).add_(within)
         ctx.save_for_backward(gradient)
         return total
-
-
-def _inner(array: Tensor, axis: int) -> Tensor:
-    return array.narrow(axis, 0, array.shape[axis] - 1)
 
 
 REGULARISER = TotalVariation

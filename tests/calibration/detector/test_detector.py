@@ -8,6 +8,8 @@ import pytest
 from scipy import ndimage, stats
 
 from calibration.detector.cells import collect_cells, true_moments
+from calibration.detector.correlation import correlation_of
+from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, NUM_LEVELS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
@@ -21,6 +23,7 @@ from calibration.detector.posterior import (
     _sampler,
     sample_posterior,
 )
+from calibration.detector.repair import Repairs
 from calibration.detector.shape import misfit, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
@@ -129,6 +132,15 @@ def test_unconverged_chain_is_an_error_that_says_how_many_more_steps():
     levels = collect_levels([readings(np.random.default_rng(6), electrons)])
     with pytest.raises(ValueError, match=r"needs about \d+ more"):
         sample_posterior([levels], num_steps=60, largest_num_steps=60)
+
+
+def test_a_chain_whose_own_time_forbids_it_to_converge_is_given_up_at_once(monkeypatch):
+    electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
+    levels = collect_levels([readings(np.random.default_rng(6), electrons)])
+    monkeypatch.setattr("calibration.detector.posterior.importance_sample", lambda *_: None)
+    monkeypatch.setattr("emcee.EnsembleSampler.get_autocorr_time", lambda *_, **__: np.full(3, 50.0))
+    with pytest.raises(ValueError, match=r"after 60 steps.*raw frames"):
+        sample_posterior([levels], num_steps=60, largest_num_steps=2000)
 
 
 def test_dark_frames_fix_offset_and_read_noise():
@@ -254,6 +266,20 @@ def test_pairs_some_of_few_and_some_of_many_electrons_are_measured_together():
     assert measure_detector(pairs).posterior.gain.median == pytest.approx(GAIN, rel=0.06)
 
 
+@pytest.mark.parametrize("frames", [2, 3, 6])
+def test_misfit_of_a_burst_is_one_though_its_residuals_share_their_mean(frames):
+    found = []
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        scene = random_scene(generator, 128)
+        burst = np.stack([exposed(generator, scene) for _ in range(frames)])
+        pairs, _ = align_burst(Burst(burst))
+        readings = pooled([one for number, pair in enumerate(pairs) for one in readings_of(pair, number)[0]])
+        levels = [collect_levels(readings)]
+        found.append(misfit(levels, sample_posterior(levels).most_likely))
+    assert np.mean(found) == pytest.approx(1, abs=0.1)
+
+
 def test_a_gain_that_cannot_be_told_from_none_is_refused():
     generator = np.random.default_rng(1)
     dose = 2.4 * np.exp(
@@ -330,3 +356,28 @@ def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
     assert len(np.unique(kept.block)) == MOST_BLOCKS
     assert len(kept.signal) == 64 * MOST_BLOCKS
     assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_gain_of_a_pair_alone_has_an_interval_that_holds_photon_transfers(known):
+    generator = np.random.default_rng(6)
+    scene = random_scene(generator, 128)
+    short, long = exposed(generator, scene), exposed(generator, 16 * scene)
+    pair = align_pair(ExposurePair(short, long, 16.0 if known else None))
+    detector = measure_detector([pair])
+    line = detector.line
+    low, high = line.gain - 1.6 * line.gain_error, line.gain + 1.6 * line.gain_error
+    clear = figures_of(detector, correlation_of([pair]), Repairs())
+    assert clear.gain.median == detector.posterior.gain.median
+    if known:
+        assert clear.gain == detector.posterior.gain
+    else:
+        assert clear.gain.q05 < low < high < clear.gain.q95
+
+
+def test_a_few_pixels_beside_many_that_fill_no_level_are_left_out():
+    generator = np.random.default_rng(7)
+    electrons = generator.uniform(50, 400, 20_000)
+    few = replace(readings(generator, electrons[:60], step=1.0), scale=Scale(0, 1.0, 0.0, 300.0))
+    with pytest.raises(NotMeasurable, match="too few pixels of each brightness"):
+        collect_cells([few], guess=(GAIN, OFFSET, READ_NOISE))

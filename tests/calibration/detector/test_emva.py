@@ -178,3 +178,60 @@ def test_levels_are_stacks_or_runs_of_equal_single_frames(tmp_path):
     assert [len(level.frames) for level in read_levels(paths)] == [2, 2]
     with pytest.raises(ValueError, match="one frame only"):
         read_levels(paths[:3])
+
+
+def test_levels_beyond_saturation_tell_the_capacity_and_leave_the_gain_alone():
+    """A converter of 12 bits ends at 4095 counts, (4095 − 100) / 2 electrons: levels beyond hold no other value."""
+    top = 4095.0
+    generator = np.random.default_rng(6)
+
+    def frames(electrons: float) -> Burst:
+        made = [sim.exposed(generator, np.full(SHAPE, electrons), top=top) for _ in range(4)]
+        return Burst(np.stack(made), calibration=True)
+
+    light = [200.0, 500.0, 900.0, 1400.0, 1800.0, 1990.0, 2100.0, 4000.0, 6000.0]
+    flats, dark = [frames(level) for level in light], frames(0.0)
+    assert np.ptp(flats[-1].frames) == 0
+    found = calibrate_camera(flats, [dark], flat_times=light)
+    alone = measure_camera(flats[:3], [dark])  # up to 70 % of the capacity
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.02)
+    assert found.figures.saturated
+    assert found.figures.saturation == pytest.approx((top - 100) / 2, rel=0.12)  # the level nearest below
+    assert found.figures.linearity_error < 2e-3
+    assert found.figures.response.std() == pytest.approx(alone.response.std(), rel=0.1)
+    assert float(found.model(torch.full(SHAPE, 5000.0)).sample().max()) == top
+
+
+def test_flats_that_are_all_saturated_are_refused():
+    white = Burst(np.full((2, *SHAPE), 4095.0), calibration=True)
+    dark = Burst(np.random.default_rng(7).normal(100, 6, (2, *SHAPE)).round(), calibration=True)
+    with pytest.raises(NotMeasurable, match="every level of the flat frames is saturated"):
+        measure_camera([white], [dark])
+    with pytest.raises(ValueError, match="flat"):
+        measure_camera([Burst(4000 + dark.frames, calibration=True)], [white])
+
+
+def test_a_few_codes_of_a_low_gain_are_no_saturation():
+    generator = np.random.default_rng(8)
+
+    def frames(electrons: float) -> Burst:
+        made = [sim.exposed(generator, np.full(SHAPE, electrons), gain=0.05) for _ in range(4)]
+        return Burst(np.stack(made), calibration=True)
+
+    found = calibrate_camera([frames(level) for level in (100.0, 400.0, 1200.0, 3000.0)], [frames(0.0)])
+    assert not found.figures.saturated
+    assert found.figures.gain.median == pytest.approx(0.05, rel=0.03)
+    assert "coarse codes" in [one.name for one in found.verdict.reasons]  # the read noise is 0.15 counts
+
+
+def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
+    generator = np.random.default_rng(9)
+
+    def frames(electrons: float) -> Burst:
+        made = [sim.exposed(generator, np.full(SHAPE, electrons), offset=0.0) for _ in range(4)]
+        return Burst(np.stack(made), calibration=True)
+
+    found = calibrate_camera([frames(level) for level in (100.0, 400.0, 1200.0)], [frames(0.0)])
+    assert "clipped darkness" in [one.name for one in found.verdict.reasons]
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.03)

@@ -51,6 +51,14 @@ def test_nothing_outside_the_priors_is_possible(levels):
     assert np.isfinite(posterior(posterior.coordinates(2.0, 99.0, 1.01 * low))).all()
 
 
+def test_codes_coarser_than_electrons_leave_no_read_noise_that_would_show_single_ones(levels):
+    """A posterior of 8-bit frames at 0.2 counts per electron was a field of peaks, hard to sample, where they keep step."""
+    posterior = LogPosterior(levels, offset=(99.0, 0.7))
+    below, above = (posterior.coordinates(0.25, 99.0, read_noise) for read_noise in (0.39, 0.41))
+    assert np.isneginf(posterior(below)).all()
+    assert np.isfinite(posterior(above)).all()
+
+
 def test_scale_reduction_is_that_of_its_formula_on_chains_that_agree_and_that_do_not():
     generator = np.random.default_rng(0)
     chain = generator.standard_normal((400, 6, 2))

@@ -144,6 +144,7 @@ def test_a_camera_in_half_precision() -> None:
         assert float(found) == pytest.approx(float(model(signal).log_prob(signal)), rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["spline", "radial"])
 def test_flows_compile_without_graph_breaks(name: str) -> None:
     model, signal = MODELS[name](), torch.rand(100, generator=torch.Generator().manual_seed(0))

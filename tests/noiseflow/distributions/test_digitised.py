@@ -224,6 +224,13 @@ def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up
     law = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-4)(SIGNALS)
     with pytest.raises(ValueError, match="likely levels"):
         law.quadrature()
+    most, wide = 65536, noiseflow.Gaussian(1e9).double()  # the noise reaches every level
+    nodes, weights = noiseflow.Digitised(wide, 1.0, 0.0, most - 1.0)(SIGNALS[:1]).quadrature()
+    assert len(nodes) == most
+    assert (float(nodes[0]), float(nodes[-1])) == (0.0, most - 1.0)
+    assert_close(weights.sum(0), torch.ones(1, dtype=torch.float64), atol=1e-12, rtol=0)
+    with pytest.raises(ValueError, match=f"{most + 1} likely levels, more than {most}"):
+        noiseflow.Digitised(wide, 1.0, 0.0, float(most))(SIGNALS[:1]).quadrature()
     few = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-3)(SIGNALS[:1])
     nodes, weights = few.quadrature()
     assert_close(weights.sum(0), torch.ones(1, dtype=torch.float64), atol=1e-12, rtol=0)

@@ -151,6 +151,18 @@ def test_resumed_fit_ends_where_the_uninterrupted_one_does() -> None:
     assert torch.allclose(resumed, whole, rtol=1e-6, atol=1e-7)
 
 
+def test_the_table_of_a_joint_fit_keeps_up_with_the_noise_model_it_learns() -> None:
+    """Left as it was laid out for the first noise model, the table is off by 3e-3 nats at the end."""
+    generator = torch.Generator().manual_seed(0)
+    scene = torch.rand(64, 64, generator=generator)
+    gamma = -torch.log(torch.rand((4, 9, *scene.shape), generator=generator)).sum(0)
+    observation = scene + (0.02 + 0.08 * scene) * (gamma - 4) / 2
+    options = {"num_steps": 100, "generator": torch.Generator().manual_seed(0)}
+    found = noiseflow.fit(noiseflow.RadialFlow(), noiseflow.StaticScene(observation), observation, **options)
+    assert found.table_error is not None
+    assert found.table_error <= 1e-3
+
+
 def test_frozen_noise_model_stays_as_it_is() -> None:
     _, observation = exposures()
     model = noiseflow.Gaussian(0.05).requires_grad_(False)

@@ -50,18 +50,19 @@ def test_within_its_rows_value_and_slope_are_those_of_the_model(table) -> None:
 
 
 class Wavy(torch.nn.Module):
-    """Normal noise whose log-density ripples along the residual; finer ripples need finer tables."""
+    """Normal noise whose log-density ripples along the residual, from some size of it on; finer ripples need finer tables."""
 
-    def __init__(self, waves: float) -> None:
+    def __init__(self, waves: float, beyond: float = 0.0) -> None:
         super().__init__()
-        self.waves = torch.nn.Parameter(torch.tensor(waves))
+        self.waves, self.beyond = torch.nn.Parameter(torch.tensor(waves)), beyond
 
     def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
-        waves = self.waves
+        waves, beyond = self.waves, self.beyond
 
         class Law(torch.distributions.Normal):
             def log_prob(self, value: torch.Tensor) -> torch.Tensor:
-                return super().log_prob(value) + 0.2 * torch.sin(waves * (value - self.loc))
+                residual = value - self.loc
+                return super().log_prob(value) + 0.2 * torch.sin(waves * residual) * (residual.abs() > beyond)
 
         return Law(signal, torch.full_like(signal, 0.1), validate_args=False)
 
@@ -87,6 +88,12 @@ def test_the_error_told_is_the_error_made(waves: float) -> None:
     found = ObservationTable(model, observation, 0.0, 1.0)
     assert error_of(found, model, observation) == pytest.approx(found.error, rel=0.25, abs=1e-5)
     assert found.measure_error(model) == found.error
+
+
+def test_the_error_told_counts_unlikely_signals_as_often_as_they_are_met() -> None:
+    model, observation = Wavy(3e4, beyond=0.2), spread()  # one residual of 22 lies beyond two standard deviations
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    assert error_of(found, model, observation) == pytest.approx(found.error, rel=0.5)
 
 
 def test_finer_columns_are_taken_where_they_are_needed_and_help() -> None:
@@ -134,12 +141,21 @@ def test_rows_grow_where_signals_leave_them_and_not_for_a_few_strays() -> None:
     # as far again below as the signals went, and a hundredth: weak signals need the resolution
     assert found.low == pytest.approx(-0.8 - 0.01 * 1.8, rel=4e-3)
     assert found.high == high
+    before = found.low
+    found.cover(model, torch.linspace(-1.2, 1.0, 1000))
+    assert found.low == pytest.approx(-2.4 - before - 0.01 * (high - before), rel=4e-3)
     assert error_of(found, model, observation) <= 1e-3
     below = torch.full_like(observation, -0.6)
     value, slope = exact(model, below, observation)
     near = observation < -0.05
     assert float((found.log_prob(below) - value)[near].abs().mean()) < 5e-3
     assert float((found.slope(below) - slope)[near].abs().mean()) < 0.02 * float(slope[near].abs().mean())
+
+
+def test_rows_grow_by_a_share_of_the_signals_where_these_are_all_above() -> None:
+    found = ObservationTable(noiseflow.Gaussian(0.1), spread(), 0.0, 1.0)
+    found.cover(noiseflow.Gaussian(0.1), torch.linspace(2.0, 5.0, 1000))
+    assert (found.low, found.high) == (0.0, pytest.approx(5.0 + 0.2 * 3.0, rel=2e-3))
 
 
 @pytest.mark.parametrize("kind", ["counts", "continuous"])
@@ -218,20 +234,31 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     assert torch.tensor(distant.high) > torch.tensor(distant.low)  # in single precision
 
 
-class Partly(torch.nn.Module):
-    """Normal noise whose likelihood cannot be computed for the weakest signals."""
+def test_two_levels_are_told_apart() -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.3), 1.0, 0.0, 1.0)
+    observation = (spread() > 0.5).float()
+    found = ObservationTable(model, observation, 0.0, 1.0)
+    value, slope = exact(model, torch.full_like(observation, 0.3), observation)
+    assert found._columns is None
+    assert float((found.log_prob(torch.full_like(observation, 0.3)) - value).abs().max()) < 2e-3
+    assert float((found.slope(torch.full_like(observation, 0.3)) - slope).abs().max()) < 0.05
+
+
+class Partly(Wavy):
+    """Such noise whose likelihood cannot be computed for the weakest signals."""
 
     def forward(self, signal: torch.Tensor) -> torch.distributions.Distribution:
-        class Law(torch.distributions.Normal):
-            def log_prob(self, value: torch.Tensor) -> torch.Tensor:
-                return torch.where(self.loc < 0.1, math.nan, super().log_prob(value))
-
-        return Law(signal, torch.full_like(signal, 0.1), validate_args=False)
+        law = super().forward(signal)
+        log_prob = law.log_prob
+        law.log_prob = lambda value: torch.where(signal < 0.1, math.nan, log_prob(value))  # type: ignore[method-assign]
+        return law
 
 
 def test_signals_whose_likelihood_cannot_be_computed_do_not_count_for_the_error() -> None:
     observation = 0.7 + 0.05 * spread()
-    assert ObservationTable(Partly(), observation, 0.0, 1.0).error < 1e-2
+    assert ObservationTable(Partly(0.0), observation, 0.0, 1.0).error < 1e-2
+    # nor do they hide how far the table is off at all others
+    assert ObservationTable(Partly(3e4), observation, 0.0, 1.0).error > 0.02
 
 
 def test_some_pixels_are_looked_up_as_all_of_them() -> None:

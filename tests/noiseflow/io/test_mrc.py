@@ -78,6 +78,14 @@ def test_complex_colour_and_packed_pixels_are_refused_by_name(tmp_path: Path, mo
     with pytest.raises(ValueError, match=r"complex numbers|colour|4-bit") as caught:
         io.read(path)
     assert "damaged" not in str(caught.value)
+    absurd = write(tmp_path / "b.mrc", np.zeros((1, 4, 40), "f4"), mode, nx=40_000)
+    with pytest.raises(ValueError, match=f"no MRC file: its header says mode {mode}"):
+        io.read(absurd)
+
+
+def test_a_mode_that_nobody_knows_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no MRC file: its header says mode 99"):
+        io.read(write(tmp_path / "a.mrc", np.zeros((1, 4, 40), "f4"), 99))
 
 
 def test_map_axes_are_put_in_order(tmp_path: Path) -> None:
@@ -129,9 +137,10 @@ def test_written_values_come_back_exactly(tmp_path: Path, dtype: str) -> None:
         np.testing.assert_array_equal(io.read(tmp_path / "a.mrc").data, values)
 
 
-def test_whole_numbers_in_single_precision_stay_so(tmp_path: Path) -> None:
-    io.write(tmp_path / "a.mrc", np.array([[1.0, 2.0]], np.float32))
-    assert io.read(tmp_path / "a.mrc").data.dtype == np.float32
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_whole_numbers_in_a_type_that_mrc_has_keep_it(tmp_path: Path, kind: type) -> None:
+    io.write(tmp_path / "a.mrc", np.array([[1, 2]], kind))
+    assert io.read(tmp_path / "a.mrc").data.dtype == kind
 
 
 def test_integers_that_would_lose_digits_are_refused(tmp_path: Path) -> None:

@@ -181,8 +181,12 @@ def test_an_evaluation_is_made_of_its_definitions() -> None:
     assert len(found.per_signal) == 5
     order = np.argsort(signal.numpy())
     for each, group in zip(found.per_signal, np.array_split(order, 5), strict=True):
-        alone = metrics.divergence(Wide(), signal[group], observation[group], num_bins=16)
+        alone, finer = (
+            metrics.divergence(Wide(), signal[group], observation[group], num_bins=16, num_groups=number)
+            for number in (64, 256)
+        )
         assert each.jsd == pytest.approx(alone.jsd, rel=1e-9)
+        assert each.jsd == pytest.approx(finer.jsd, rel=1e-4)  # 64 signals stand for all of a bin
     assert found.mean_jsd == pytest.approx(np.mean([each.jsd for each in found.per_signal]))
     assert found.mean_jsd_floor == pytest.approx(np.mean([each.jsd_floor for each in found.per_signal]))
     assert len(metrics.evaluate(Wide(), signal[:3], observation[:3]).per_signal) == 3

@@ -86,6 +86,17 @@ def test_where_too_little_is_left_unclipped_all_of_it_counts(pixels: int) -> Non
     assert float(model.model.log_scale.detach().exp()) == pytest.approx(float((observation - signal).std()), rel=0.5)
 
 
+@pytest.mark.parametrize(("pixels", "suffice"), [(1024, True), (40_000, False)])
+def test_256_unclipped_pixels_and_a_tenth_of_all_suffice_to_start_from(pixels: int, suffice: bool) -> None:
+    """Unclipped are 16 of 64 groups by signal, 256 pixels, or one group, 625 pixels; their noise is a tenth as wide."""
+    unclipped = torch.arange(pixels) < (pixels // 4 if suffice else pixels // 64)
+    signal = torch.where(unclipped, 0.0, 1.0) + torch.linspace(0, 1e-3, pixels)
+    noise = torch.randn(pixels, generator=torch.Generator().manual_seed(0)) * torch.where(unclipped, 0.01, 0.1)
+    model = noiseflow.Digitised(noiseflow.Gaussian(), 0.0, -1.0, 1.0)
+    model.standardise(signal, (signal + noise).clamp(-1, 1))
+    assert (float(model.model.log_scale.detach().exp()) < 0.02) == suffice
+
+
 @pytest.mark.parametrize("kept", ["fixed_part", "fixed_interval_part"])
 def test_a_model_that_keeps_only_half_of_its_likelihood_keeps_none_behind_limits(kept: str) -> None:
     inner = noiseflow.Gaussian(0.1)

@@ -157,6 +157,7 @@ def test_command_refuses_what_it_does_not_know(tmp_path):
         (["--repeats", "0"], "at least 1"),
         (["sabotage", "--method", "magic"], "choose from auto"),
         (["needle", "--method", "l2"], "belongs to the benchmark sabotage"),
+        (["needle", "--in-turn"], "belongs to the benchmark sabotage"),
     ):
         result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
         assert isinstance(result.exception, ValueError)
@@ -190,6 +191,16 @@ def test_sabotage_keeps_the_results_of_every_method_apart(tmp_path, monkeypatch)
         paths.add(json.loads(result.stdout.splitlines()[-1])["sabotage"]["results"])
     assert methods == ["joint", "sirt", "l2"]
     assert len(paths) == 3
+
+
+def test_ways_in_turn_spoil_each_scene_in_other_ways(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark_sabotage, "_cell", lambda results, line, key, compute: line(key))
+    lines = []
+    options = {"size": 16, "method": "l2", "seed": 0, "quick": False}
+    benchmark_sabotage.run(Results(tmp_path / "r.json", "test"), lines.append, **options, in_turn=True)
+    spoilt = [line.partition("/") for line in lines if not line.startswith("good/")]
+    assert sorted(way for _, _, way in spoilt) == sorted(benchmark_sabotage.WAYS)
+    assert {scene for scene, _, _ in spoilt} == {", ".join(scene) for scene in benchmark_sabotage.SCENES}
 
 
 def test_plain_values_are_json():

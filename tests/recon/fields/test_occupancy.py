@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from noiseflow import Gaussian
 from recon.fields.coordinate_network import CoordinateNetwork
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
@@ -16,7 +17,7 @@ from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.phantoms import shells
-from recon.simulate.simulation import clean_tilt_series
+from recon.simulate.simulation import add_noise, clean_tilt_series
 
 
 @pytest.fixture
@@ -204,10 +205,11 @@ def test_what_is_wanted_only_once_stays_empty():
 def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
     density = shells(16, generator=np.random.default_rng(1), count=2)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 20.0))
+    noisy = add_noise(clean, Gaussian(0.5 * float(clean.images.std())), seed=0)
     make = partial(CoordinateNetwork, width=8, layers=2, frequencies=2, skip=0)
-    grid = VolumeGrid.of(clean)
+    grid = VolumeGrid.of(noisy)
     first, second, plain = (
-        JointReconstructor(make_field=make, skip_vacuum=skip).signal_model(clean, grid) for skip in (True, True, False)
+        JointReconstructor(make_field=make, skip_vacuum=skip).signal_model(noisy, grid) for skip in (True, True, False)
     )
     assert plain.occupancy is None
     dense, _ = clean_tilt_series(np.ones((8, 16, 16), np.float32), np.arange(-60, 61, 20.0))

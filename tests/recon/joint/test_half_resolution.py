@@ -135,6 +135,7 @@ def slices(phantom, seed=0):
     return whole.truth[:, rows], replace(whole.noisy, images=whole.noisy.images[:, rows]), whole.noise_model
 
 
+@pytest.mark.slow
 def test_half_the_steps_at_half_the_resolution_lose_nothing():
     gains = []
     for phantom, seed in itertools.product(("shells", "virions"), (0, 1)):  # by chance, one alone may differ by 0.15
@@ -173,3 +174,17 @@ def test_what_is_masked_at_full_resolution_is_masked_at_half():
         assert half.use is not None
         assert torch.equal(half.use, torch.isfinite(half.observation))
         assert 0 < int(half.use.sum()) < half.use.numel()
+
+
+@pytest.mark.parametrize("through_rows", [False, True])
+def test_what_counts_as_vacuum_is_the_same_at_both_resolutions_and_in_blocks(through_rows):
+    shape = _SHAPES[0]
+    shares = []
+    for least in (0.2, 0.9):
+        model = smooth_model(shape)
+        model.occupancy = Occupancy(torch.ones(1, 1, 1), shape, least=least)
+        if through_rows:
+            model.occupancy = model.occupancy.rows(slice(0, shape[1]))
+        HalfResolution(model).hand_over()
+        shares.append(model.occupancy.share)
+    assert 0 < shares[1] < 0.9 * shares[0]

@@ -253,3 +253,14 @@ def test_a_real_series_with_little_noise_is_not_taken_for_noise():
     predicted = benchmark_needle.predict(parts.given, volume, parts.left_out.tilt_angles)
     # least squares reaches 39.9 dB; fits that excuse misfits as noise were at 34 and 22
     assert compare(predicted, parts.target).psnr > 39
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (3.0, False)])
+def test_a_dim_part_counts_as_vacuum_only_where_noise_could_have_made_it(noise, kept):
+    density = np.zeros((32, 32, 32))
+    density[10:22, 4:14, 10:22] = 1.0
+    density[10:22, 16:28, 10:22] = 0.08
+    series, _ = clean_tilt_series(density, np.arange(-80, 81, 4.0), acquisition=ACQUISITIONS["gaussian"])
+    noisy = add_noise(series, noiseflow.Gaussian(noise * float(series.images.std()) / 4), seed=0)
+    occupancy = JointReconstructor().signal_model(noisy, VolumeGrid.of(noisy)).occupancy
+    assert (occupancy is None or bool(occupancy.mask[12:20, 12:20, 18:26].all())) == kept  # (z, x, y)

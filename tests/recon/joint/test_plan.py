@@ -61,6 +61,15 @@ PLANS = {
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
+    "wide": (
+        Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True, wide=True),
+        """
+        whole  start noise of the volume    noise       10  simple
+        whole  begin                        signal      74  simple, rate 0.6, half resolution
+        whole  go on                        signal      74  chosen, rate 0.6, half resolution
+        whole  fit                          signal      76  chosen, rate 0.6
+        """,
+    ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
         """
@@ -157,19 +166,36 @@ def test_what_is_done_is_what_was_planned(clipped, options):
         return result
 
     fit = JointReconstructor(run_fit=run_fit, **options)
-    planned, _ = fit.plan(clipped)
+    planned, *_ = fit.plan(clipped)
     fit(clipped)
     signal = [(s.name, s.num_steps) for s in planned if s.kind == "signal"]
     assert [step for step in done if "choose weight" not in step[0]] == signal
     assert any("choose weight" in name for name, _ in done) == any(s.kind == "weights" for s in planned)
 
 
+def smooth(height, width):
+    """A series without noise."""
+    ramp = np.linspace(0, 1, height, dtype=np.float32)[:, None] + np.linspace(0, 1, width, dtype=np.float32)
+    return TiltSeries(ramp * np.ones((9, 1, 1), np.float32), np.arange(9) * 10.0, mode="linear")
+
+
 def test_little_noise_is_seen_before_any_fit(clipped):
-    ramp = np.linspace(0, 1, 20, dtype=np.float32)
-    smooth = TiltSeries(ramp + ramp[:, None] * np.ones((9, 1, 1), np.float32), np.arange(9) * 10.0, mode="linear")
     fit = JointReconstructor()
-    assert "describe noise" in [s.name for s in fit.plan(smooth)[0]]
+    assert "describe noise" in [s.name for s in fit.plan(smooth(20, 20))[0]]
     assert "choose noise" in [s.name for s in fit.plan(clipped)[0]]
+
+
+def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_than_they_need():
+    started = []
+
+    def run_fit(name, *parts, **given):
+        started.append(name)
+        return noiseflow.fit(*parts, **given)
+
+    short = replace(Schedule(), settle=1, adapt=1, quiet=4, quiet_trial=1, describe=1)
+    JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
+    assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
+    assert JointReconstructor().plan(smooth(32, 160))[1] == 12
 
 
 def test_stages_are_values():

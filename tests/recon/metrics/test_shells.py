@@ -69,6 +69,10 @@ def test_scalings_bring_a_result_to_its_reference(shift):
     assert (ranged.min(), ranged.max()) == pytest.approx((truth.min(), truth.max()))
     np.testing.assert_allclose(np.diff(ranged.ravel()) / np.diff(result.ravel()), np.ptp(truth) / np.ptp(result))
     assert match(result, truth, scaling="raw") is result
+    for scaling in ("affine", "min-max"):  # with the gain of the truth, or its offset, already
+        np.testing.assert_allclose(match(truth + 2.0, truth, scaling=scaling), truth)
+        balanced = truth - (truth.mean() if scaling == "affine" else truth.min())
+        np.testing.assert_allclose(match(3.0 * balanced, balanced, scaling=scaling), balanced, atol=1e-12)
     flat = np.full_like(truth, 3.0)
     np.testing.assert_allclose(match(flat, truth, scaling="affine"), truth.mean())
     np.testing.assert_allclose(match(flat, truth, scaling="min-max"), truth.min())

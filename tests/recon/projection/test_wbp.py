@@ -68,6 +68,7 @@ def test_tilts_share_half_a_circle_and_no_more():
     limited = angular_shares(np.arange(-60, 61, 2.0))
     np.testing.assert_allclose(limited, np.deg2rad(2))
     np.testing.assert_allclose(angular_shares(np.array([7.0, 7.0])), math.pi / 2)
+    np.testing.assert_allclose(np.rad2deg(angular_shares(np.array([7.0, 17.0]))), [10, 10])
     # a direction that rounding put on the other side of the turn is that of zero
     np.testing.assert_allclose(np.rad2deg(angular_shares(np.array([0.0, -1e-12, 60.0, 120.0]))), [30, 30, 60, 60])
     uneven = np.array([-30.0, 0.0, 10.0, 10.0, 50.0])

@@ -266,6 +266,7 @@ def test_error_bars_of_blocks_share_what_is_settled_and_fade_like_the_volume(sce
     np.testing.assert_array_equal(resumed.uncertainty.std.attenuation, found.uncertainty.std.attenuation)
 
 
+@pytest.mark.slow
 def test_workers_make_the_error_bars_of_one_process(scene, tmp_path, run):
     pytest.importorskip("dask.distributed", reason="needs the extra [distributed]")
     _, noisy = scene

@@ -1,5 +1,6 @@
 """Blocks give the volume of a whole fit: as good, and without seams; on Dask workers too, though one of them dies."""
 
+import gc
 import os
 import signal
 from dataclasses import replace
@@ -16,8 +17,9 @@ from recon.joint.run import run_fit
 from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
+from recon.projection.tile import Tile
 from recon.scale.blocks import HALO, BlockFiles, block_memory, blocks
-from recon.scale.memory import choose_slices, needed_memory
+from recon.scale.memory import _group_available, choose_slices, needed_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -107,6 +109,19 @@ def test_a_block_of_vacuum_takes_no_step(density):
     assert found.projections.shape == (21, 32, 32)
 
 
+def test_what_blocks_take_over_holds_no_matrices_of_tiles_and_still_projects():
+    _, noisy = scene("shells", 32, 6.0)
+    fit = JointReconstructor(weight=4.0, num_steps=10, noise_model=Gaussian)
+    settled = fit.settle(noisy, VolumeGrid.of(noisy))
+    gc.collect()
+    kept = [each for each in gc.get_objects() if isinstance(each, Tile)]
+    assert not kept
+    model = settled.signal_model
+    said = model.signal()  # makes them again
+    model.let_go()
+    assert torch.equal(model.signal(), said)
+
+
 @pytest.mark.slow
 def test_a_killed_worker_changes_not_a_bit(tmp_path):
     dask = pytest.importorskip("dask.distributed")
@@ -159,6 +174,15 @@ def test_an_unreachable_scheduler_is_one_line(monkeypatch):
         pass
 
 
+@pytest.mark.parametrize(("limit", "left"), [("8000\n", 8000 - (7500 - 6000)), ("max\n", None)])
+def test_files_that_were_read_do_not_count_against_the_memory_of_a_container(tmp_path, limit, left):
+    (tmp_path / "memory.max").write_text(limit)
+    (tmp_path / "memory.current").write_text("7500\n")
+    (tmp_path / "memory.stat").write_text("anon 1000\nfile 6500\ninactive_file 6000\nactive_file 500\n")
+    assert _group_available(tmp_path) == left
+    assert _group_available(tmp_path / "none") is None
+
+
 def test_slices_are_chosen_by_the_memory_that_is_free():
 
     class Virtual(TiltSeries):  # of 79 images of 1000², without their pixels
@@ -174,5 +198,8 @@ def test_slices_are_chosen_by_the_memory_that_is_free():
     assert needed_memory(*block_memory(series, grid, slices, fitted=True)) < 12 * 2**30
     assert choose_slices(series, grid, 24 * 2**30, workers=2) == slices
     assert choose_slices(series, grid, 2**40, plenty=4 * 2**30) == 64
+    lower = choose_slices(series, grid, 22 * 2**30)  # 64 slices would fit, and take more than half
+    assert 32 <= lower < 64
+    assert needed_memory(*block_memory(series, grid, lower, fitted=True)) < 11 * 2**30
     with pytest.raises(MemoryError, match="--thickness"):
         choose_slices(series, grid, 2**30)

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from recon.benchmarks.sabotage import spoil
 from recon.benchmarks.scenes import make_scene
-from recon.benchmarks.spoiling import WAYS
+from recon.benchmarks.ways import WAYS, Spoilt
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
@@ -48,13 +49,21 @@ def larger(seed: int = 0) -> Any:
     return make_scene(48, phantom="particles", noise="low-dose", tilts=TILTS, seed=seed)
 
 
-def judged(series: TiltSeries, thickness: int | None = None) -> Verdict:
+def judged(series: TiltSeries, thickness: int | None = None, method: str = "l2") -> Verdict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         screening = screen(series)
         prepared = screening.passed(series)
-        result = reconstruct(prepared, VolumeGrid.of(prepared, thickness), method="l2", weight=0.4, num_steps=120)
+        weight = 0.4 if method == "l2" else None
+        result = reconstruct(prepared, VolumeGrid.of(prepared, thickness), method=method, weight=weight, num_steps=120)
         return judge(prepared, result, screening=screening)
+
+
+def assert_named(name: str, spoilt: Spoilt) -> None:
+    """A true reason for a grade below good is among the first two."""
+    verdict = judged(spoilt.series, spoilt.thickness)
+    assert verdict.grade != "good"
+    assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
 
 
 def oracle(noise: str = "low-dose") -> tuple[TiltSeries, Told]:
@@ -157,9 +166,7 @@ def test_a_good_reconstruction_is_good() -> None:
 @pytest.mark.usefixtures("one_thread")
 def test_what_spoils_a_series_is_named(name: str) -> None:
     spoilt = spoil(scene(), name, other=scene(seed=9), seed=5)
-    verdict = judged(spoilt.series, spoilt.thickness)
-    assert verdict.grade != "good"
-    assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
+    assert_named(name, spoilt)
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -184,9 +191,41 @@ def test_borders_that_an_alignment_filled_are_seen_until_they_are_masked() -> No
 @pytest.mark.usefixtures("one_thread")
 def test_what_spoils_a_larger_series_is_named(name: str) -> None:
     spoilt = spoil(larger(), name, other=larger(seed=9), seed=5)
-    verdict = judged(spoilt.series, spoilt.thickness)
-    assert verdict.grade != "good"
-    assert set(verdict.subjects[:2]) & set(WAYS[name].reasons), verdict.reasons
+    assert_named(name, spoilt)
+
+
+@pytest.mark.parametrize("name", ["two tilts swapped", "one tilt of another object"])
+@pytest.mark.usefixtures("one_thread")
+def test_a_single_tilt_that_does_not_belong_is_named(name: str) -> None:
+    made, other = (make_scene(48, phantom="filaments", noise="8-bit", tilts=TILTS, seed=seed) for seed in (0, 9))
+    told = Told(Volume(made.truth.astype(np.float32)), made.clean.images.astype(np.float32), None, made.noise_model)
+    assert judge(made.noisy, told).grade == "good"
+    assert judge(spoil(made, name, other=other, seed=5).series, told).subjects[0] == "tilts"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two series spliced",
+        "half of the images upside down",
+        "half of the tilts rebinned",
+        "compressed by blocks of 8 pixels",
+        "pixels shuffled in half of the tilts",
+        "a bright background that moves",
+    ],
+)
+@pytest.mark.usefixtures("one_thread")
+def test_the_true_reason_stands_among_the_first_two(name: str) -> None:
+    made, other = (make_scene(48, phantom="filaments", noise="8-bit", tilts=TILTS, seed=seed) for seed in (0, 9))
+    spoilt = spoil(made, name, other=other, seed=5)
+    assert_named(name, spoilt)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_what_sirt_leaves_is_no_background_that_moves() -> None:
+    verdict = judged(make_scene(48, phantom="filaments", noise="8-bit", tilts=TILTS).noisy, method="sirt")
+    assert "residuals" in verdict.subjects
+    assert "beam" not in verdict.subjects, verdict.reasons
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -196,6 +235,28 @@ def test_projections_moved_by_a_pixel_are_seen() -> None:
     moved[::2] = told.projections[::2]
     verdict = judge(series, replace(told, projections=moved))
     assert verdict.subjects[0] == "alignment"
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_an_axis_off_the_middle_counts_from_an_eighth_of_a_pixel_on() -> None:
+    series, told = oracle()
+    grades = {}
+    for off in (0.08, 0.3):
+        moved = ndimage.shift(told.projections, (0, 0, off), order=1, mode="nearest")
+        grades[off] = judge(series, replace(told, projections=moved)).subjects
+    assert grades == {0.08: (), 0.3: ("alignment",)}
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(("noise", "named"), [(2.0, False), (0.3, True)])
+def test_contrast_that_a_regulariser_takes_is_excused_by_strong_noise_alone(noise: float, named: bool) -> None:
+    made = scene()
+    clean = made.clean.images.astype(np.float32)
+    weak = clean.mean() + np.float32(0.6) * (clean - clean.mean())
+    drawn = np.random.default_rng(4).normal(0, noise * clean.std(), clean.shape).astype(np.float32)
+    series = replace(made.clean, images=clean + drawn)
+    verdict = judge(series, Told(Volume(made.truth.astype(np.float32)), weak))
+    assert ("residuals" in verdict.subjects) == named
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -1,0 +1,49 @@
+"""Dot charts of the results pages: one row a method, one panel a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from noiseflow.io import atomic_path
+from noiseflow.report import new_figure
+
+COLOURS = "#0072B2", "#D55E00"  # Okabe and Ito: told apart by everybody
+MARKS = "o", "s"  # and in grey
+Panel = tuple[str, str, dict[str, dict[str, float]]]
+
+
+def save(path: Path, panels: Sequence[Panel], *, columns: int, straight: float | None = None) -> None:
+    """Write a picture.
+
+    Args:
+        panels: title, label of the x axis with its unit, and {series: {method: value}}, methods best first.
+        columns: panels side by side.
+        straight: values beyond ± this one stand on a logarithmic axis; None: none do.
+    """
+    methods = max(len(_names(series)) for _, _, series in panels)
+    rows = -(-len(panels) // columns)
+    figure, axes = new_figure(columns, rows, width=5.5 * columns, height=0.8 + 0.26 * methods)
+    for axis, panel in zip(axes.flat, panels, strict=True):
+        _draw(axis, *panel)
+        if straight is not None:
+            axis.set_xscale("symlog", linthresh=straight)
+    with atomic_path(path) as partial:
+        figure.savefig(partial, format="png", dpi=90, facecolor="white")
+
+
+def _draw(axis: Any, title: str, label: str, series: dict[str, dict[str, float]]) -> None:
+    names = _names(series)
+    for (legend, values), colour, mark in zip(series.items(), COLOURS, MARKS, strict=False):
+        places = [names.index(name) for name in values]
+        axis.plot(list(values.values()), places, mark, color=colour, label=legend)
+    axis.set(title=title, xlabel=label, yticks=range(len(names)), yticklabels=names)
+    axis.set_ylim(len(names) - 0.5, -0.5)
+    axis.grid(axis="y", alpha=0.4)
+    if len(series) > 1:
+        axis.legend(fontsize=8, loc="best")
+
+
+def _names(series: dict[str, dict[str, float]]) -> list[str]:
+    return list(dict.fromkeys(name for values in series.values() for name in values))

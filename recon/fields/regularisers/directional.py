@@ -1,0 +1,210 @@
+"""Directional total variation: faces are smooth along themselves, and their jumps count less."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.fields.regularisers._differences import layers
+from recon.fields.regularisers.base import Regulariser
+from recon.fields.regularisers.total_variation import TotalVariation
+from recon.projection.saved_gradient import SavedGradient
+
+
+class DirectionalVariation(Regulariser):
+    """Σ √(‖∇v‖² − a (∇v·n)² + ε²) − ε: total variation in which jumps along the normal n of a face count less.
+
+    Total variation shrinks the jump of a face by as much as it smooths the face. Here n = ∇v̄ / √(‖∇v̄‖² + δ²) comes from the
+    means v̄ of 3³ voxels: where these have no slope, this is total variation; across a face of them a jump counts √(1 − a) times,
+    and along the face as before. The idea is that of directional and structure-tensor total variation
+    (doi:10.1137/15M1047325, doi:10.1137/14098154X); n follows the volume itself, so the cost is not convex.
+
+    Args:
+        discount: a, how much less the square of a jump along the normal counts.
+        certain: δ, slopes of the means below this, in units of the scale, give no direction.
+        smoothing: ε, changes below this, in units of the scale, count quadratically.
+
+    Raises:
+        ValueError: a smoothing or slope that is not positive, or a discount outside 0 to 1.
+    """
+
+    # 48³, true noise: 0.9 gains 0.7 dB more on filaments than 0.75, but costs a slab 0.2 dB in place of 0.1
+    def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = 0.02) -> None:
+        if not (smoothing > 0 and certain > 0 and 0 <= discount < 1):
+            raise ValueError(
+                f"smoothing {smoothing} and certain {certain} must be positive, in units of the scale, and discount {discount} "
+                "zero or more and less than 1"
+            )
+        self.discount, self.certain, self.smoothing = discount, certain, smoothing
+
+    def __call__(self, volume: Tensor, scale: float) -> Tensor:
+        value: Tensor = _Directional.apply(volume, self.discount, self.certain * scale, self.smoothing * scale)  # type: ignore[no-untyped-call]
+        return value
+
+    def at_half_resolution(self) -> Regulariser:
+        """Total variation: directions of a rough volume mislead (512³: -0.1 dB), and it takes a fifth of the time."""
+        return TotalVariation(self.smoothing)
+
+    def __repr__(self) -> str:
+        return (
+            f"DirectionalVariation(discount={self.discount:g}, certain={self.certain:g}, smoothing={self.smoothing:g})"
+        )
+
+
+class _Directional(SavedGradient):
+    @staticmethod
+    def forward(ctx: Any, volume: Tensor, discount: float, certain: float, smoothing: float) -> Tensor:
+        gradient, total = torch.zeros_like(volume), volume.new_zeros(())
+        count = layers(volume)
+        for start in range(0, len(volume), count):
+            box = _Box.around(volume, start, min(start + count, len(volume)))
+            if box is not None:
+                total += _add(box, volume, gradient, discount=discount, certain=certain, smoothing=smoothing)
+        ctx.save_for_backward(gradient)
+        return total
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A few layers, their neighbours, and of these the part that holds anything, with empty voxels around it.
+
+    Arrays of it are flat, so that a step along an axis is a shift. A shift leads from the end of a row to the start of the
+    next: from an empty voxel to an empty one.
+
+    Attributes:
+        starts, stops: its voxels in the volume, of which the outermost may lie beyond an edge.
+        size: of the volume.
+    """
+
+    starts: tuple[int, ...]
+    stops: tuple[int, ...]
+    size: tuple[int, ...]
+
+    @staticmethod
+    def around(volume: Tensor, start: int, stop: int) -> _Box | None:
+        """The box for the terms of the layers from start to stop, which see one more; None if these are all zero."""
+        seen = volume[start : stop + 1].abs().sum(0)
+        starts, stops = [start - 1], [stop + 2]
+        for axis, size in enumerate(seen.shape):
+            occupied = seen.sum(1 - axis).nonzero()
+            if not len(occupied):
+                return None
+            # the voxel before the first has a term, which needs a mean, which needs one more; likewise behind the last
+            starts.append(max(-1, int(occupied[0]) - 2))
+            stops.append(min(size + 1, int(occupied[-1]) + 3))
+        return _Box(tuple(starts), tuple(stops), tuple(volume.shape))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(stop - start for start, stop in zip(self.starts, self.stops, strict=True))
+
+    @property
+    def shifts(self) -> tuple[int, int, int]:
+        """One step along z, x and y in a flat array."""
+        _, width, height = self.shape
+        return width * height, height, 1
+
+    def inside(self, array: Tensor) -> Tensor:
+        """The part of a flat array that lies in the volume."""
+        whole = array.view(self.shape)
+        for axis, (start, stop, size) in enumerate(zip(self.starts, self.stops, self.size, strict=True)):
+            whole = whole.narrow(axis, max(0, -start), min(stop, size) - max(0, start))
+        return whole
+
+    def of(self, volume: Tensor) -> Tensor:
+        """The part of a volume that lies in the box."""
+        for axis, (start, stop, size) in enumerate(zip(self.starts, self.stops, self.size, strict=True)):
+            volume = volume.narrow(axis, max(0, start), min(stop, size) - max(0, start))
+        return volume
+
+    def plane(self, array: Tensor, axis: int, index: int) -> Tensor | None:
+        """A plane of the volume, or the one beyond its edge, in a flat array that starts at the box's second layer."""
+        whole = array.view(-1, *self.shape[1:])
+        at = index - self.starts[axis] - (axis == 0)
+        return whole.select(axis, at) if 0 <= at < whole.shape[axis] else None
+
+    def scale_edges(self, sums: Tensor) -> Tensor:
+        """To 27 times the mean where a sum has fewer voxels."""
+        for axis, size in enumerate(self.size):
+            for index in {0, size - 1}:
+                plane = self.plane(sums, axis, index)
+                if plane is not None:
+                    plane.mul_(3 / min(size, 2))
+        return sums
+
+    def end_differences(self, array: Tensor, axis: int) -> Tensor:
+        """Make those that lead beyond the edges zero."""
+        for index in (-1, self.size[axis] - 1):
+            plane = self.plane(array, axis, index)
+            if plane is not None:
+                plane.zero_()
+        return array
+
+
+def _add(box: _Box, volume: Tensor, gradient: Tensor, *, discount: float, certain: float, smoothing: float) -> Tensor:
+    """The cost of the box's layers but the first and the last two; its gradient is added to that of the volume."""
+    layer = box.shifts[0]
+    here = volume.new_zeros(math.prod(box.shape))
+    box.inside(here).copy_(box.of(volume))
+    means = box.scale_edges(_sums(here, box))  # 27 times the means, from the second layer to the last but one
+    count = means.numel() - layer
+    slopes, steps = (
+        [box.end_differences(_difference(array, shift, count), axis) for axis, shift in enumerate(box.shifts)]
+        for array in (here[layer:], means)
+    )
+    steepness, squared = (_squares(vectors, floor) for vectors, floor in ((steps, 27 * certain), (slopes, smoothing)))
+    along = slopes[0] * steps[0]
+    for slope, step in zip(slopes[1:], steps[1:], strict=True):
+        along.addcmul_(slope, step)
+    share = torch.div(along, steepness, out=steepness)
+    magnitude = squared.addcmul_(along, share, value=-discount).clamp_(min=smoothing**2).sqrt_()
+    inverse = magnitude.reciprocal()
+    cost = magnitude.sub_(smoothing).sum()
+    turning = torch.mul(share, inverse, out=along).mul_(discount)
+    bending = share.mul_(turning)
+    found, padded = torch.zeros_like(here), here.new_zeros(len(means) + 4 * layer)
+    of_means = padded[2 * layer : -2 * layer]
+    for shift, slope, step in zip(box.shifts, slopes, steps, strict=True):
+        flow = torch.mul(slope, inverse, out=magnitude).addcmul_(step, turning, value=-1)
+        _add_adjoint(found[layer:], flow, shift)
+        _add_adjoint(of_means, step.mul_(bending).addcmul_(slope, turning, value=-1), shift)
+    box.scale_edges(of_means)
+    box.of(gradient).add_(box.inside(found.add_(_sums(padded, box))))
+    return cost
+
+
+def _sums(array: Tensor, box: _Box) -> Tensor:
+    """Of each voxel of a flat array and its 26 neighbours, without the first and last layer; its own adjoint."""
+    for shift in box.shifts[:0:-1]:
+        found = torch.empty_like(array)
+        found[:shift] = array[:shift]
+        torch.add(array[shift:], array[:-shift], out=found[shift:])
+        found[:-shift].add_(array[shift:])
+        array = found
+    layer = box.shifts[0]
+    return (array[: -2 * layer] + array[layer:-layer]).add_(array[2 * layer :])
+
+
+def _difference(array: Tensor, shift: int, count: int) -> Tensor:
+    """To the voxel a shift further, of the first so many."""
+    return array[shift : shift + count] - array[:count]
+
+
+def _squares(vectors: list[Tensor], floor: float) -> Tensor:
+    found = torch.addcmul(vectors[0].new_tensor(floor**2), vectors[0], vectors[0])
+    for each in vectors[1:]:
+        found.addcmul_(each, each)
+    return found
+
+
+def _add_adjoint(found: Tensor, flow: Tensor, shift: int) -> None:
+    """Add the adjoint of `_difference`."""
+    found[: len(flow)].sub_(flow)
+    found[shift : shift + len(flow)].add_(flow)
+
+
+REGULARISER = DirectionalVariation

@@ -1,0 +1,64 @@
+"""Whether each image continues those beside it: single tilts that do not, and places where the series breaks in two."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.verdict.coarse import Coarse
+from recon.verdict.residuals import neighbours
+from recon.verdict.verdict import Finding
+
+Array = NDArray[Any]
+_LONE, _LONE_SHARE, _BESIDE = 6.0, 0.3, 11  # usual deviations, good 4.1; of the structure; tilts beside it
+_BREAK, _BREAK_SCORE, _AROUND = (
+    0.5,
+    4.0,
+    9,
+)  # of what neighbours share elsewhere, good series 0.58; standard errors; pairs
+_WIDE = 1.5  # median steps: images so far apart need not be alike
+
+
+def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
+    """Single tilts that their neighbours predict far worse than the tilts beside them; those at the ends have few neighbours."""
+    images, left = coarse.images[coarse.order], errors[coarse.order]
+    if images.shape[1] < 2 or len(images) < 2 * _BESIDE:
+        return {}, []
+    structure = float(np.median([neighbours(image[None] - image.mean(), 1) for image in images]))
+    shared = np.array([neighbours(each[None], 1) for each in left])
+    beyond = shared - ndimage.median_filter(shared, _BESIDE, mode="nearest")
+    usual = 1.4826 * float(np.median(np.abs(beyond)))
+    far = (beyond > _LONE * usual) & (beyond > _LONE_SHARE * structure)
+    far[:2] = far[-2:] = False
+    evidence = {"lone tilts": int(far.sum())}
+    if not far.any():
+        return evidence, []
+    named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[coarse.order][far][:5])
+    words = f"the image at {named} does not continue those beside it: it belongs to another tilt, or to another object"
+    strength = float(min(2.9, (beyond / max(usual, 1e-30))[far].max() / _LONE))
+    return evidence, [Finding("tilts", strength, words, "check its angle, or leave it out")]
+
+
+def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
+    """One place where neighbouring images, whose noise is independent, share far less than all other neighbours do."""
+    images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
+    steps = np.diff(angles)
+    if len(images) < 2 * _AROUND:
+        return {}, []
+    flat = images - images.mean((1, 2), keepdims=True)
+    power = (flat**2).mean((1, 2))
+    shared = (flat[1:] * flat[:-1]).mean((1, 2))
+    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
+    usual = ndimage.median_filter(shared, _AROUND, mode="nearest")
+    apart = (shared < _BREAK * usual) & (usual - shared > _BREAK_SCORE * chance) & (steps < _WIDE * np.median(steps))
+    evidence = {"breaks": int(apart.sum())}
+    if apart.sum() != 1:  # more are wrong angles, which other evidence names
+        return evidence, []
+    where = int(np.argmax(apart))
+    between = f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on"
+    words = f"the images {between} do not continue each other: the specimen changed"
+    advice = "reconstruct both parts apart, or check whether one of them was turned over"
+    return evidence, [Finding("specimen", 2.9, words, advice, "seen")]

@@ -1,0 +1,29 @@
+"""The expected time follows the steps, the slices, and the voxels that are not skipped."""
+
+import numpy as np
+import pytest
+
+from recon.joint.plan import Facts, plan
+from recon.scale import cost
+from recon.series.tilt_series import VolumeGrid
+from recon.simulate.phantoms import shells
+from recon.simulate.simulation import clean_tilt_series
+
+
+@pytest.fixture(scope="module")
+def series():
+    return clean_tilt_series(shells(16, generator=np.random.default_rng(0)), np.array([-30.0, 0.0, 30.0]))[0]
+
+
+def test_vacuum_and_half_resolution_take_less_time(series, monkeypatch):
+    monkeypatch.setattr(cost, "_seconds_of_a_slice", lambda *_: 1.0)
+
+    def expected(share, **facts):
+        stages = plan(Facts(settled=True, **facts))
+        return cost.expected_seconds(stages, series, VolumeGrid.of(series), 8, share)
+
+    whole, empty, halved = expected(1.0), expected(0.0), expected(1.0, can_halve=True)
+    steps = 150 * 16  # slices
+    assert whole == pytest.approx(1.5 * steps, rel=0.01)
+    assert empty == pytest.approx(0.6 * steps, rel=0.01)
+    assert halved == pytest.approx((76 + 74 / 8) / 150 * whole, rel=0.01)
