@@ -72,14 +72,18 @@ def middle_rows(height: int) -> slice:
 def seams(found: Array, truth: Array, slices_at_once: int | None) -> dict[str, Any]:
     """How much a volume jumps across the borders of its blocks, relative to neighbouring slices inside; and the truth there.
 
-    Each is the ratio of mean absolute differences that is largest over the borders; None where there is no border.
+    Returns:
+        Blocks, the ratios of mean absolute differences that are largest over the borders (None where there is no border), and
+        of every border its place with the difference there and the usual one beside it, of volume and of truth.
     """
-    borders = _borders(found.shape[1], slices_at_once)
-    ratios = [[_ratio(array, border) for border in borders] for array in (found, truth)]
+    jumps = [
+        (border, _jump(found, border), _jump(truth, border)) for border in _borders(found.shape[1], slices_at_once)
+    ]
     return {
-        "blocks": 1 + len(borders),
-        "seam": max(ratios[0], default=None),
-        "seam of the truth": max(ratios[1], default=None),
+        "blocks": 1 + len(jumps),
+        "seam": max((_ratio(jump) for _, jump, _ in jumps), default=None),
+        "seam of the truth": max((_ratio(jump) for *_, jump in jumps), default=None),
+        "jumps": [[border, *jump, *beside] for border, jump, beside in jumps],
     }
 
 
@@ -87,7 +91,7 @@ def seams_beside(found: Array, other: Array, slices_at_once: int) -> float:
     """How much more a volume jumps across the borders of its blocks than another of the same series jumps there that has no
     border so near: the largest quotient of the two ratios of `seams`; one where blocks leave no trace."""
     borders = _borders(found.shape[1], slices_at_once)
-    return max(_ratio(found, border) / _ratio(other, border) for border in borders)
+    return max(_ratio(_jump(found, border)) / _ratio(_jump(other, border)) for border in borders)
 
 
 def _borders(height: int, slices_at_once: int | None) -> list[int]:
@@ -95,10 +99,16 @@ def _borders(height: int, slices_at_once: int | None) -> list[int]:
     return [part.rows.start - 1 for part in parts[1:]]
 
 
-def _ratio(array: Array, border: int) -> float:
+def _jump(array: Array, border: int) -> tuple[float, float]:
+    """Mean absolute difference of the two slices at a border, and the median of those of the slices near it."""
     first, stop = max(0, border - _NEAR), min(array.shape[1], border + _NEAR + 2)
     total = np.zeros(stop - first - 1)
     for section in array[:, first:stop]:  # section by section: a slab of a large volume lies all over the file
         total += np.abs(np.diff(section, axis=0)).mean(1)
-    inside = float(np.median(np.delete(total, border - first)))
-    return float(total[border - first]) / inside if inside else 1.0  # vacuum on either side jumps nowhere
+    total /= len(array)
+    return float(total[border - first]), float(np.median(np.delete(total, border - first)))
+
+
+def _ratio(jump: tuple[float, float]) -> float:
+    at, inside = jump
+    return at / inside if inside else 1.0  # vacuum on either side jumps nowhere
