@@ -22,11 +22,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import scale_page
 import torch
 from scale_measure import mapped, middle_rows, psnr, run, seams, seams_beside
 
 from noiseflow.commands.console import Output
+from recon.benchmarks.external import astra_sirt
 from recon.benchmarks.scenes import Results
 from recon.benchmarks.search import best_fit
 from recon.fields.regularisers._names import DEFAULT
@@ -37,6 +39,7 @@ from recon.series.tilt_series import VolumeGrid, read_tilt_series
 from recon.simulate.simulation import ACQUISITIONS
 
 RESULTS = Path(__file__).parent / "results" / "scale.json"
+_ASTRA = 8  # slices: each costs as much as another
 TILTS = "-59.5:57.5:1.5"  # 79
 Cell = dict[str, Any]
 
@@ -51,6 +54,7 @@ class Row:
         threads: of the process; None takes those of ``--threads``.
         beside: options of a second reconstruction, whose borders of blocks lie elsewhere: its jumps are those without a border.
         oracle: whether, in place of the command, a fit that knows the true noise is searched for its best weight.
+        astra: whether, in place of the command, ASTRA's SIRT reconstructs a few slices; every slice costs it the same.
     """
 
     phantom: str
@@ -59,6 +63,7 @@ class Row:
     threads: int | None = None
     beside: tuple[str, ...] | None = None
     oracle: bool = False
+    astra: bool = False
 
 
 ROWS = {
@@ -80,6 +85,7 @@ LARGE = {
     "borders-slab-256": Row("slab", 256, ("--slices-at-once", "64"), beside=("--slices-at-once", "256")),
     "borders-slab-512": Row("slab", 512, beside=("--slices-at-once", "48")),
     "oracle-512": Row("shells", 512, oracle=True),
+    "astra-512": Row("shells", 512, astra=True),
     "processes-1": Row("shells", 256, ("--slices-at-once", "64"), threads=2),
     "processes-2": Row("shells", 256, ("--slices-at-once", "64", "--workers", "2")),
 }
@@ -142,6 +148,8 @@ def measure(row: Row, folder: Path, threads: int) -> Cell:
     about = {"phantom": row.phantom, "size": row.size, "options": list(row.options), "threads": threads}
     if row.oracle:
         return about | of_oracle(folder, truth, threads)
+    if row.astra:
+        return about | of_astra(folder, truth)
     with tempfile.TemporaryDirectory(prefix="volume-", dir=folder) as scratch:
         out = Path(scratch) / "volume.mrc"
         figures, said = run("reconstruct", folder / "tilts.mrc", "-o", out, *row.options, threads=threads)
@@ -174,6 +182,20 @@ def of_oracle(folder: Path, truth: Any, threads: int) -> Cell:
     oracle = JointReconstructor(noise_model=ACQUISITIONS["clipped"].noise)
     found = best_fit(series.rows(wide), grid, oracle, lambda volume: psnr(volume, part, rows=inner))
     return {"psnr of the middle": max(found.tried.values()), "setting": found.setting, "tried": found.tried}
+
+
+def of_astra(folder: Path, truth: Any) -> Cell:
+    """ASTRA's SIRT of slices in the middle, at the number of iterations that the truth likes best."""
+    series = read_tilt_series(folder / "tilts.mrc", mapped=True)
+    middle = truth.shape[1] // 2
+    rows = slice(middle - _ASTRA // 2, middle + _ASTRA // 2)
+    grid = replace(VolumeGrid.of(series), height=_ASTRA)
+    best: Cell = {"psnr of the slices": -np.inf}
+    for label, seconds, volume in astra_sirt(series.rows(rows), grid, (4, 8, 16, 32)):
+        found = psnr(volume, truth[:, rows])
+        if found > best["psnr of the slices"]:
+            best = {"psnr of the slices": found, "setting": label, "slices": _ASTRA, "seconds of the slices": seconds}
+    return best
 
 
 if __name__ == "__main__":

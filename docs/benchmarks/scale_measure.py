@@ -72,18 +72,27 @@ def middle_rows(height: int) -> slice:
 def seams(found: Array, truth: Array, slices_at_once: int | None) -> dict[str, Any]:
     """How much a volume jumps across the borders of its blocks, relative to neighbouring slices inside; and the truth there.
 
+    Where the truth is empty on both sides, neighbouring slices differ by rounding, and a ratio to that says nothing: such borders
+    are compared with neighbouring slices of the specimen.
+
     Returns:
-        Blocks, the ratios of mean absolute differences that are largest over the borders (None where there is no border), and
-        of every border its place with the difference there and the usual one beside it, of volume and of truth.
+        Blocks; the ratios of mean absolute differences that are largest over the borders within the specimen (None where there
+        is no border); the largest difference at a border in vacuum, over the median of neighbouring slices at the others (None
+        where there is no such border); and of every border its place with the difference there and the usual one beside it, of
+        volume and of truth.
     """
-    jumps = [
-        (border, _jump(found, border), _jump(truth, border)) for border in _borders(found.shape[1], slices_at_once)
-    ]
+    borders = _borders(found.shape[1], slices_at_once)
+    jumps = [(border, *_jump(found, border), *_jump(truth, border)) for border in borders]
+    inside = [jump for jump in jumps if any(jump[3:])]
+    vacuum = [at for _, at, _, *true in jumps if not any(true)]
+    none = 1.0 if borders else None  # a series of vacuum alone jumps nowhere
+    usual = float(np.median([beside for _, _, beside, *_ in inside])) if inside else 0.0
     return {
-        "blocks": 1 + len(jumps),
-        "seam": max((_ratio(jump) for _, jump, _ in jumps), default=None),
-        "seam of the truth": max((_ratio(jump) for *_, jump in jumps), default=None),
-        "jumps": [[border, *jump, *beside] for border, jump, beside in jumps],
+        "blocks": 1 + len(borders),
+        "seam": max((_ratio(at, beside) for _, at, beside, *_ in inside), default=none),
+        "seam of the truth": max((_ratio(*true) for _, _, _, *true in inside), default=none),
+        "seam in vacuum": max(vacuum) / usual if vacuum and usual else None,
+        "jumps": [list(jump) for jump in jumps],
     }
 
 
@@ -91,7 +100,7 @@ def seams_beside(found: Array, other: Array, slices_at_once: int) -> float:
     """How much more a volume jumps across the borders of its blocks than another of the same series jumps there that has no
     border so near: the largest quotient of the two ratios of `seams`; one where blocks leave no trace."""
     borders = _borders(found.shape[1], slices_at_once)
-    return max(_ratio(_jump(found, border)) / _ratio(_jump(other, border)) for border in borders)
+    return max(_ratio(*_jump(found, border)) / _ratio(*_jump(other, border)) for border in borders)
 
 
 def _borders(height: int, slices_at_once: int | None) -> list[int]:
@@ -109,6 +118,5 @@ def _jump(array: Array, border: int) -> tuple[float, float]:
     return float(total[border - first]), float(np.median(np.delete(total, border - first)))
 
 
-def _ratio(jump: tuple[float, float]) -> float:
-    at, inside = jump
-    return at / inside if inside else 1.0  # vacuum on either side jumps nowhere
+def _ratio(at: float, beside: float) -> float:
+    return at / beside if beside else 1.0

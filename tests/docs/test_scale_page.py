@@ -29,6 +29,14 @@ def test_a_seam_is_the_jump_across_a_border() -> None:
     assert psnr(found, truth, rows=slice(0, 20)) > 35
     assert middle_rows(512) == slice(224, 288)
     assert middle_rows(40) == slice(0, 40)
+    assert said["seam in vacuum"] is None
+    half = truth.copy()
+    half[:, 32:] = 0
+    beyond = half.copy()
+    beyond[:, blocks(64, 20, HALO)[3].rows.start :] = 1e-3
+    said = seams(beyond, half, 20)
+    assert said["seam"] == said["seam of the truth"], "a border in vacuum has no neighbours to be compared with"
+    assert said["seam in vacuum"] == pytest.approx(3e-3, rel=0.1)
     empty = np.zeros_like(truth)
     assert seams(empty, empty, 20)["seam"] == 1
     assert seams(found, truth, None)["seam"] is None
