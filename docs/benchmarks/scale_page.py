@@ -57,9 +57,8 @@ def page(content: Cell) -> str:
         "`python docs/benchmarks/scale.py run` measures the rows. Peak memory is the largest resident set that the operating "
         "system saw, pages of mapped files included. *FSC 0.5* is the frequency, in cycles per voxel, at which the "
         "shell correlation with the truth falls to one half. *Seam* is how much the volume jumps across the border of two "
-        "blocks, over neighbouring slices inside, at the border within the specimen where that is largest; beside it, the same of "
-        "the truth. *Load* "
-        "is the number of processes that waited for a core when the row began: where it is high, only processor time compares.",
+        "blocks, over neighbouring slices inside, at the border within the specimen where that is largest; beside it, the same "
+        "of the truth. *Load* is the number of processes that waited for a core when the row began: where it is high, only processor time compares.",
         _table(rows),
         _growth(rows),
         _vacuum(rows),
@@ -203,8 +202,8 @@ def _astra(rows: dict[str, Cell]) -> str:
     return (
         f"ASTRA's SIRT on the processor, which goes slice by slice with one thread, took {part:.0f} s for {slices} slices in the "
         f"middle of 512³ at the number of iterations that suits the truth best ({row['setting']}, "
-        f"{row['psnr of the slices']:.2f} dB there): {part * row['size'] / slices:.0f} s for all {row['size']}, where `sirt-512`, "
-        f"with two threads and its number of iterations found by itself, took {ours['seconds']:.0f} s."
+        f"{row['psnr of the slices']:.2f} dB there): {part * row['size'] / slices:.0f} s for all {row['size']}, where "
+        f"`sirt-512`, with two threads and its number of iterations found by itself, took {ours['seconds']:.0f} s."
     )
 
 
