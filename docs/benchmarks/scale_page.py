@@ -58,7 +58,8 @@ def page(content: Cell) -> str:
         "system saw, pages of mapped files included. *FSC 0.5* is the frequency, in cycles per voxel, at which the "
         "shell correlation with the truth falls to one half. *Seam* is how much the volume jumps across the border of two "
         "blocks, over neighbouring slices inside, at the border within the specimen where that is largest; beside it, the same "
-        "of the truth. *Load* is the number of processes that waited for a core when the row began: where it is high, only processor time compares.",
+        "of the truth. *Load* is "
+        "the number of processes that waited for a core when the row began: where it is high, only processor time compares.",
         _table(rows),
         _growth(rows),
         _vacuum(rows),
