@@ -1,8 +1,9 @@
 """Accuracy and time of the alignment, on simulated raw series and the raw needle.
 
-Run as python docs/benchmarks/alignment.py [--data FOLDER].
+    python docs/benchmarks/alignment.py run [--data FOLDER]    # rows not yet kept; FOLDER holds tilt_needle_256
+    python docs/benchmarks/alignment.py page                   # tables and picture of alignment.md from the results
 
-Writes the table of docs/benchmarks/alignment.md. Times are processor seconds of one thread.
+Times are processor seconds of one thread.
 """
 
 from __future__ import annotations
@@ -11,24 +12,35 @@ import argparse
 import math
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import dots
 import numpy as np
 import torch
+from joint_page import table
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 
+from recon.benchmarks.provenance import measured_on
+from recon.benchmarks.scenes import Results
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import AxisUndetermined, find_alignment
 from recon.series.tilt_series import TiltSeries, read_tilt_series
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
-PAGE = Path(__file__).with_suffix(".md")
+HERE = Path(__file__).parent
+PAGE = HERE / "alignment.md"
+HINTS = "no hint", "`--tilt-axis 90`", "its log"
 START, END = "<!-- table -->", "<!-- end of table -->"
 ANGLES = np.arange(-70, 71, 3.0)
 Array = NDArray[np.float64]
+Row = dict[str, Any]
+Scene = tuple[str, int, float, str, float]
 
 
 @dataclass(frozen=True)
@@ -73,76 +85,115 @@ def errors(raw: Raw, found: Alignment) -> tuple[float, float, float]:
     return float(turn), float(along.std()), float(np.sqrt(np.mean(across**2)))
 
 
-def timed(series: TiltSeries, **options: float | None) -> tuple[Alignment | AxisUndetermined, float]:
+def timed(series: TiltSeries, tilt_axis: float | None = None) -> tuple[Alignment | AxisUndetermined, float]:
     """The alignment, or the refusal, and the processor seconds it took."""
     started = time.process_time()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return find_alignment(series, **options), time.process_time() - started
+            return find_alignment(series, tilt_axis=tilt_axis), time.process_time() - started
     except AxisUndetermined as refusal:
         return refusal, time.process_time() - started
 
 
-def simulated(line: list[str], *, quick: bool) -> None:
-    """A row for each scene."""
-    line += [
-        "| scene | size | noise | angles | axis error (°) | along (pixels rms) | across (pixels rms) | margin | CPU seconds |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    scenes = [("shells", 64, 33.0), ("filaments", 64, -75.0), ("particles", 64, 118.0), ("slab", 64, 33.0)]
-    for phantom, size, axis in scenes if quick else [*scenes, ("shells", 128, 10.0), ("particles", 256, -41.0)]:
+def scenes() -> Iterator[tuple[str, Scene]]:
+    """Name, and phantom, size, axis (degrees), noise and error of the angles of every simulated series."""
+    turned = [("shells", 64, 33.0), ("filaments", 64, -75.0), ("particles", 64, 118.0), ("slab", 64, 33.0)]
+    for phantom, size, axis in [*turned, ("shells", 128, 10.0), ("particles", 256, -41.0)]:
         for noise in ("low-dose", "clipped"):
             for angle_error in (0.0, 0.05):
-                raw = raw_series(phantom, size, axis, noise=noise, angle_error=angle_error, seed=1)
-                found, seconds = timed(raw.series)
-                start = f"| {phantom} | {size} | {noise} | {'true' if angle_error == 0 else f'{angle_error:.0%} off'} |"
-                if isinstance(found, AxisUndetermined):
-                    line.append(f"{start} asks for the axis | | | | {seconds:.0f} |")
-                else:
-                    turn, along, across = errors(raw, found)
-                    margin = "–" if found.margin is None else f"{found.margin:.0f}"
-                    line.append(f"{start} {turn:.2f} | {along:.2f} | {across:.2f} | {margin} | {seconds:.0f} |")
-                print(line[-1], flush=True)
+                angles = "true" if angle_error == 0 else f"{angle_error:.0%} off"
+                yield f"{phantom}, {size}², {noise}/{angles}", (phantom, size, axis, noise, angle_error)
 
 
-def needle(line: list[str], data: Path) -> None:
-    """The raw needle without a hint, with a rough one, and with the microscope's log."""
-    line += [
-        "",
-        "| raw needle, 77 × 256² | axis (°) | gaps explained | runner-up | margin | CPU seconds |",
-        "|---|---|---|---|---|---|",
-    ]
+def simulated(phantom: str, size: int, axis: float, noise: str, angle_error: float) -> Row:
+    """Errors and time of one simulated series; time alone where it asks for the axis."""
+    raw = raw_series(phantom, size, axis, noise=noise, angle_error=angle_error, seed=1)
+    found, seconds = timed(raw.series)
+    row: Row = {"seconds": seconds}
+    if isinstance(found, Alignment):
+        row |= dict(zip(("axis", "along", "across"), errors(raw, found), strict=True)) | {"margin": found.margin}
+    return row
+
+
+def needle(hint: str, data: Path) -> Row:
+    """The raw needle without a hint, with a rough one, or with the microscope's log."""
     logged = read_tilt_series(data / "tilt_needle_256" / "needle_256_raw.mrc", mode="linear")
-    unknown = replace(logged, tilt_axis=None)
-    for name, series, hint in (
-        ("no hint", unknown, None),
-        ("`--tilt-axis 90`", unknown, 90.0),
-        ("its log", logged, None),
-    ):
-        found, seconds = timed(series, tilt_axis=hint)
-        assert isinstance(found, Alignment)
-        rival, residual = found.evidence[1], found.evidence[0].residual
-        line.append(
-            f"| {name} | {found.tilt_axis:.2f} | {1 - residual:.2%} | {rival.axis:.1f}°: {1 - rival.residual:.2%} | "
-            f"{found.margin:.0f} | {seconds:.0f} |"
-        )
-        print(line[-1], flush=True)
+    series = logged if hint == "its log" else replace(logged, tilt_axis=None)
+    found, seconds = timed(series, tilt_axis=90.0 if hint == "`--tilt-axis 90`" else None)
+    assert isinstance(found, Alignment)
+    best, rival = found.evidence[:2]
+    return {
+        "axis": found.tilt_axis,
+        "explained": 1 - best.residual,
+        "runner-up": [rival.axis, 1 - rival.residual],
+        "margin": found.margin,
+        "seconds": seconds,
+    }
+
+
+def tables(content: dict[str, Any]) -> str:
+    """Picture, both tables, and where their figures come from."""
+    rows, cells = [], content["cells"]
+    for name, (phantom, size, _, noise, angle_error) in scenes():
+        if name not in cells:
+            continue
+        row, angles = cells[name], "true" if angle_error == 0 else f"{angle_error:.0%} off"
+        found = ["asks for the axis", "", "", ""]
+        if "axis" in row:
+            margin = "–" if row["margin"] is None else f"{row['margin']:.0f}"
+            found = [*(f"{row[key]:.2f}" for key in ("axis", "along", "across")), margin]
+        rows.append([phantom, f"{size}", noise, angles, *found, f"{row['seconds']:.0f}"])
+    shifts = ["along (pixels rms)", "across (pixels rms)"]
+    header = ["scene", "size", "noise", "angles", "axis error (°)", *shifts, "margin", "CPU seconds"]
+    real = [
+        [
+            hint,
+            f"{row['axis']:.2f}",
+            f"{row['explained']:.2%}",
+            f"{row['runner-up'][0]:.1f}°: {row['runner-up'][1]:.2%}",
+            f"{row['margin']:.0f}",
+            f"{row['seconds']:.0f}",
+        ]
+        for hint, row in ((hint, cells[f"needle/{hint}"]) for hint in HINTS if f"needle/{hint}" in cells)
+    ]
+    needle_header = ["raw needle, 77 × 256²", "axis (°)", "gaps explained", "runner-up", "margin", "CPU seconds"]
+    picture = "![Error of the shifts across the axis, scene by scene, with true angles and with angles 5 % off](alignment.png)"
+    return "\n\n".join([picture, table(header, rows), table(needle_header, real), measured_on([content])])
+
+
+def panel(cells: dict[str, Row]) -> dots.Panel:
+    """Errors across the axis, which are the larger ones, by the angles given."""
+    series: dict[str, dict[str, float]] = {}
+    for name, row in cells.items():
+        if "across" in row:
+            scene, angles = name.split("/")
+            series.setdefault(f"angles {angles}", {})[scene] = row["across"]
+    return "Shifts across the axis", "error (pixels rms)", series
 
 
 def main() -> None:
-    """Measure and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Measure what is not kept yet, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("run", "page"))
     parser.add_argument("--data", type=Path, help="folder with tilt_needle_256; without it, only simulated series")
-    parser.add_argument("--quick", action="store_true", help="64 pixels only")
+    parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "alignment.json", help="JSON file")
     given = parser.parse_args()
+    results = Results(given.out, "alignment")
+    if given.part == "page":
+        before, rest = PAGE.read_text(encoding="utf-8").split(START)
+        text = "\n\n".join([before + START, tables(results.content), END + rest.split(END)[1]])
+        dots.save(PAGE.with_suffix(".png"), [panel(results.cells)], columns=1)
+        PAGE.write_text(text, encoding="utf-8")
+        return
     torch.set_num_threads(1)
-    line: list[str] = []
-    simulated(line, quick=given.quick)
-    if given.data is not None:
-        needle(line, given.data)
-    before, rest = PAGE.read_text(encoding="utf-8").split(START)
-    PAGE.write_text(f"{before}{START}\n\n" + "\n".join(line) + f"\n\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    if given.again:
+        results.forget("")
+    for name, scene in scenes():
+        print(name, results.cell(name, partial(simulated, *scene)), flush=True)
+    for hint in HINTS if given.data is not None else ():
+        print(hint, results.cell(f"needle/{hint}", partial(needle, hint, given.data)), flush=True)
 
 
 if __name__ == "__main__":

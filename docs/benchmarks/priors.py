@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import dots
 import torch
 from joint_accuracy import NOISES, true_noise
 from prior_candidates import CANDIDATES
@@ -104,6 +105,7 @@ def page(cells: dict[str, Row]) -> str:
     """The page as Markdown."""
     runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
     lines = [_HEAD, "", "Computed " + ", ".join(f"{date} at commit {commit}" for date, commit in runs) + ".", ""]
+    lines += ["![Gain of two regularisers over total variation, scene by scene](priors.png)", ""]
     for part, words in (
         ("oracle", "True noise, best of four weights"),
         ("earlier", "The same, with the fit as it was at commits 72700d1 and 2e37b89"),
@@ -131,6 +133,19 @@ def page(cells: dict[str, Row]) -> str:
         lines += [f"| worse by more than {_WORSE} dB | {' | '.join(worse)} |", ""]
         lines += _chosen(scenes) if part == "joint" else []
     return "\n".join([*lines, _WHY, ""])
+
+
+def panel(cells: dict[str, Row]) -> dots.Panel:
+    """Gains over total variation with noise and weight as the fit chooses them, the largest first."""
+    gains: dict[str, dict[str, float]] = {"directional": {}, "second-order": {}}
+    for key, row in cells.items():
+        kind, where, name = key.split("/", 2)
+        if kind == "joint" and name in gains:
+            gains[name][where] = row["volume"] - cells[f"joint/{where}/total-variation"]["volume"]
+    ranked = {
+        name: dict(sorted(found.items(), key=lambda item: item[1], reverse=True)) for name, found in gains.items()
+    }
+    return "Noise and weight as the fit chooses them", "gain over total variation (dB)", ranked
 
 
 def _text(found: dict[str, Row], name: str) -> str:
@@ -178,6 +193,7 @@ def main() -> None:
     if options.part == "page":
         with io.atomic_path(HERE / "priors.md") as partial:
             partial.write_text(page(results.cells), encoding="utf-8")
+        dots.save(HERE / "priors.png", [panel(results.cells)], columns=1)
         return
     compute = {"oracle": oracle, "joint": joint}[options.part]
     for noise in options.noise or NOISES:

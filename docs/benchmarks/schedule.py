@@ -18,6 +18,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import dots
 import torch
 from joint_accuracy import NOISES, PHANTOMS
 from joint_page import table
@@ -105,6 +106,7 @@ def page(content: dict[str, Any]) -> str:
         )
     header = ["number", "is", "changed to", "mean gain (dB)", "range (dB)"]
     header += [f"needle, {noise} (dB)" for noise in needle.NOISES] + ["time", "scenes"]
+    picture = "![Mean gain of the volume when a number of the plan is made smaller or larger](schedule.png)"
     head = (
         "# What each number of the plan earns\n\nA joint fit is a list of stages (`noiseflow reconstruct --dry-run` prints it); "
         "`recon.joint.plan.Schedule` holds its numbers of steps and learning rates. Each row changes one of them. Gains are in "
@@ -114,7 +116,22 @@ def page(content: dict[str, Any]) -> str:
         "also taught the noise model on the whole volume, which was given up since ({doc}`../architecture`).\n\n"
         "```sh\npython docs/benchmarks/schedule.py run\n```"
     )
-    return "\n\n".join([head, measured_on([content]), table(header, rows)]) + "\n"
+    return "\n\n".join([head, picture, measured_on([content]), table(header, rows)]) + "\n"
+
+
+def panel(cells: dict[str, Any]) -> dots.Panel:
+    """Mean gain of the simulated scenes, by number and by the way it is changed."""
+    series: dict[str, dict[str, float]] = {"smaller": {}, "larger": {}}
+    usual = Schedule()
+    for number, changed, _ in variants():
+        gains = [
+            row["psnr"] - cells[f"{name}/as planned/"]["psnr"]
+            for name in names()
+            if not name.startswith("needle") and (row := cells.get(f"{name}/{number}/{changed}"))
+        ]
+        if number != "as planned" and gains:
+            series["smaller" if float(changed) < getattr(usual, number) else "larger"][number] = statistics.mean(gains)
+    return "Numbers of the plan, changed one at a time", "mean gain of the volume (dB)", series
 
 
 def main() -> None:
@@ -131,6 +148,7 @@ def main() -> None:
     if options.part == "page":
         with atomic_path(HERE / "schedule.md") as partial:
             partial.write_text(page(results.content), encoding="utf-8")
+        dots.save(HERE / "schedule.png", [panel(results.content["cells"])], columns=1)
         return
     for name in options.scene or names():
         for number, changed, schedule in variants():
