@@ -49,7 +49,6 @@ _SLAB, _SLAB_VOXELS = (
 )  # slices; more where they are small: so many voxels tell weights apart as well as more do
 _QUIET_SLAB = 12  # of 256²: they choose 6.8 for the raw needle, 24 choose 5.7, which is 0.0001 nats likelier to them
 _QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
-_WIDE = 256  # voxels, where steps are as many as at 96
 _WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
 
 
@@ -159,7 +158,7 @@ class JointReconstructor:
         whole = self._model(settled.start, tilt_series, grid, rows=rows, settled=settled, projector=projector)
         # copies, so that a block cannot change what the next one begins with
         models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
-        facts = replace(settled.facts, settled=True, can_halve=settled.facts.can_halve and self._can_halve(whole))
+        facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series, share=_HELD_OUT, place=(rows, settled.start.height))
         run = self._run(facts, {"whole": task}, models, [], progress)
         run.weight_choice = settled.weight_choice
@@ -260,8 +259,7 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
-            wide=whole.field.width > _WIDE,
-            can_halve=self._can_halve(whole) and not (given is not None and needs_image(given)),
+            halvings=0 if given is not None and needs_image(given) else self._halvings(whole),
         )
         return facts, rows, given
 
@@ -338,8 +336,8 @@ class JointReconstructor:
         held_out = block_mask(shape, share=share, rows=whole_rows, generator=generator).to(self.device)
         return Task(model, observation, use, held_out)
 
-    def _can_halve(self, model: TomographySignal) -> bool:
-        return self.coarse_to_fine and HalfResolution.possible(model)
+    def _halvings(self, model: TomographySignal) -> int:
+        return HalfResolution.times(model) if self.coarse_to_fine else 0
 
     def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
         """Of the slab: a few cannot tell weights apart where each has few pixels, and gaps of tilts need twice as many voxels.

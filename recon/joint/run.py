@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -113,11 +114,10 @@ class Runner:
     def _signal(self, stage: FitStage, task: Task) -> None:
         if stage.afresh:
             task.restart()
-        if not stage.half:
+        with ExitStack() as stack:
+            for _ in range(stage.halvings):
+                task = stack.enter_context(task.halved())
             self.result = self._fit_signal(stage, task, stage.name)
-            return
-        with task.halved() as half:
-            self.result = self._fit_signal(stage, half, stage.name)
 
     def _noise(self, stage: FitStage, task: Task) -> None:
         model = self.models[stage.noise]

@@ -39,7 +39,7 @@ def expected_seconds(
             total += stage.num_steps * stage.fits * _NOISE_STEP
         else:
             slices = slab_height if stage.where == "slab" else grid.height
-            total += stage.num_steps * stage.fits * slices * slice_step / (8 if stage.half else 1)
+            total += stage.num_steps * stage.fits * slices * slice_step / 8**stage.halvings
     return total
 
 

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(autouse=True)
 def _small_lattices_too(monkeypatch):
-    monkeypatch.setattr(half_resolution, "_LEAST", 48)
+    monkeypatch.setattr(half_resolution, "_LEAST", (48, 1000))
 
 
 _ANGLES = np.arange(-60, 61, 8.0)
@@ -121,12 +121,30 @@ def test_the_full_resolution_begins_around_what_was_found():
 
 def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
     model = smooth_model(_SHAPES[0])
-    assert HalfResolution.possible(model)
-    small = smooth_model((24, 24, half_resolution._LEAST - 1))
+    assert HalfResolution.times(model) == 1
+    small = smooth_model((24, 24, half_resolution._LEAST[0] - 1))
     voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
     blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
     for other in (small, voxels, blurred):
-        assert not HalfResolution.possible(other)
+        assert HalfResolution.times(other) == 0
+
+
+def test_a_wide_volume_begins_at_a_quarter_of_the_resolution(monkeypatch):
+    shape = _SHAPES[0]
+    model = smooth_model(shape)
+    with torch.no_grad():
+        *_, coarsest, coarse, _ = model.field.grids
+        coarsest.copy_(functional.adaptive_avg_pool3d(coarse[None], coarsest.shape)[0])
+        coarse.zero_()
+    monkeypatch.setattr(half_resolution, "_LEAST", (shape[2], shape[2]))
+    assert HalfResolution.times(model) == 2
+    half = HalfResolution(model)
+    quarter = HalfResolution(half.signal_model)
+    seen = quarter.pixels(half.pixels(images_of(model)))
+    found = images_of(quarter.signal_model)
+    assert found.shape == seen.shape
+    assert float((found - seen).abs().mean()) < 0.05 * float(seen.max() - seen.min())
+    assert quarter.signal_model.field.grids[0] is model.field.grids[0], "what it learns, the whole has learnt"
 
 
 def slices(phantom, seed=0):

@@ -45,7 +45,7 @@ PLANS = {
         """,
     ),
     "everything chosen, large": (
-        Facts(can_halve=True),
+        Facts(halvings=1),
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
@@ -56,26 +56,27 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half resolution
+        whole  begin                        signal      37  simple, rate 0.6, half the resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "wide": (
-        Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True, wide=True),
+        Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=2),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, half resolution
-        whole  go on                        signal      74  chosen, rate 0.6, half resolution
+        whole  begin                        signal      74  simple, rate 0.6, a quarter of the resolution
+        whole  go on                        signal      222  chosen, rate 0.6, a quarter of the resolution
+        whole  go on at half                signal      148  chosen, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "noise known, weight given": (
-        Facts(choose_noise=False, learn_noise=False, choose_weight=False, can_halve=True),
+        Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half resolution
+        whole  begin                        signal      37  simple, rate 0.6, half the resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -102,7 +103,7 @@ PLANS = {
         """,
     ),
     "quiet": (
-        Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, can_halve=True),
+        Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, offset held
@@ -112,8 +113,8 @@ PLANS = {
         slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
         slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      60  simple, rate 0.6, offset held, half resolution
-        whole  go on                        signal      60  simple, rate 0.6, offset held, half resolution
+        whole  begin                        signal      60  simple, rate 0.6, offset held, half the resolution
+        whole  go on                        signal      60  simple, rate 0.6, offset held, half the resolution
         whole  fit                          signal      120  simple, rate 0.6, offset held
         whole  describe noise               noise       600  chosen
         """,

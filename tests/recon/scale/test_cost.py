@@ -22,7 +22,7 @@ def test_vacuum_and_half_resolution_take_less_time(series, monkeypatch):
         stages = plan(Facts(settled=True, **facts))
         return cost.expected_seconds(stages, series, VolumeGrid.of(series), 8, share)
 
-    whole, empty, halved = expected(1.0), expected(0.0), expected(1.0, can_halve=True)
+    whole, empty, halved = expected(1.0), expected(0.0), expected(1.0, halvings=1)
     steps = 150 * 16  # slices
     assert whole == pytest.approx(1.5 * steps, rel=0.01)
     assert empty == pytest.approx(0.6 * steps, rel=0.01)
