@@ -166,6 +166,7 @@ def measure(row: Row, folder: Path, threads: int) -> Cell:
         "seconds inside": said["seconds"],
         "choices": said["choices"],
         "verdict": said["verdict"]["grade"],
+        "reasons": said["verdict"]["reasons"],
     }
     return about | figures | judged | keep
 
