@@ -156,7 +156,9 @@ def measure(row: Row, folder: Path, threads: int) -> Cell:
         volume = mapped(out)
         if row.beside is not None:
             run("reconstruct", folder / "tilts.mrc", "-o", Path(scratch) / "beside.mrc", *row.beside, threads=threads)
-            figures["beside"] = seams_beside(volume, mapped(Path(scratch) / "beside.mrc"), said["slices_at_once"])
+            figures["beside"] = seams_beside(
+                volume, mapped(Path(scratch) / "beside.mrc"), truth, said["slices_at_once"]
+            )
             figures["psnr beside"] = psnr(mapped(Path(scratch) / "beside.mrc"), truth)
         judged = {"psnr": psnr(volume, truth), "psnr of the middle": psnr(volume, truth, rows=middle_rows(row.size))}
         judged |= {"fsc 0.5": resolution(*fourier_shell_correlation(volume, truth), 0.5)}

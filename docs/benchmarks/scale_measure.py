@@ -96,10 +96,10 @@ def seams(found: Array, truth: Array, slices_at_once: int | None) -> dict[str, A
     }
 
 
-def seams_beside(found: Array, other: Array, slices_at_once: int) -> float:
-    """How much more a volume jumps across the borders of its blocks than another of the same series jumps there that has no
-    border so near: the largest quotient of the two ratios of `seams`; one where blocks leave no trace."""
-    borders = _borders(found.shape[1], slices_at_once)
+def seams_beside(found: Array, other: Array, truth: Array, slices_at_once: int) -> float:
+    """How much more a volume jumps across the borders of its blocks within the specimen than another of the same series jumps
+    there that has no border so near: the largest quotient of the two ratios of `seams`; one where blocks leave no trace."""
+    borders = [border for border in _borders(found.shape[1], slices_at_once) if any(_jump(truth, border))]
     return max(_ratio(*_jump(found, border)) / _ratio(*_jump(other, border)) for border in borders)
 
 

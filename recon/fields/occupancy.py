@@ -68,9 +68,10 @@ class Occupancy(nn.Module):
         """The blocks of voxels that the data want occupied; arguments as of `retest`."""
         options: dict[str, Any] = {"ceil_mode": True, "divisor_override": 1}
         # slices are projected one by one: those of a block may be added up before
-        slabs = functional.avg_pool2d(gradient[None, None], (1, self.block), **options)[0, 0]
+        depth, width, height = (min(self.block, size) for size in self.mask.shape)  # a thin volume is one block deep
+        slabs = functional.avg_pool2d(gradient[None, None], (1, height), **options)[0, 0]
         lattice = projector.backproject(slabs).view(*self.mask.shape[:2], -1)
-        gain = -functional.avg_pool3d(lattice[None, None], (self.block, self.block, 1), **options)[0, 0]
+        gain = -functional.avg_pool3d(lattice[None, None], (depth, width, 1), **options)[0, 0]
         return gain > 6 * self.block**2 * cost
 
     @torch.no_grad()

@@ -18,13 +18,13 @@ def test_a_seam_is_the_jump_across_a_border() -> None:
     generator = np.random.default_rng(0)
     truth = generator.random((6, 64, 8), dtype=np.float32)
     found = truth + np.float32(0.01) * generator.standard_normal(truth.shape, dtype=np.float32)
-    assert seams_beside(found, truth, 20) == pytest.approx(1, abs=0.02)
+    assert seams_beside(found, truth, truth, 20) == pytest.approx(1, abs=0.02)
     found[:, blocks(64, 20, HALO)[2].rows.start :] += 5
     said = seams(found, truth, 20)
     assert said["blocks"] == 4
     assert said["seam"] > 10
     assert said["seam of the truth"] == pytest.approx(1, abs=0.3)
-    assert seams_beside(found, truth, 20) > 10
+    assert seams_beside(found, truth, truth, 20) > 10
     assert psnr(found, truth) == pytest.approx(compare(found, truth).psnr, rel=1e-5)
     assert psnr(found, truth, rows=slice(0, 20)) > 35
     assert middle_rows(512) == slice(224, 288)

@@ -137,6 +137,16 @@ def test_rows_of_an_occupancy_can_be_tested_again():
     assert part.share == 1
 
 
+@pytest.mark.parametrize("shape", [(2, 9, 12), (2, 1, 12), (3, 3, 3)])
+def test_a_volume_thinner_than_a_block_is_tested_again(shape):
+    depth, height, width = shape
+    projector = SliceProjector(tilt_angles=[0.0], depth=depth, width=width)
+    occupancy = Occupancy(torch.zeros(1, 1, 1), shape)
+    for _ in range(20):
+        occupancy.retest(-torch.ones(width, height), projector, 1e-6)
+    assert occupancy.share == 1
+
+
 def test_what_counts_as_something_is_a_fifth_of_the_scale():
     rough = torch.zeros(6, 6, 6)
     rough[1, 1, 1], rough[4, 4, 4] = 0.19, 0.21
