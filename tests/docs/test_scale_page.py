@@ -31,7 +31,7 @@ def test_a_seam_is_the_jump_across_a_border() -> None:
     assert middle_rows(40) == slice(0, 40)
     assert said["seam in vacuum"] is None
     half = truth.copy()
-    half[:, 32:] = 0
+    half[:, 40:] = 0
     beyond = half.copy()
     beyond[:, blocks(64, 20, HALO)[3].rows.start :] = 1e-3
     said = seams(beyond, half, 20)
