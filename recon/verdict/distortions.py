@@ -14,6 +14,7 @@ from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
 NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "brightness", "background")
+_TWIN, _FEWEST = 0.02, 3  # degrees within which tilts are one angle; tilts that a spread can be taken of
 _DEGREE = 5  # of the curves over the tilts: drifts and wrong angles are smooth, noise is not
 
 
@@ -22,7 +23,8 @@ class Distortion:
     """One kind of difference over all tilts.
 
     Attributes:
-        size: rms over the tilts beyond chance and beyond the mean; pixels at the image's edge, or a share of the contrast.
+        size: rms over the tilts within the range, beyond chance and beyond the mean; pixels at the image's edge, or a share of
+            the contrast.
         smooth: rms of its smooth part over the tilts, alike.
         rough: spread about its smooth part beyond chance, alike; a few tilts far out do not count.
         mean: over all tilts, alike.
@@ -46,7 +48,8 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
     """Regress each residual on what small changes of its image would do to it, with errors that hold under any noise.
 
     The errors are White's (doi:10.2307/1912934): noise need be neither Gaussian nor of one width. Fitted volumes take part of a
-    distortion into themselves, so what is found is a lower bound.
+    distortion into themselves, so what is found is a lower bound. The tilts at both ends of the range are measured and not
+    counted: there a regularised volume follows neighbours of one side alone, and its projection lags behind the image.
     """
     found = [_of_tilt(*pair) for pair in _fields(residuals)]
     estimates, errors = zip(*found, strict=True)
@@ -66,7 +69,8 @@ def _units(residuals: Residuals) -> tuple[float, ...]:
 def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
     """For each tilt in turn, the columns of the regression and what they shall explain."""
     width = residuals.images.shape[2]
-    across, along = np.arange(width, dtype=np.float64) - (width - 1) / 2, residuals.height[:, None].astype(np.float64)
+    across = np.arange(width, dtype=np.float64) - (width - 1) / 2
+    along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # about the middle of these slices
     by_angle = _slope_over_tilts(residuals)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
@@ -96,13 +100,17 @@ def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
     return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
 
 
-def _over_tilts(values: Array, errors: Array, residuals: Residuals) -> Distortion:
+def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distortion:
+    angles = residuals.tilt_angles
+    inner = (angles > angles.min() + _TWIN) & (angles < angles.max() - _TWIN)
+    if inner.sum() < _FEWEST:
+        inner[:] = True
+    angles, values, errors = angles[inner], measured[inner], errors[inner]
     weights = 1 / errors**2
     mean = float((weights * values).sum() / weights.sum())
     away = values - mean
     count = len(values)
     scatter = float(np.sqrt((away**2 * weights).sum() / max(1, count - 1)))
-    angles = residuals.tilt_angles
     place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-9) - 1
     basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
@@ -113,4 +121,4 @@ def _over_tilts(values: Array, errors: Array, residuals: Residuals) -> Distortio
     left = 1.4826 * float(np.median(np.abs(away - basis @ curve + mean)))
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(errors**2)))))
     size = float(np.sqrt(max(0.0, np.mean(away**2 - errors**2))))
-    return Distortion(size, smooth, rough, mean, scatter, trend, mean * float(np.sqrt(weights.sum())), values)
+    return Distortion(size, smooth, rough, mean, scatter, trend, mean * float(np.sqrt(weights.sum())), measured)

@@ -8,7 +8,6 @@ import numpy as np
 
 from recon.series.tilt_series import block_means
 from recon.verdict.distortions import Distortion
-from recon.verdict.gap_fit import Unexplained
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
@@ -23,18 +22,14 @@ _GONIOMETER = (
 )
 _TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.049
 _TURN_OFFSET = 2.3  # standard errors of the same: chance gives so many once in fifty; standard scenes reach 1.03
-_OFF_MIDDLE = (
-    0.12  # pixels, of all images alike: an eighth of a voxel blurs by less than interpolation between voxels does
-)
+_OFF_MIDDLE = 0.12  # pixels, of all images alike, that the volume did not follow; standard scenes reach 0.06
 _USUAL_EDGE, _BLURRED = 24.0, 0.5  # pixels from middle to edge that these hold for; what blurs images of any size
 _BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
 _BLOCK, _SMOOTH = 8, 0.65  # pixels; a moved or turned object leaves 0.6 at most, for residuals then lie at its edges
 _RESIDUAL = 0.06  # share of the structure that the volume leaves, beyond the contrast that its regulariser takes
 
 
-def image_findings(
-    residuals: Residuals, found: dict[str, Distortion], gap: Unexplained
-) -> tuple[dict[str, Any], list[Finding]]:
+def image_findings(residuals: Residuals, found: dict[str, Distortion]) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings of the residuals at full resolution."""
     (share, error), white = residuals.unexplained(), residuals.whiteness()
     edge = residuals.images.shape[2] / 2
@@ -107,7 +102,7 @@ def _shifts(found: dict[str, Distortion], edge: float) -> list[Finding]:
     where = max(strengths, key=lambda name: strengths[name])
     chosen = across if "across" in where else along
     size = max(chosen.size, chosen.smooth)
-    off = abs(across.mean) / _OFF_MIDDLE if abs(across.offset) > _OFFSET else 0.0
+    off = abs(across.mean) / _at_edge(_OFF_MIDDLE, edge) if abs(across.offset) > _OFFSET else 0.0
     if max(strengths[where], off) < 1:
         return []
     if off > strengths[where]:

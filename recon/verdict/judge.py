@@ -67,7 +67,7 @@ def judge(
     found = distortions(residuals)
     parts = [
         geometry_findings(geometry, gap, own, found),
-        image_findings(residuals, found, gap),
+        image_findings(residuals, found),
         tilt_findings(tilt_series, coarse, geometry, screening),
         pixel_findings(tilt_series, residuals),
         sharpness_findings(tilt_series, residuals),
