@@ -130,11 +130,13 @@ class FittedBlock:
         arrays = found.volume.attenuation, found.projections
         if not self.num_samples:
             return arrays
-        from recon.uncertainty.posterior import error_bars
+        from recon.uncertainty.posterior import Posterior
 
-        options: dict[str, Any] = {"seed": fit.seed, "run_stage": self.run_stage, "prefix": fit.prefix}
-        bars = error_bars(found, tilt_series, self.num_samples, place=(block.wide, block.height), **options)
-        return *arrays, bars.std.attenuation, bars.bias.attenuation
+        posterior = Posterior(found, tilt_series, self.num_samples, seed=fit.seed, block=block)
+        self.run_stage(f"{fit.prefix}error bars", posterior)
+        bars = posterior.result()
+        powers = posterior.sums.powers().table().astype(np.float32)
+        return *arrays, bars.std.attenuation, bars.bias.attenuation, powers
 
     def prefix_of(self, block: Block) -> str:
         """Of the names of a block's fits."""

@@ -22,6 +22,7 @@ from noiseflow.io.numpy_files import write as write_npy
 from noiseflow.kept_memory import hand_back
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.result import error_bar_paths
+from recon.uncertainty.shell_band import ShellPowers
 
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction
@@ -51,6 +52,18 @@ class Block:
     wide: slice
     height: int
 
+    def shares(self) -> Images:
+        """(y,) how much of each `wide` slice is this block's, neighbours having the rest: the squares of all add up to one."""
+        place, half = np.arange(self.wide.start, self.wide.stop) + 0.5, (self.rows.stop - self.rows.start) // 2
+        found = np.ones(len(place), dtype=np.float32)
+        for border, inward, halo in (
+            (self.rows.start, 1, self.rows.start - self.wide.start),
+            (self.rows.stop, -1, self.wide.stop - self.rows.stop),
+        ):
+            if width := min(halo, half):
+                found *= np.sin(np.pi / 4 * (1 + np.clip(inward * (place - border) / width, -1, 1)))
+        return found
+
 
 @dataclass(frozen=True)
 class Blockwise:
@@ -58,7 +71,7 @@ class Blockwise:
 
     Attributes:
         solve: from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
-            (tilt, y, u), and of standard deviation and bias where `num_samples` says so.
+            (tilt, y, u), and where `num_samples` says so of standard deviation and bias, and the table of `ShellPowers`.
         finish: makes the result of the whole volume and its projections.
         halo: slices that a block sees beyond its own.
         forget: called with every block that is kept, for what only an unfinished one wants.
@@ -97,7 +110,7 @@ class BlockFiles:
     @property
     def names(self) -> tuple[str, ...]:
         """What a block gives, one file each."""
-        return ("volume", "projections", "std", "bias") if self.error_bars else ("volume", "projections")
+        return ("volume", "projections", "std", "bias", "shells") if self.error_bars else ("volume", "projections")
 
     def finished(self, block: Block) -> bool:
         """Whether a block need not be computed again."""
@@ -112,6 +125,11 @@ class BlockFiles:
     def read(self, block: Block) -> list[Images]:
         """The same, mapped to memory."""
         return [np.load(self._path(name, block), mmap_mode="r") for name in self.names]
+
+    def powers(self, parts: list[Block]) -> ShellPowers:
+        """Of the whole volume and its samples, from those of all blocks."""
+        tables = (np.load(self._path("shells", part)).astype(np.float64) for part in parts)
+        return ShellPowers.of(np.sum(list(tables), axis=0))
 
     def _path(self, name: str, block: Block) -> Path:
         return self.folder / f"{name}-{block.wide.start:07d}-{block.wide.stop:07d}.npy"
@@ -145,7 +163,9 @@ def assemble(
     )
     fade = min([_FADE, *overlaps, min(part.rows.stop - part.rows.start for part in parts) // 2])
     for number, part in enumerate(parts):
-        for target, found in zip((volumes[0], projections, *volumes[1:]), files.read(part), strict=True):
+        for target, found in zip(
+            (volumes[0], projections, *volumes[1:]), files.read(part), strict=False
+        ):  # shells are left
             first = part.rows.start + (fade if number else 0)
             stop = part.rows.stop + (fade if number < len(parts) - 1 else 0)
             if number and fade:

@@ -56,7 +56,10 @@ def reconstruct_in_blocks(
             _on_cluster(client, method, tilt_series, parts, files)
         projections, (volume, *bars) = assemble(parts, files, tilt_series, grid, scratch)
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
-        return result if not bars else replace(result, uncertainty=Uncertainty(bars[0], bars[1], method.num_samples))
+        if not bars:
+            return result
+        error_bars = Uncertainty(bars[0], bars[1], method.num_samples, files.powers(parts).band())
+        return replace(result, uncertainty=error_bars)
 
 
 @contextmanager

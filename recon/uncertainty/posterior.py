@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from recon.uncertainty.energy import Energy
 from recon.uncertainty.moments import Moments
 from recon.uncertainty.result import Uncertainty
 from recon.uncertainty.shell_band import ShellSums
+
+if TYPE_CHECKING:
+    from recon.scale.blocks import Block
 
 _STEPS = 30  # between two samples
 _SETTLE = 120  # steps that lead from the most likely volume to a usual one
@@ -35,7 +38,7 @@ class Posterior:
         tilt_series: what it was made of, tilts in the same order.
         num_samples: how many.
         seed: of the fit and of the chain.
-        place: rows of a block among all, and how many these are: they say which pixels its fit left out.
+        block: the slices of these images among all of the volume: they say which pixels its fit left out.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
     Raises:
@@ -49,7 +52,7 @@ class Posterior:
         num_samples: int,
         *,
         seed: int = 0,
-        place: tuple[slice, int] | None = None,
+        block: Block | None = None,
         visit: Callable[[Tensor], None] | None = None,
     ) -> None:
         model, noise_model = outcome.signal_model, outcome.likelihood or outcome.noise_model
@@ -66,7 +69,7 @@ class Posterior:
         tilt_series = self.orientation.series(rising)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
         generator = torch.Generator().manual_seed(seed)
-        rows, height = (None, observation.shape[2]) if place is None else place
+        rows, height = (None, observation.shape[2]) if block is None else (block.wide, block.height)
         shape = (*observation.shape[:2], height)
         train = ~block_mask(shape, share=_SHARE, rows=rows, generator=generator).to(device)
         if tilt_series.mask is not None:
@@ -76,7 +79,8 @@ class Posterior:
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # blocks must not share their noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
-        self.sums = ShellSums(self.energy.volume(self.units)) if place is None else None  # a block is not the volume
+        shares = None if block is None else torch.from_numpy(block.shares())
+        self.sums = ShellSums(self._seen(), shares=shares, height=height)
 
     @torch.no_grad()
     def step(self) -> str:
@@ -91,10 +95,10 @@ class Posterior:
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the error bars diverged: a voxel is no longer finite; check the data's scale")
         self.done += 1
-        if self.sums is not None:
-            self.sums.add(self.energy.volume(self.units))
+        sample = self._seen()
+        self.sums.add(sample)
         if self.visit is not None:
-            self.visit(torch.from_numpy(self._volume(self.units)))
+            self.visit(sample)
         return f"sample {self.done}"
 
     def _move(self) -> None:
@@ -102,29 +106,30 @@ class Posterior:
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
         self.units.add_(noise, alpha=(2 * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
 
+    def _seen(self) -> Tensor:
+        """The chain's volume, (z, y, x), as the user sees it."""
+        return torch.from_numpy(self._volume(self.units))
+
     def _volume(self, units: Tensor) -> np.ndarray:
         return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
         """The chain where it is, and its moments so far."""
         chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
-        sums = None if self.sums is None else self.sums.state()
-        return chain | {"moments": self.moments.state(), "sums": sums}
+        return chain | {"moments": self.moments.state(), "sums": self.sums.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.done, self.units = state["done"], state["units"].to(self.units).clone()
         self.generator.set_state(state["generator"])
         self.moments.load_state(state["moments"])
-        if self.sums is not None:
-            self.sums.load_state(state["sums"])
+        self.sums.load_state(state["sums"])
 
     def result(self) -> Uncertainty:
         """Standard deviation, bias and expected shell correlation from the samples so far."""
         parts = self.moments.std, self.moments.mean - self.energy.start
         std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
-        shells = None if self.sums is None else self.sums.band()
-        return Uncertainty(std, bias, self.done, shells)
+        return Uncertainty(std, bias, self.done, self.sums.powers().band())
 
 
 def error_bars(
@@ -133,7 +138,6 @@ def error_bars(
     num_samples: int = 16,
     *,
     seed: int = 0,
-    place: tuple[slice, int] | None = None,
     run_stage: RunStage = run_stage,
     prefix: str = "",
 ) -> Uncertainty:
@@ -148,14 +152,13 @@ def error_bars(
         tilt_series: what it was made of, tilts in the same order.
         num_samples: how many; they are thirty steps of the chain apart.
         seed: of the fit; it leaves the same pixels out.
-        place: rows of a block among all, and how many these are.
         run_stage: carries the stage out; `recon.joint.checkpoint.Journal.run_stage` keeps what it has reached.
         prefix: of the name under which it does.
 
     Raises:
         ValueError: a reconstruction that no fit made, or fewer than two samples.
     """
-    posterior = Posterior(outcome, tilt_series, num_samples, seed=seed, place=place)
+    posterior = Posterior(outcome, tilt_series, num_samples, seed=seed)
     run_stage(f"{prefix}error bars", posterior)
     return posterior.result()
 

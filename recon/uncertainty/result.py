@@ -24,7 +24,7 @@ class Uncertainty:
         std: standard deviation of the volumes that are compatible with the images, attenuation per voxel.
         bias: their mean minus the volume, which is the most likely of them, attenuation per voxel.
         num_samples: what they come from.
-        shells: where the Fourier shell correlation with the truth is expected; None of a volume that was sampled in blocks.
+        shells: where the Fourier shell correlation with the truth is expected; None of a volume fewer than four voxels thick.
     """
 
     std: Volume

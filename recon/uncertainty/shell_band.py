@@ -81,46 +81,85 @@ class ShellBand:
             ) from error
 
 
+@dataclass(frozen=True)
+class ShellPowers:
+    """Sums over the frequencies of each shell, of a volume and of samples; those of parts of a volume add up.
+
+    Attributes:
+        cross: (sample, shell) of the products of sample and volume.
+        power: (sample, shell) of the power of each sample.
+        own, common: (shell,) of the power of the volume and of the samples' mean.
+    """
+
+    cross: Array
+    power: Array
+    own: Array
+    common: Array
+
+    def table(self) -> Array:
+        """All in one array, which `of` takes; tables of parts add up."""
+        return np.concatenate([self.cross, self.power, self.own[None], self.common[None]])
+
+    @classmethod
+    def of(cls, table: Array) -> ShellPowers:
+        """What `table` gave."""
+        count = len(table) // 2 - 1
+        return cls(table[:count], table[count:-2], table[-2], table[-1])
+
+    def band(self) -> ShellBand | None:
+        """The band; None of a volume that is fewer than four voxels thick, or without samples."""
+        count, shells = len(self.power), len(self.own) - 1
+        if 2 * shells < _FEWEST or not count:
+            return None
+        norm = np.sqrt(self.power * self.own)
+        curves = np.divide(self.cross, norm, out=np.zeros_like(self.cross), where=norm > 0)
+        spread = np.maximum(self.power.mean(0) - self.common, 0) * count / max(1, count - 1)
+        total = self.own + spread
+        high = np.sqrt(np.divide(self.own, total, out=np.zeros_like(total), where=total > 0))
+        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
+        return ShellBand(np.arange(shells + 1) / (2 * shells), low, np.maximum(low, high))
+
+
 class ShellSums:
     """Sums by shell of the spectra of a volume and of samples seen one by one.
 
+    A part of a volume shows the powers of the whole, as in P. D. Welch's estimate of power spectra (1967,
+    doi:10.1109/TAU.1967.1161901), if each of its slices counts by a share and the squares of all parts' shares add up to one.
+
     Args:
         volume: (z, y, x).
+        shares: (y,) of the slices of a part; None counts all of them in full.
+        height: slices of the whole volume, where this is a part of it.
     """
 
-    def __init__(self, volume: Tensor) -> None:
+    def __init__(self, volume: Tensor, *, shares: Tensor | None = None, height: int | None = None) -> None:
         shape = volume.shape
-        self.shells = min(shape) // 2
+        self.shells = min(shape[0], height or shape[1], shape[2]) // 2
+        self.shares = None if shares is None else shares.to(volume)[:, None]
         index, times = shells_of(tuple(shape), self.shells)
         inside = np.minimum(index, self.shells + 1)  # one more for the corners, which nobody looks at
         self.index = torch.from_numpy(inside.ravel().astype(np.int32)).to(volume.device)
         self.times = torch.from_numpy(times.astype(np.float32)).to(volume.device)
-        self.spectrum = torch.fft.rfftn(volume)
+        self.spectrum = self._spectrum(volume)
         self.cross: list[Tensor] = []  # one entry per sample: (shells + 1,)
         self.power: list[Tensor] = []
         self.total = torch.zeros_like(self.spectrum)
 
     def add(self, sample: Tensor) -> None:
         """Take a sample in, (z, y, x)."""
-        spectrum = torch.fft.rfftn(sample)
+        spectrum = self._spectrum(sample)
         self.cross.append(self._by_shell((spectrum * self.spectrum.conj()).real))
         self.power.append(self._power(spectrum))
         self.total += spectrum
 
-    def band(self) -> ShellBand | None:
-        """The band; None of a volume that is fewer than four voxels thick."""
-        if 2 * self.shells < _FEWEST or not self.power:
-            return None
-        cross, power = (torch.stack(sums).numpy() for sums in (self.cross, self.power))
-        count = len(power)
-        own, common = (self._power(spectrum).numpy() for spectrum in (self.spectrum, self.total / count))
-        norm = np.sqrt(power * own)
-        curves = np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
-        spread = np.maximum(power.mean(0) - common, 0) * count / max(1, count - 1)
-        total = own + spread
-        high = np.sqrt(np.divide(own, total, out=np.zeros_like(own), where=total > 0))
-        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
-        return ShellBand(np.arange(self.shells + 1) / (2 * self.shells), low, np.maximum(low, high))
+    def powers(self) -> ShellPowers:
+        """The sums so far."""
+        count = len(self.power)
+        none = np.zeros((0, self.shells + 1))
+        cross, power = (torch.stack(sums).numpy() if sums else none for sums in (self.cross, self.power))
+        return ShellPowers(
+            cross, power, self._power(self.spectrum).numpy(), self._power(self.total / max(1, count)).numpy()
+        )
 
     def state(self) -> dict[str, Any]:
         """What `load_state` takes."""
@@ -129,6 +168,10 @@ class ShellSums:
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.cross, self.power, self.total = state["cross"][:], state["power"][:], state["total"].clone()
+
+    def _spectrum(self, volume: Tensor) -> Tensor:
+        spectrum: Tensor = torch.fft.rfftn(volume if self.shares is None else volume * self.shares, norm="ortho")
+        return spectrum
 
     def _power(self, spectrum: Tensor) -> Tensor:
         return self._by_shell(spectrum.abs().square())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import typer
+from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
 from noiseflow import Gaussian, io
@@ -23,6 +24,7 @@ from recon.metrics.metrics import fourier_shell_correlation, resolution
 from recon.projection.image_formation import Linear
 from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
+from recon.scale.blocks import blocks
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.simulate.phantoms import particles
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -41,7 +43,7 @@ from recon.uncertainty import (
     volume_above,
 )
 from recon.uncertainty.measure import parse_region
-from recon.uncertainty.shell_band import ShellSums
+from recon.uncertainty.shell_band import ShellPowers, ShellSums
 from tests.commands import run_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -218,11 +220,14 @@ def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
     noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
     settings = {"noise_model": ACQUISITIONS["clipped"].noise(), "weight": 0.4, "uncertainty": 16, "num_steps": 60}
-    whole = reconstruct(noisy, method="joint-supervised", **settings).uncertainty.std.attenuation
-    blocks = {"slices_at_once": 6, "scratch": tmp_path / "v.npy"}
-    parts = reconstruct(noisy, method="joint-supervised", **settings, **blocks).uncertainty.std.attenuation
+    whole = reconstruct(noisy, method="joint-supervised", **settings).uncertainty
+    in_blocks = {"slices_at_once": 6, "scratch": tmp_path / "v.npy"}
+    parts = reconstruct(noisy, method="joint-supervised", **settings, **in_blocks).uncertainty
     inside = density > 0.05 * density.max()
-    assert parts[inside].mean() == pytest.approx(whole[inside].mean(), rel=0.05)
+    assert parts.std.attenuation[inside].mean() == pytest.approx(whole.std.attenuation[inside].mean(), rel=0.05)
+    fine = slice(3, None)  # of the coarsest shells a block of so few slices sees little
+    np.testing.assert_allclose(parts.shells.high[fine], whole.shells.high[fine], atol=0.1)
+    np.testing.assert_allclose(parts.shells.low[fine], whole.shells.low[fine], atol=0.2)
 
 
 def test_a_new_volume_without_error_bars_does_not_keep_those_of_the_old(scene, tmp_path):
@@ -256,7 +261,7 @@ def test_shell_band_is_that_of_known_samples(tmp_path):
     samples = [0.5 * volume + torch.randn(volume.shape, generator=generator) for _ in range(40)]
     for sample in samples:
         sums.add(sample)
-    band = sums.band()
+    band = sums.powers().band()
     np.testing.assert_allclose(band.high[4:], (1 / 2) ** 0.5, atol=0.03)  # the volume and noise as strong
     np.testing.assert_allclose(band.low[4:], (0.25 / 1.25) ** 0.5, atol=0.1)  # a twentieth quantile: below the mean
     assert (band.low[4:] < (0.25 / 1.25) ** 0.5 + 0.01).all()
@@ -265,7 +270,33 @@ def test_shell_band_is_that_of_known_samples(tmp_path):
     (tmp_path / "v_fsc.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="not the table"):
         ShellBand.read(tmp_path / "v_fsc.csv")
-    assert ShellSums(volume[:3]).band() is None
+    assert ShellSums(volume[:3]).powers().band() is None
+
+
+def test_shell_band_of_blocks_is_that_of_the_whole():
+    """Slices near a border belong to both blocks by shares whose squares add up to one."""
+    generator, parts = torch.Generator().manual_seed(0), blocks(64, 16, 6)
+    shares = np.zeros(64)
+    for part in parts:
+        shares[part.wide] += part.shares() ** 2
+    np.testing.assert_allclose(shares, 1, rtol=1e-6)
+    volume = torch.from_numpy(gaussian_filter(np.random.default_rng(0).normal(size=(64, 64, 64)), 1.5)).float()
+    noise = 0.5 * float(volume.std())
+    whole = ShellSums(volume)
+    sums = [
+        ShellSums(volume[:, part.wide], shares=torch.from_numpy(part.shares()), height=part.height) for part in parts
+    ]
+    for _ in range(6):
+        sample = volume + noise * torch.randn(volume.shape, generator=generator)
+        whole.add(sample)
+        for part, one in zip(parts, sums, strict=True):
+            one.add(sample[:, part.wide])
+    added = ShellPowers.of(np.sum([one.powers().table() for one in sums], axis=0))
+    assert added.own.sum() == pytest.approx(whole.powers().own.sum(), rel=0.02)
+    for found, told in zip(
+        (added.band().low, added.band().high), (whole.powers().band().low, whole.powers().band().high), strict=True
+    ):
+        np.testing.assert_allclose(found[3:], told[3:], atol=0.06)
 
 
 def test_shell_band_of_a_fit_holds_the_correlation_with_the_truth(tmp_path):

@@ -22,7 +22,9 @@ def seen(change: Array, *, first_row: float = 0.0, noise: float = 0.002) -> Resi
     images = gaussian_filter(generator.normal(size=(TILTS, ROWS, WIDTH)), (4, 3, 3))
     images /= images.std()
     across = (np.arange(WIDTH) - (WIDTH - 1) / 2) / (WIDTH / 2)
-    residual = change[:, None, None] * across * np.gradient(images, axis=2) + noise * generator.normal(size=images.shape)
+    residual = change[:, None, None] * across * np.gradient(images, axis=2) + noise * generator.normal(
+        size=images.shape
+    )
     height = first_row + np.arange(ROWS)
     return Residuals(images + residual, images, residual, np.linspace(-60, 60, TILTS), height)
 
