@@ -292,7 +292,12 @@ def test_a_batch_that_is_stopped_tells_how_far_it_came(files: Path, tmp_path: Pa
         "--method l2 --weight 0.4 --steps 5000",
     ]
     process = start(words, tmp_path / "log")
-    wait_for(lambda: any(tmp_path.glob("out/*.checkpoint")) or any(tmp_path.glob("out/.*.lock")), process)
+
+    def begun() -> set[Path]:
+        """What a series has begun; the table's lock comes before."""
+        return {*tmp_path.glob("out/*"), *tmp_path.glob("out/.*")} - {tmp_path / "out" / ".batch.csv.lock"}
+
+    wait_for(lambda: any(path.suffix in (".checkpoint", ".lock") for path in begun()), process)
     os.kill(process.pid, signal.SIGINT)
     process.join(120)
     assert process.exitcode == 130
