@@ -62,7 +62,7 @@ def run_time(folder: Path) -> str:
         _defaults(folder),
         "The other tables show each method at its best setting, found by looking at the truth outside the clock, which "
         "no user can do; the joint fit chooses its own weight and noise model within its time, and only its number of "
-        "steps is the best of three. Rows older than those above are of a slower fit. "
+        "steps is the best of three. "
         "The oracle, a line in the figures, is the same fit given the true noise, at its "
         "best weight. ASTRA's SIRT runs on the CPU, slice by slice; its GPU algorithms were not measured. One size is "
         "one command:\n\n"
