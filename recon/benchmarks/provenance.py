@@ -28,7 +28,7 @@ def _commit() -> str:
         return found.stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/*.py")  # of the whole checkout
         return git("rev-parse", "--short=7", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return ""
