@@ -148,8 +148,8 @@ def paper_table(folder: Path) -> str:
         "and SIRT are this library's, not IMOD's, at their best window, cutoff and number of iterations. "
         "The supervised fit keeps "
         "a flow fitted to clean and noisy images. Settings of all "
-        f"but the joint fits were searched by looking at the truth, in fits of {benchmark_search.STEPS} steps. Only that of "
-        "clean images would gain with more: 4 dB with four times as many. In "
+        f"but the joint fits were searched by looking at the truth, in fits of {benchmark_search.STEPS} steps, "
+        f"of clean images {benchmark_paper.CLEAN_STEPS}. In "
         "the printed table MSE and DSSIM of the last five rows are exchanged (the printed PSNR is that of "
         "the other column); here "
         "they are put right.",

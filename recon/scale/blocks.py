@@ -46,22 +46,21 @@ class Block:
         rows: the block's own.
         wide: these and their halo.
         height: slices of the whole volume.
+        overlap: slices on either side of a border that belong to two blocks, and to no third.
     """
 
     rows: slice
     wide: slice
     height: int
+    overlap: int
 
     def shares(self) -> Images:
         """(y,) how much of each `wide` slice is this block's, neighbours having the rest: the squares of all add up to one."""
-        place, half = np.arange(self.wide.start, self.wide.stop) + 0.5, (self.rows.stop - self.rows.start) // 2
+        place = np.arange(self.wide.start, self.wide.stop) + 0.5
         found = np.ones(len(place), dtype=np.float32)
-        for border, inward, halo in (
-            (self.rows.start, 1, self.rows.start - self.wide.start),
-            (self.rows.stop, -1, self.wide.stop - self.rows.stop),
-        ):
-            if width := min(halo, half):
-                found *= np.sin(np.pi / 4 * (1 + np.clip(inward * (place - border) / width, -1, 1)))
+        for border, inward in ((self.rows.start, 1), (self.rows.stop, -1)):
+            if self.overlap and 0 < border < self.height:
+                found *= np.sin(np.pi / 4 * (1 + np.clip(inward * (place - border) / self.overlap, -1, 1)))
         return found
 
 
@@ -89,8 +88,9 @@ def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
     """Blocks of nearly equal height, of so many slices at most."""
     count = -(-height // slices_at_once)
     ends = [round(number * height / count) for number in range(count + 1)]
+    overlap = min(halo, int(np.diff(ends).min()) // 2)
     return [
-        Block(slice(start, stop), slice(max(0, start - halo), min(height, stop + halo)), height)
+        Block(slice(start, stop), slice(max(0, start - halo), min(height, stop + halo)), height, overlap)
         for start, stop in pairwise(ends)
     ]
 
@@ -123,8 +123,8 @@ class BlockFiles:
                 write_npy(partial, np.asarray(array, dtype=np.float32))
 
     def read(self, block: Block) -> list[Images]:
-        """The same, mapped to memory."""
-        return [np.load(self._path(name, block), mmap_mode="r") for name in self.names]
+        """What has a value for each voxel or pixel, mapped to memory."""
+        return [np.load(self._path(name, block), mmap_mode="r") for name in self.names if name != "shells"]
 
     def powers(self, parts: list[Block]) -> ShellPowers:
         """Of the whole volume and its samples, from those of all blocks."""
@@ -158,14 +158,9 @@ def assemble(
     paths = [scratch, *(error_bar_paths(scratch).values() if files.error_bars else ())]
     volumes = [create_volume(path, grid.shape, voxel) for path in paths]
     projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent)
-    overlaps = (
-        min(below.wide.stop - below.rows.stop, above.rows.start - above.wide.start) for below, above in pairwise(parts)
-    )
-    fade = min([_FADE, *overlaps, min(part.rows.stop - part.rows.start for part in parts) // 2])
+    fade = min(_FADE, parts[0].overlap)
     for number, part in enumerate(parts):
-        for target, found in zip(
-            (volumes[0], projections, *volumes[1:]), files.read(part), strict=False
-        ):  # shells are left
+        for target, found in zip((volumes[0], projections, *volumes[1:]), files.read(part), strict=True):
             first = part.rows.start + (fade if number else 0)
             stop = part.rows.stop + (fade if number < len(parts) - 1 else 0)
             if number and fade:

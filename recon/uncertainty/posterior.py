@@ -80,7 +80,7 @@ class Posterior:
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # blocks must not share their noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
         shares = None if block is None else torch.from_numpy(block.shares())
-        self.sums = ShellSums(self._seen(), shares=shares, height=height)
+        self.sums = ShellSums(self.energy.volume(self.units), shares=shares, height=height)
 
     @torch.no_grad()
     def step(self) -> str:
@@ -95,20 +95,15 @@ class Posterior:
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the error bars diverged: a voxel is no longer finite; check the data's scale")
         self.done += 1
-        sample = self._seen()
-        self.sums.add(sample)
+        self.sums.add(self.energy.volume(self.units))
         if self.visit is not None:
-            self.visit(sample)
+            self.visit(torch.from_numpy(self._volume(self.units)))
         return f"sample {self.done}"
 
     def _move(self) -> None:
         noise = torch.randn(self.units.shape, generator=self.generator, device=self.units.device)
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
         self.units.add_(noise, alpha=(2 * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
-
-    def _seen(self) -> Tensor:
-        """The chain's volume, (z, y, x), as the user sees it."""
-        return torch.from_numpy(self._volume(self.units))
 
     def _volume(self, units: Tensor) -> np.ndarray:
         return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))

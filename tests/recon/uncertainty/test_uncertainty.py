@@ -273,13 +273,18 @@ def test_shell_band_is_that_of_known_samples(tmp_path):
     assert ShellSums(volume[:3]).powers().band() is None
 
 
-def test_shell_band_of_blocks_is_that_of_the_whole():
-    """Slices near a border belong to both blocks by shares whose squares add up to one."""
-    generator, parts = torch.Generator().manual_seed(0), blocks(64, 16, 6)
-    shares = np.zeros(64)
-    for part in parts:
+@pytest.mark.parametrize(
+    ("height", "slices_at_once", "halo"), [(64, 16, 6), (23, 6, 12), (50, 7, 12), (9, 3, 12), (10, 4, 0)]
+)
+def test_squares_of_the_shares_of_blocks_add_up_to_one(height, slices_at_once, halo):
+    shares = np.zeros(height)
+    for part in blocks(height, slices_at_once, halo):
         shares[part.wide] += part.shares() ** 2
     np.testing.assert_allclose(shares, 1, rtol=1e-6)
+
+
+def test_shell_band_of_blocks_is_that_of_the_whole():
+    generator, parts = torch.Generator().manual_seed(0), blocks(64, 16, 6)
     volume = torch.from_numpy(gaussian_filter(np.random.default_rng(0).normal(size=(64, 64, 64)), 1.5)).float()
     noise = 0.5 * float(volume.std())
     whole = ShellSums(volume)

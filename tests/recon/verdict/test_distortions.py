@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.verdict.distortions import distortions
+from recon.verdict.image_findings import image_findings
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -46,3 +47,14 @@ def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
     assert abs(found.values[0]) > 20 * abs(calm.values).max()
     assert found.size == calm.size
     assert found.trend == calm.trend
+
+
+@pytest.mark.parametrize(("width", "told"), [(64, True), (256, False)])
+def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int, told: bool) -> None:
+    generator = np.random.default_rng(0)
+    images = gaussian_filter(generator.normal(size=(TILTS, ROWS, width)), (4, 3, 3))
+    images /= images.std()
+    residual = 0.3 * np.gradient(images, axis=2) + 0.1 * generator.normal(size=images.shape)
+    residuals = Residuals(images + residual, images, residual, np.linspace(-60, 60, TILTS), np.arange(ROWS))
+    _, findings = image_findings(residuals, distortions(residuals))
+    assert ("alignment" in {finding.subject for finding in findings}) == told
