@@ -288,6 +288,8 @@ def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
             marker, colour = next(looks)
             style = {"linewidth": 2.6 if bold else 1.3, "marker": marker, "markersize": 5 if bold else 3.5}
             style |= {"linestyle": ":", "label": f"{name}, unfinished: {stopped}"} if stopped else {"label": name}
+            if len(points) == 1:  # which curves would hide
+                style |= {"linestyle": "none", "marker": "*", "markersize": 13, "markeredgecolor": "black", "zorder": 4}
             axis.plot(seconds, psnr, color=colour, **style)
     axis.set(xscale="log", xlabel="wall time (s)", ylabel="PSNR of the volume, affinely matched (dB)", title=title)
     axis.grid(alpha=0.3, which="both")
