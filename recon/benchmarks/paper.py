@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -43,7 +42,7 @@ def run(scene: Scene, results: Results, line: Callable[[str], None]) -> None:
 def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
     noisy, grid = scene.noisy, scene.grid
     least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS)
-    patient = replace(least_squares, num_steps=CLEAN_STEPS)
+    patient = JointReconstructor(noise_model=Gaussian, num_steps=CLEAN_STEPS)
     oracle = JointReconstructor(noise_model=lambda: scene.noise_model, num_steps=STEPS)
 
     def score(volume: Array) -> float:
