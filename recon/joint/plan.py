@@ -8,7 +8,7 @@ from typing import Literal
 
 from noiseflow.described import described
 
-Kind = Literal["signal", "noise", "candidates", "weights"]
+Kind = Literal["signal", "noise", "candidates", "finalists", "weights"]
 Where = Literal["slab", "whole"]
 Noise = Literal["simple", "chosen"]
 
@@ -53,7 +53,7 @@ class Schedule:
         settle: signal steps on the slab before noise models are compared.
         candidate: steps of each candidate noise model; its likelihood then differs from where it would end by less than the
             tolerance of the choice.
-        adapt: signal steps on the slab under the chosen noise model.
+        adapt: signal steps on the slab under the chosen noise model, and under the likeliest simpler one.
         refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same where nothing follows them: misfit spans three decades, and after 60 steps a needle's noise model
@@ -87,7 +87,8 @@ class FitStage:
     Attributes:
         name: unique within a plan; the journal keeps what the stage reached under it.
         kind: ``signal`` fits the volume and response under a fixed noise model; ``noise`` fits the noise model to a fixed signal;
-            ``candidates`` fits several noise models and takes one; ``weights`` compares weights of the regulariser.
+            ``candidates`` fits several noise models to a fixed signal and takes one; ``finalists`` fits the volume under that
+            one and under the likeliest simpler one, and takes one of the two; ``weights`` compares weights of the regulariser.
         where: the slab that choices are made on, or the whole volume.
         noise: the simple noise model that every fit begins with, or the model of choice.
         num_steps: optimisation steps; of each fit, where there are several.
@@ -157,8 +158,9 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
+    adapt: Kind = "finalists" if facts.choose_noise else "signal"
     stages.append(
-        FitStage("adapt", "signal", "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True, hold_offset=hold)
+        FitStage("adapt", adapt, "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True, hold_offset=hold)
     )
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
@@ -213,7 +215,7 @@ def describe(stages: Sequence[FitStage]) -> str:
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
-        if stage.kind in ("signal", "weights"):
+        if stage.kind in ("signal", "finalists", "weights"):
             how.append(f"rate {stage.rate:g}")
         if stage.hold_offset:
             how.append("offset held")

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -33,7 +33,7 @@ _TABULATED = 0.05  # nats per pixel
 
 @dataclass(frozen=True)
 class _Tried:
-    """A candidate and its held-out negative log-likelihood above the best one's, nats per pixel."""
+    """A candidate and its held-out negative log-likelihood above that of another, nats per pixel."""
 
     model: nn.Module
     excess: float
@@ -93,6 +93,7 @@ class Runner:
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
         self.result = FitResult(models["simple"])
+        self._runner_up: nn.Module | None = None  # the likeliest noise model simpler than the chosen
         self._done, self._expected = 0, expected
 
     def run(self, stages: Sequence[FitStage]) -> None:
@@ -101,6 +102,7 @@ class Runner:
             "signal": self._signal,
             "noise": self._noise,
             "candidates": self._candidates,
+            "finalists": self._finalists,
             "weights": self._weights,
         }
         for where in {stage.where for stage in stages if stage.afresh}:
@@ -143,9 +145,31 @@ class Runner:
             tried.insert(place, _Tried(model, excess))
             if excess <= _TOLERATED:
                 break
-        best = min(each.excess for each in tried)
-        judged = [_Tried(each.model, each.excess - best) for each in tried]
-        self.models["chosen"] = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED).model
+        chosen = _simplest(tried, task)
+        behind = min(tried[: tried.index(chosen)], key=lambda each: each.excess, default=None)
+        self.models["chosen"] = chosen.model
+        self._runner_up = None if behind is None or math.isinf(behind.excess) else behind.model
+
+    def _finalists(self, stage: FitStage, task: Task) -> None:
+        """Fit the volume under the noise model of choice and, from the same state, under the likeliest simpler one: a rich noise
+        model also describes what a rough signal lacks, and may seem likelier for as long as the signal has not followed. On a
+        needle with 10 counts Poisson noise was 0.007 nats behind before, and 0.08 ahead after twenty steps."""
+        model, runner_up = task.signal_model, self._runner_up
+        start = copy.deepcopy(model.state_dict()) if runner_up is not None else {}
+        chosen = self._fit_signal(stage, task, stage.name)
+        self.result = chosen
+        if runner_up is None:
+            return
+        richer, adapted = self.models["chosen"], copy.deepcopy(model.state_dict())
+        model.load_state_dict(start)
+        self.models["chosen"] = runner_up
+        simpler = self._fit_signal(stage, task, f"{stage.name} 2")
+        tried = [_Tried(runner_up, _last_nll(simpler)), _Tried(richer, _last_nll(chosen))]
+        if _simplest(tried, task).model is runner_up:
+            self.result = simpler
+        else:
+            self.models["chosen"] = richer
+            model.load_state_dict(adapted)
 
     def _weights(self, stage: FitStage, task: Task) -> None:
         """Compare weights by fits that all begin in the same state: steps that another weight has taken count for none. The task
@@ -158,8 +182,7 @@ class Runner:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
-            history = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").history
-            nll = list(history.values())[-1]
+            nll = _last_nll(self._fit_signal(stage, task, f"{stage.name} {weight:.4g}"))
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
@@ -212,6 +235,20 @@ class Runner:
         )
         self._done = begun + options["num_steps"]
         return result
+
+
+def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
+    """The simplest that predicts held-out pixels nearly as well as the best."""
+    best = min(each.excess for each in tried)
+    judged = [replace(each, excess=each.excess - best) for each in tried]
+    found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
+    return tried[judged.index(found)]
+
+
+def _last_nll(result: FitResult) -> float:
+    """Of held-out pixels after the last step, nats per pixel; infinite if it is no number."""
+    nll = list(result.history.values())[-1]
+    return nll if math.isfinite(nll) else math.inf
 
 
 @torch.no_grad()

@@ -255,6 +255,23 @@ def test_a_real_series_with_little_noise_is_not_taken_for_noise():
     assert compare(predicted, parts.target).psnr > 39
 
 
+def test_a_rich_noise_model_is_not_chosen_for_what_a_rough_signal_lacks():
+    given = benchmark_needle.split(benchmark_needle.load(), "10 counts", "every fifth", seed=0).given
+    tried = []
+
+    def run_fit(name, *arguments, **options):
+        result = noiseflow.fit(*arguments, **options)
+        tried.append((name, result.held_out_nll, type(arguments[0]).__name__))
+        return result
+
+    result = JointReconstructor(weight=2.0, num_steps=1, run_fit=run_fit)(given)
+    assert isinstance(result.noise_model, noiseflow.PoissonGaussian)  # as the counts were drawn
+    assert float(result.noise_model.gain) == pytest.approx(1, abs=0.05)
+    nll = {name: (nll, model) for name, nll, model in tried if name.startswith("adapt")}
+    assert nll["adapt"][1] == "Mixture", "the rich model no longer seems better at first: find another series"
+    assert nll["adapt 2"][0] < nll["adapt"][0] - 0.02
+
+
 @pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (3.0, False)])
 def test_a_dim_part_counts_as_vacuum_only_where_noise_could_have_made_it(noise, kept):
     density = np.zeros((32, 32, 32))
