@@ -66,7 +66,8 @@ class Matcher:
         self.projector = SliceProjector(
             tilt_angles=tilt_angles, depth=self.size, width=self.size, device=str(images.device)
         )
-        self._sine = torch.from_numpy(np.sin(np.deg2rad(tilt_angles))).float().to(images.device)
+        theta = np.deg2rad(tilt_angles)
+        self._moves = torch.from_numpy(np.stack([np.sin(theta), np.cos(theta)], 1)).float().to(images.device)
 
     def match(self, axis: float, shifts: Tensor, *, rounds: int, free_axis: bool = False) -> Match:
         """Iterations of SIRT take turns with a Gauss-Newton step of all shifts, and of the axis, towards its projections."""
@@ -93,10 +94,15 @@ class Matcher:
         return values, inside
 
     def centred(self, found: Match) -> Match:
-        """The same with the volume's mass in the middle of its depth, for the whole object shall fit a slab."""
-        height = _middle(found.volume.sum((1, 2))) * self.binning
-        across = torch.stack([torch.zeros_like(self._sine), height * self._sine], -1)
-        return replace(found, shifts=found.shifts + across @ frame(found.axis, across))
+        """The same with the volume's mass above the middle of its width and depth.
+
+        Shifts determine an object up to its place. In the middle it fits a thin volume, and its shifts do not depend on the scale
+        of the stated tilt angles, as those of an object far from the axis do.
+        """
+        place = torch.tensor([_middle(found.volume.sum(other)) for other in ((1, 2), (0, 1))]) * self.binning
+        across = self._moves @ place.to(self._moves)
+        moves = torch.stack([torch.zeros_like(across), across], -1)
+        return replace(found, shifts=found.shifts + moves @ frame(found.axis, moves))
 
     def about_mass(self, found: Match, turn: float) -> tuple[float, Tensor]:
         """Axis and shifts after a turn about the place on the axis where most of the mass is: the least disturbance."""
