@@ -95,6 +95,12 @@ def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
     ]
 
 
+def fitted_slices(height: int, slices_at_once: int) -> int:
+    """Slices that are fitted where a volume is fitted in blocks: those with their halo, and what is settled first."""
+    wide: int = sum(part.wide.stop - part.wide.start for part in blocks(height, slices_at_once, HALO))
+    return wide + min(height, SETTLED_ON)
+
+
 @dataclass(frozen=True)
 class BlockFiles:
     """The finished blocks of one volume.
