@@ -62,6 +62,16 @@ def test_blocks_cover_every_slice_once():
         assert max(part.rows.stop - part.rows.start for part in parts) <= at_once
 
 
+def test_blocks_of_a_low_volume_that_see_the_same_slices_are_files_of_their_own(tmp_path):
+    """Their shares of the power by shell differ."""
+    files, parts = BlockFiles(tmp_path, error_bars=True), blocks(16, 8, HALO)
+    assert parts[0].wide == parts[1].wide
+    for part in parts:
+        assert not files.finished(part)
+        files.write(part, *(np.full((2, 2, 2), part.rows.start, np.float32) for _ in files.names))
+    assert [int(files.read(part)[0].max()) for part in parts] == [0, 8]
+
+
 def test_a_finished_block_is_not_computed_again(tmp_path):
     _, noisy = scene("shells", 28, 12.0)
     options = {"method": "l2", "weight": 0.5, "num_steps": 8, "slices_at_once": 14}
