@@ -90,6 +90,8 @@ def estimates(content: Cell) -> str:
         "Not measured: computed by `python docs/benchmarks/scale.py page` for shells, 79 tilts, blocks of "
         f"{_SLICES} slices, one thread a worker.\n\n" + "\n".join(lines) + "\n\n"
     )
+    if beside := " ".join(filter(None, (_beside(rows), _growth(rows)))):
+        text += f"Measured ({{doc}}`scale`): {beside}\n\n"
     return text + (
         f"- **Time**: at 512³ a slice of a block takes {slice_seconds:.2f} s of processor time, halo included, and what is "
         f"settled first takes {start:.0f} s. Both grow with the area of a slice. The first runs on all workers, the second "
@@ -169,6 +171,15 @@ def _borders(rows: dict[str, Cell]) -> str:
         "with borders elsewhere, or whole; the last column is the largest of all borders, and 1 where blocks leave no trace.\n\n"
         + "\n".join(lines)
     )
+
+
+def _beside(rows: dict[str, Cell]) -> str:
+    """The largest row that was measured, to compare with its estimate."""
+    row = rows.get("shells-1000")
+    if row is None:
+        return ""
+    minutes = _time(row["processor seconds"])
+    return f"1000³ took {minutes} of processor time and {row['peak GiB']:.1f} GiB, in {row['blocks']} blocks."
 
 
 def _vacuum(rows: dict[str, Cell]) -> str:

@@ -20,11 +20,12 @@ from noiseflow.commands.console import (
 )
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
+    chosen_slices,
     disk_line,
     memory_line,
     open_journal,
+    require_blocks,
     scratch_beside,
-    slices_for,
     stoppable,
     warnings_as_lines,
 )
@@ -175,6 +176,8 @@ def reconstruct(
     settings_of(**options)
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler has workers of its own; leave out --workers")
+    if workers is not None or scheduler is not None:
+        require_blocks(method, "--workers" if scheduler is None else "--scheduler")
     if fsc and report is None:
         raise ValueError("--fsc adds to the report: name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
@@ -207,17 +210,18 @@ def reconstruct(
         truth = None if reference is None else read_reference(reference, grid)
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
+        journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         if slices_at_once is None:
             many = workers if scheduler is None else 2
-            slices_at_once = slices_for(tilt_series, grid, method, chosen_device, many)
+            slices_at_once = chosen_slices(journal, tilt_series, grid, method, chosen_device, many)
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
         output.line(memory)
-        if slices_at_once is not None:
-            output.line(disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0, halves=fsc))
+        disk = disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0, halves=fsc)
+        if slices_at_once is not None or dry_run:
+            output.line(disk)
         if dry_run:
-            _show_plan(tilt_series, grid, options, memory, output)
+            _show_plan(tilt_series, grid, options, slices_at_once, {"memory": memory, "disk": disk}, output)
             return
-        journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
         started = time.perf_counter()
         with stoppable(journal, context), scratch_beside(out) as scratch, client_of(workers, scheduler) as client:
             if slices_at_once is not None:
@@ -267,22 +271,32 @@ def _solve(
     return outcome, (halves[0], halves[1])
 
 
-def _show_plan(tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], memory: str, output: Output) -> None:
+def _show_plan(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    options: dict[str, Any],
+    slices_at_once: int | None,
+    needed: dict[str, str],
+    output: Output,
+) -> None:
     """What would be done, in words and for programs."""
     from dataclasses import asdict
 
     from recon.joint.plan import describe
     from recon.methods import find_method, settings_of
+    from recon.scale.blocks import fitted_slices
     from recon.scale.cost import expected_seconds
 
     method = find_method(options["method"])
-    result: dict[str, Any] = {"method": method.name, "memory": memory, "stages": [], "expected_seconds": None}
+    result: dict[str, Any] = {"method": method.name, **needed, "slices_at_once": slices_at_once}
+    result |= {"stages": [], "expected_seconds": None}
     if method.plan is None:
         output.line(f"{method.name}: {method.description} It has no stages to plan.")
     else:
         made = {name: value for name, value in options.items() if name != "method"}
         stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
-        seconds = expected_seconds(stages, tilt_series, grid, slab, share)
+        fitted = None if slices_at_once is None else fitted_slices(grid.height, slices_at_once)
+        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted)
         output.line(f"slab: {slab} of {grid.height} slices")
         output.line(describe(stages))
         output.line(f"expected: about {seconds:.0f} s on this machine")

@@ -139,12 +139,43 @@ def memory_line(
     return require_memory(needed_memory(*block, fitted=fitted) * workers + held, device)
 
 
-def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
-    """Slices of a block, where the whole volume is large, does not fit into memory, or workers share it; else None.
+def chosen_slices(
+    journal: Journal, tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None
+) -> int | None:
+    """Slices of a block, where the whole volume is large, does not fit into memory, or workers share it; else None. A run that
+    resumes keeps its blocks, however much memory is free by now: with others, none of them would be finished.
 
     Raises:
         MemoryError: not even a few slices fit.
+        ValueError: workers are to share a volume whose fit was begun in one piece.
     """
+    found: int | None = journal.choose(
+        "slices at once", lambda: _slices_for(tilt_series, grid, method, device, workers)
+    )
+    if found is None and journal.resumed and (workers or 1) > 1:
+        raise ValueError(
+            "the checkpoint is of a run that reconstructs the whole volume in one piece, which workers cannot share; leave out "
+            f"--workers and --scheduler, or leave out --resume to start over ({journal.folder})"
+        )
+    return found
+
+
+def require_blocks(method: str, option: str) -> None:
+    """Refuse an option that shares the blocks of a volume, where a method makes none.
+
+    Raises:
+        ValueError: it makes none.
+    """
+    from recon.methods import find_method, method_names
+
+    if find_method(method).blockwise is None:
+        able = [name for name in method_names() if find_method(name).blockwise is not None]
+        raise ValueError(
+            f"{option}: method {method} reconstructs no blocks to share; use --method {', '.join(able)}, or leave out {option}"
+        )
+
+
+def _slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
     from recon.methods import find_method
     from recon.scale.memory import PLENTY, available_memory, choose_slices
 
@@ -158,12 +189,20 @@ def slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: A
 
 
 def disk_line(
-    tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int, *, error_bars: bool = False, halves: bool = False
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    slices_at_once: int | None,
+    *,
+    error_bars: bool = False,
+    halves: bool = False,
 ) -> str:
     """One line about the blocks and the room on the disk that they take until the volume is whole; with `halves`, those of the
     even and of the odd tilts, too."""
     from recon.scale.blocks import HALO, blocks
 
+    if slices_at_once is None:
+        num_bytes = 4 * (3 if error_bars else 1) * grid.height * grid.depth * grid.width
+        return f"blocks: none; disk: about {num_bytes / 2**30:.1f} GiB"
     parts = blocks(grid.height, slices_at_once, HALO)
     listed = sum(part.wide.stop - part.wide.start for part in parts)
     volumes = (3 if error_bars else 1) + (2 if halves else 0)

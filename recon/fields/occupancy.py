@@ -11,6 +11,9 @@ from torch.nn import functional
 
 from recon.projection.base import Projector
 
+OCCUPIED_MARGIN = 2
+"""Voxels around what a rough volume holds that are occupied, too."""
+
 _RETEST_EVERY = 10
 
 
@@ -34,7 +37,7 @@ class Occupancy(nn.Module):
     num_steps: Tensor
 
     def __init__(
-        self, rough: Tensor, shape: Sequence[int], *, least: float = 0.2, margin: int = 2, block: int = 4
+        self, rough: Tensor, shape: Sequence[int], *, least: float = 0.2, margin: int = OCCUPIED_MARGIN, block: int = 4
     ) -> None:
         super().__init__()
         self.least, self.block = least, block

@@ -71,7 +71,7 @@ class Journal:
         report: StepReport | None = None,
     ) -> None:
         self.folder, self.interval, self.report = Path(folder), interval, report
-        self.settings = json.loads(json.dumps(settings))
+        self.settings, self._choices = json.loads(json.dumps(settings)), dict[str, Any]()
         self.stop_requested = self.abandoned = self.in_fit = False
         self._fresh = not (resume and self.exists)
         if not self._fresh:
@@ -86,6 +86,13 @@ class Journal:
     def resumed(self) -> bool:
         """Whether this run goes on with an earlier one."""
         return not self._fresh
+
+    def choose(self, name: str, find: Callable[[], Any]) -> Any:
+        """What this run finds by itself, or found before it was stopped, however the machine has changed since: as JSON can hold
+        it. To be called before anything is written."""
+        if name not in self._choices:
+            self._choices[name] = find()
+        return self._choices[name]
 
     def fit(
         self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
@@ -220,6 +227,7 @@ class Journal:
     def _start(self) -> None:
         self.discard()
         description = {"format": _FORMAT, "library_version": version("noiseflow"), "settings": self.settings}
+        description["choices"] = self._choices
         with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
             partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
         self._fresh = False
@@ -229,6 +237,7 @@ class Journal:
         try:
             kept = json.loads((self.folder / _RUN).read_text(encoding="utf-8"))
             format_, settings = kept["format"], dict(kept["settings"])
+            self._choices = dict(kept.get("choices", {}))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"the checkpoint's {_RUN} is damaged; {advice}") from error
         if format_ != _FORMAT or kept.get("library_version") != version("noiseflow"):

@@ -16,7 +16,7 @@ from noiseflow import Gaussian
 from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
 from recon.fields.fields import Field, MultiresolutionField
-from recon.fields.occupancy import Occupancy
+from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
@@ -125,12 +125,8 @@ class JointReconstructor:
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:
         """Choose noise model, weight and response for all slices of a series: the first two on the slab of most contrast, the
         response on it and on the slab of least contrast, where vacuum tells a dimmer beam from a haze as in a whole fit."""
-        num_slices = self._num_slices(grid)
-        dense = contrast_slab(tilt_series, num_slices)
-        slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
-        rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
-        start, part = self._start(tilt_series, grid), tilt_series.rows(rows)
-        model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
+        start = self._start(tilt_series, grid)
+        part, model = self._slabs(start, tilt_series, grid)
         run = self._slab(part, model, start.noise, progress)
         run.fit_whole()
         return run.settled(start)
@@ -168,12 +164,12 @@ class JointReconstructor:
 
     def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int, float]:
         """The stages for a series, the slices of the slab that choices are made on, and the share of the voxels that are not
-        skipped as vacuum; arguments as of a call."""
+        skipped as vacuum; arguments as of a call. It takes the memory of a few slices, for a whole volume may not fit."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
-        whole = self._model(start, tilt_series, grid)
-        facts, rows, _ = self._facts(tilt_series, whole, start.noise)
-        share = 1.0 if whole.occupancy is None else whole.occupancy.share
+        part, model = self._slabs(start, tilt_series, grid)
+        facts, rows, _ = self._facts(part, model, start.noise)
+        share = self._occupied_share(start, model, grid)
         return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
@@ -201,6 +197,29 @@ class JointReconstructor:
         generator = torch.Generator().manual_seed(self.seed)
         rough = coarse_start(tilt_series, response, grid, generator=generator)
         return Start(rough, response, height, noise_share(tilt_series.images))
+
+    def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
+        """The slices of most and of least contrast, and their signal model."""
+        num_slices = self._num_slices(grid)
+        dense = contrast_slab(tilt_series, num_slices)
+        slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
+        rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
+        part = tilt_series.rows(rows)
+        return part, self._model(start, part, replace(grid, height=len(rows)), rows=rows)
+
+    def _occupied_share(self, start: Start, model: TomographySignal, grid: VolumeGrid) -> float:
+        """The share of the voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
+        if not (self.skip_vacuum and model.projector.has_parts):
+            return 1.0
+        occupied = 0
+        for first in range(0, grid.height, _SLAB):
+            stop = min(grid.height, first + _SLAB)
+            seen = slice(max(0, first - OCCUPIED_MARGIN), min(grid.height, stop + OCCUPIED_MARGIN))
+            rough, shape = start.rows(seen) / model.field.scale, (grid.depth, seen.stop - seen.start, grid.width)
+            mask = Occupancy(rough, shape, least=start.vacuum).mask
+            occupied += int(mask[..., first - seen.start : stop - seen.start].sum())
+        share = occupied / (grid.depth * grid.height * grid.width)
+        return share if share < _WORTHWHILE else 1.0
 
     def _model(
         self,

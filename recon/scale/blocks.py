@@ -95,6 +95,12 @@ def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
     ]
 
 
+def fitted_slices(height: int, slices_at_once: int) -> int:
+    """Slices that are fitted where a volume is fitted in blocks: those with their halo, and what is settled first."""
+    wide: int = sum(part.wide.stop - part.wide.start for part in blocks(height, slices_at_once, HALO))
+    return wide + min(height, SETTLED_ON)
+
+
 @dataclass(frozen=True)
 class BlockFiles:
     """The finished blocks of one volume.
@@ -132,7 +138,8 @@ class BlockFiles:
         return ShellPowers.of(np.sum(list(tables), axis=0))
 
     def _path(self, name: str, block: Block) -> Path:
-        return self.folder / f"{name}-{block.wide.start:07d}-{block.wide.stop:07d}.npy"
+        # by the block's own slices: those with the halo may be the same of two blocks of a low volume
+        return self.folder / f"{name}-{block.rows.start:07d}-{block.rows.stop:07d}.npy"
 
 
 def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files: BlockFiles) -> None:

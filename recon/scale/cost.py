@@ -21,7 +21,12 @@ _START = 2.0  # s, of the coarse reconstruction before the first stage
 
 
 def expected_seconds(
-    stages: Sequence[FitStage], tilt_series: TiltSeries, grid: VolumeGrid, slab_height: int, share: float = 1.0
+    stages: Sequence[FitStage],
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    slab_height: int,
+    share: float = 1.0,
+    num_slices: int | None = None,
 ) -> float:
     """Seconds that stages will take where nothing else runs, within a factor of two or so.
 
@@ -31,14 +36,16 @@ def expected_seconds(
         grid: of the volume.
         slab_height: slices of the slab that choices are made on.
         share: of the voxels that are not skipped.
+        num_slices: that are fitted, those counted twice that two blocks share; by default all of the volume.
     """
+    num_slices = grid.height if num_slices is None else num_slices
     slice_step = (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
     total = _START
     for stage in stages:
         if stage.kind in ("noise", "candidates"):
             total += stage.num_steps * stage.fits * _NOISE_STEP
         else:
-            slices = slab_height if stage.where == "slab" else grid.height
+            slices = slab_height if stage.where == "slab" else num_slices
             total += stage.num_steps * stage.fits * slices * slice_step / 8**stage.halvings
     return total
 

@@ -130,9 +130,28 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
     library: Any = dask.distributed  # it has no types
     try:
         for task in library.as_completed(tasks, loop=client.loop):
-            task.result()
+            _require_done(task)
     finally:
         client.cancel(tasks)
+
+
+def _require_done(task: Any) -> None:
+    """Raise what a task raised, in words where its workers or the scheduler are gone.
+
+    Raises:
+        ConnectionError: they are.
+    """
+    from dask.distributed import CancelledError, KilledWorker
+
+    try:
+        task.result()
+    except KilledWorker as error:
+        raise ConnectionError(
+            "every worker that fitted one of the blocks died, most likely for want of memory; take fewer workers, or lower "
+            "blocks (--slices-at-once)"
+        ) from error
+    except CancelledError as error:
+        raise ConnectionError("the Dask scheduler is gone, and what its workers were fitting with it") from error
 
 
 def _no_result(*_: Any) -> Any:

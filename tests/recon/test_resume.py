@@ -91,6 +91,26 @@ def test_thirty_kills_at_random_moments_lose_nothing(series, whole, tmp_path):
         assert same(kill_and_resume(series, whole, tmp_path / str(seed), 5, random.Random(seed)), whole[0])
 
 
+@pytest.mark.slow
+def test_kills_lose_no_finished_block_and_change_not_a_bit(series, tmp_path):
+    def blocks(out):
+        return {
+            file: file.stat().st_mtime_ns for file in out.with_name(f"{out.name}.checkpoint").glob("blocks-*/*.npy")
+        }
+
+    out, more, known = tmp_path / "volume.npy", ["--slices-at-once", 4], {}
+    finish(command(series, tmp_path / "whole.npy", *more), tmp_path / "log")
+    for least in (2, 4, 6):  # two files each
+        process = start(command(series, out, *more), tmp_path / "log")
+        wait_for(lambda least=least: len(blocks(out)) >= least, process)
+        kill(process)
+        found = blocks(out)
+        assert known.items() <= found.items()
+        known, more = found, ["--slices-at-once", 4, "--resume"]
+    finish(command(series, out, *more), tmp_path / "log")
+    np.testing.assert_array_equal(np.load(out), np.load(tmp_path / "whole.npy"))
+
+
 def steps_told(log):
     """(title, step, steps) of every line of progress."""
     found = re.findall(r"^(.*): (\d+)/(\d+), ", log.read_text(), re.MULTILINE)

@@ -18,8 +18,9 @@ from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
 from recon.projection.tile import Tile
-from recon.scale.blocks import HALO, BlockFiles, block_memory, blocks
+from recon.scale.blocks import HALO, BlockFiles, Blockwise, block_memory, blocks
 from recon.scale.memory import _group_available, choose_slices, needed_memory
+from recon.scale.running import reconstruct_in_blocks
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -59,6 +60,16 @@ def test_blocks_cover_every_slice_once():
         parts = blocks(height, at_once, 8)
         assert [row for part in parts for row in range(height)[part.rows]] == list(range(height))
         assert max(part.rows.stop - part.rows.start for part in parts) <= at_once
+
+
+def test_blocks_of_a_low_volume_that_see_the_same_slices_are_files_of_their_own(tmp_path):
+    """Their shares of the power by shell differ."""
+    files, parts = BlockFiles(tmp_path, error_bars=True), blocks(16, 8, HALO)
+    assert parts[0].wide == parts[1].wide
+    for part in parts:
+        assert not files.finished(part)
+        files.write(part, *(np.full((2, 2, 2), part.rows.start, np.float32) for _ in files.names))
+    assert [int(files.read(part)[0].max()) for part in parts] == [0, 8]
 
 
 def test_a_finished_block_is_not_computed_again(tmp_path):
@@ -160,6 +171,28 @@ def _kill_once(process: int, folder: Path):
     thread = threading.Thread(target=watch)
     thread.start()
     return thread
+
+
+def _die(series, block):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_workers_that_all_die_are_one_line(tmp_path):
+    """As where their memory is short: the error names that, and no fault of the library."""
+    dask = pytest.importorskip("dask.distributed")
+    from dask import config
+
+    _, noisy = scene("shells", 16, 30.0)
+    grid, blockwise = VolumeGrid.of(noisy), Blockwise(_die, lambda *_: None)
+    options = {"scratch": tmp_path / "v.npy", "folder": None, "slices_at_once": 8}
+    local = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    with (
+        config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.LocalCluster(**local) as cluster,
+        dask.Client(cluster, set_as_default=False) as client,
+        pytest.raises(ConnectionError, match=r"died.*fewer workers"),
+    ):
+        reconstruct_in_blocks(blockwise, noisy, grid, client=client, **options)
 
 
 def test_an_unreachable_scheduler_is_one_line(monkeypatch):

@@ -1,0 +1,110 @@
+"""What is found out before a volume is reconstructed: its plan, in the memory of a few slices, and its blocks, once."""
+
+import numpy as np
+import pytest
+
+from recon.commands.running import chosen_slices
+from recon.fields.fields import MultiresolutionField
+from recon.joint.checkpoint import Journal
+from recon.joint.joint import JointReconstructor
+from recon.scale.blocks import HALO, SETTLED_ON, blocks, fitted_slices
+from recon.scale.running import assemble
+from recon.series.tilt_series import TiltSeries, VolumeGrid, write_tilt_series
+from recon.simulate.phantoms import shells
+from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+
+
+@pytest.fixture(scope="module")
+def series():
+    """A series of 80 slices, of which those in the middle show something."""
+    clean, _ = clean_tilt_series(shells(32, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0))
+    tall = np.ones((clean.num_tilts, 80, 32), np.float32)
+    tall[:, 24:56] = clean.images
+    return add_noise(TiltSeries(tall, clean.tilt_angles), ACQUISITIONS["clipped"].noise(), seed=2)
+
+
+@pytest.fixture
+def tilts(series, tmp_path):
+    write_tilt_series(tmp_path / "tilts.mrc", series)
+    return tmp_path / "tilts.mrc"
+
+
+def test_planning_makes_no_field_of_the_whole_volume(series):
+    """`--dry-run` of a volume that does not fit into memory must not need that memory."""
+    heights = []
+
+    def make_field(shape, **options):
+        heights.append(shape[1])
+        return MultiresolutionField(shape, **options)
+
+    grid, fit = VolumeGrid.of(series), JointReconstructor(make_field=make_field, slab=8)
+    _, slab, share = fit.plan(series, grid)
+    assert heights
+    assert max(heights) <= 16
+    assert slab == 8
+    assert share == pytest.approx(fit.signal_model(series, grid).occupancy.share, abs=1e-6)
+
+
+def test_a_dry_run_names_blocks_memory_disk_and_time(tilts, tmp_path, run):
+    command = ["reconstruct", tilts, "-o", tmp_path / "v.mrc", "--dry-run"]
+    whole, parts = run(*command), run(*command, "--slices-at-once", 20)
+    assert whole["slices_at_once"] is None
+    assert whole["disk"].startswith("blocks: none; disk: about")
+    assert parts["slices_at_once"] == 20
+    assert parts["disk"].startswith("blocks: 4 of 20 slices at most; disk: about")
+    assert parts["memory"].startswith("memory: about")
+    assert parts["expected_seconds"] > 0
+    assert not (tmp_path / "v.mrc").exists()
+    assert not (tmp_path / "v.mrc.checkpoint").exists()
+
+
+def test_slices_of_a_halo_are_fitted_twice():
+    wide = [part.wide for part in blocks(80, 20, HALO)]
+    assert fitted_slices(80, 20) == sum(each.stop - each.start for each in wide) + SETTLED_ON
+    assert fitted_slices(30, 30) == 60
+
+
+def test_a_run_that_resumes_keeps_its_blocks_however_much_memory_is_free(tilts, tmp_path, run, refused, monkeypatch):
+    """With other blocks, those that are done would be computed again."""
+    solved = []
+    command = ["reconstruct", tilts, "-o", tmp_path / "v.mrc", "--method", "sirt", "--steps", 4]
+
+    def no_room(*_):
+        raise OSError(28, "No space left on device")
+
+    def counted(method, tilt_series, block, files, solve=None):
+        solved.append(files.finished(block))
+        original(method, tilt_series, block, files)
+
+    from recon.scale import running
+
+    original = running.solve_block
+    monkeypatch.setattr("recon.scale.running.solve_block", counted)
+    monkeypatch.setattr("recon.scale.memory.choose_slices", lambda *_, **__: 16)
+    monkeypatch.setattr("recon.scale.running.assemble", no_room)
+    assert "--resume" in refused(*command)
+    assert solved == [False] * 5
+    monkeypatch.setattr("recon.scale.memory.choose_slices", lambda *_, **__: None)
+    monkeypatch.setattr("recon.scale.running.assemble", assemble)
+    solved.clear()
+    assert run(*command, "--resume")["slices_at_once"] == 16
+    assert solved == [True] * 5
+    assert run(*command)["slices_at_once"] is None  # a new run chooses for itself
+
+
+def test_workers_cannot_join_a_volume_that_was_begun_in_one_piece(series, tmp_path):
+    grid, kept = VolumeGrid.of(series), Journal(tmp_path / "kept", {})
+    assert chosen_slices(kept, series, grid, "l2", "cpu", None) is None
+    kept.keep()  # writes
+    again = Journal(tmp_path / "kept", {}, resume=True)
+    with pytest.raises(ValueError, match=r"in one piece.*leave out --workers"):
+        chosen_slices(again, series, grid, "l2", "cpu", 2)
+    assert chosen_slices(Journal(tmp_path / "kept", {}), series, grid, "l2", "cpu", 2) == 40
+    assert chosen_slices(Journal(tmp_path / "new", {}), series, grid, "l2", "cpu", 1) is None
+
+
+@pytest.mark.parametrize("option", [("--workers", 2), ("--scheduler", "tcp://127.0.0.1:9")])
+def test_workers_of_a_method_without_blocks_are_refused(tilts, tmp_path, refused, option):
+    said = refused("reconstruct", tilts, "-o", tmp_path / "v.mrc", "--method", "wbp-denoised", *option)
+    assert f"{option[0]}: method wbp-denoised" in said
+    assert "wbp, or leave out" in said
