@@ -259,7 +259,9 @@ class LevelMasses:
         if share.any():
             noise = np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
             cumulant = cumulant + noise
-        exponent = cumulant * (electrons + 0.5 * spread * cumulant)  # a gamma distribution to second order
+        # a gamma distribution to second order, of a variance up to its mean: beyond that, as where an offset leaves a level no
+        # electrons, the second order would grow to probabilities of any size
+        exponent = cumulant * (electrons + 0.5 * np.minimum(spread, electrons) * cumulant)
         wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # where that saves a logarithm
         if wide.size:
             exponent[:, wide], _ = _gamma_mixed(cumulant[:, wide], electrons[:, wide], spread[:, wide], False)
