@@ -23,9 +23,9 @@ UNRESOLVED = 0.1, 0.4
 electrons, beyond which no electron shows. The prior ends there. Coarser codes than electrons cannot tell less, and the
 likelihood would be a field of peaks where electrons and codes keep step."""
 
-MOST_ELECTRONS = 1e12
-"""Electrons of a pixel, a million full wells, which no exposure holds: beyond them an offset is so far below the pixel values that
-the likelihood overflows. The prior of the offset ends there, or a sampler's far proposal would end the calibration."""
+MOST_ELECTRONS = 1e60
+"""Electrons of a pixel beyond which a proposal is impossible: their squares are still finite numbers. Noise that does not depend
+on the signal lets the posterior reach gains as small as its prior allows, far below this, by which it is recognised."""
 
 
 class LogPosterior:

@@ -191,11 +191,12 @@ def test_signals_of_a_wrong_scale_are_brought_to_the_likely_one(factor, change):
     assert posterior.rescaled(posterior.coordinates(2.0, 100.0, 2.0)) is not None
 
 
-def test_an_offset_above_dim_levels_makes_no_probabilities_above_one():
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_offset_above_dim_levels_makes_no_probabilities_above_one(share):
     """Their signals' spread, taken to second order about no electrons, once did: bursts of two frames were refused or failed."""
     electrons = np.random.default_rng(2).gamma(4.0, 40.0, 20_000)
-    one = collect_levels([readings(np.random.default_rng(3), electrons, step=1.0)])
-    masses = LevelMasses(one).masses(np.full(2, 2.0), one.signal[[4, 12]], np.full(2, 0.15))
+    one = collect_levels([readings(np.random.default_rng(3), electrons, share=share, step=1.0)])
+    masses = LevelMasses(one).masses(np.full(3, 2.0), one.signal[[2, 4, 12]], np.full(3, 0.15))
     assert masses.max() < 1.0
     np.testing.assert_allclose(masses.sum(axis=2), 1.0, atol=1e-9)
 
