@@ -17,6 +17,7 @@ from calibration.detector.figures import (
     correctable,
     disagrees,
 )
+from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
 from calibration.detector.repair import LEAST_SHARE, Repairs
 from calibration.detector.shape import field_deviation
@@ -99,6 +100,7 @@ def judge_calibration(
     """
     reasons = [
         *_scene(repairs, correlation),
+        *_independence(pairs),
         *_correlation(pairs, correlation, repairs, figures),
         *_shape(detector, figures),
         *_range(pairs, detector, figures),
@@ -184,12 +186,33 @@ def _correlation(
     return found
 
 
+def _independence(pairs: Sequence[AlignedPair]) -> list[Reason]:
+    found = []
+    lag = correlation_in_time(pairs)
+    if abs(lag) > BIAS / 2:  # it takes twice itself off the variance
+        text = f"the noise of successive frames correlates by {lag:+.3f}: image lag, a filter over time, or a changing scene; "
+        text += f"the gain is off by about {abs(2 * lag):.0%}"
+        grade: Grade = "bad" if abs(lag) > 5 * BIAS / 2 else "doubtful"
+        found.append(
+            Reason("frames correlated", grade, text + ". Take frames apart in time, without averaging in the camera.")
+        )
+    share = max(map(contained_share, pairs))
+    if share > BIAS:
+        text = f"{share:.1%} of the long exposure's signal is the short exposure itself: the long one is a mean or sum of frames "
+        text += "with the short one among them, and the gain is too low by as much"
+        found.append(Reason("short contained", "bad", text + ". Give a short exposure that is none of them."))
+    return found
+
+
 def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
-    """Whether the first frame went through block compression."""
-    if not block_compressed(pairs[0].short):
-        return []
-    text = "the frame was compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own"
-    return [Reason("compressed", "bad", text + ". Give raw frames.")]
+    """Whether the first frame, or its long exposure, went through block compression."""
+    first = pairs[0]
+    end = " compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own. Give raw frames."
+    if block_compressed(first.short):
+        return [Reason("compressed", "bad", "the frame was" + end)]
+    if first.frames == 1 and block_compressed(first.long):
+        return [Reason("compressed", "doubtful", "the long exposure was" + end)]
+    return []
 
 
 def _shape(detector: Detector, figures: Figures) -> list[Reason]:

@@ -259,7 +259,10 @@ class LevelMasses:
         if share.any():
             noise = np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
             cumulant = cumulant + noise
-        exponent = cumulant * (electrons + 0.5 * spread * cumulant)  # a gamma distribution to second order
+        # a gamma distribution, as the fraction that agrees with it to second order: unlike the second order itself, it makes no
+        # probability above one of a spread much larger than its mean, as where an offset leaves a level no electrons
+        rate = np.maximum(electrons, 1e-9)
+        exponent = rate * cumulant / (1 - 0.5 * spread / rate * cumulant)
         wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # where that saves a logarithm
         if wide.size:
             exponent[:, wide], _ = _gamma_mixed(cumulant[:, wide], electrons[:, wide], spread[:, wide], False)

@@ -23,6 +23,10 @@ UNRESOLVED = 0.1, 0.4
 electrons, beyond which no electron shows. The prior ends there. Coarser codes than electrons cannot tell less, and the
 likelihood would be a field of peaks where electrons and codes keep step."""
 
+MOST_ELECTRONS = 1e60
+"""Electrons of a pixel beyond which a proposal is impossible: their squares are still finite numbers. Noise that does not depend
+on the signal lets the posterior reach gains as small as its prior allows, far below this, by which it is recognised."""
+
 
 class LogPosterior:
     """log p(parameters | levels) for rows of (log gain, offset or log variance, log read noise).
@@ -52,8 +56,10 @@ class LogPosterior:
         coordinates = np.atleast_2d(coordinates)
         low, high = np.log(READ_NOISE_RANGE)
         inside = (coordinates[:, 2] > low) & (coordinates[:, 2] < high) & (np.abs(coordinates[:, 0]) < 50)
-        gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
-        inside &= (offset < self.brightest) & (read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1]))
+        with np.errstate(over="ignore"):  # variances so far off that they overflow are refused in the next line
+            gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
+        inside &= (offset < self.brightest) & (self.brightest - offset < MOST_ELECTRONS * gain)
+        inside &= read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1])
         result = np.full(len(coordinates), -np.inf)
         if inside.any():
             result[inside] = self.likelihood(gain[inside], offset[inside], read_noise[inside])

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from calibration.detector.correlation import correlation_of_residuals
+from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.residual import Residual
 from calibration.exposures.compression import block_compressed
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.pipeline import measure_exposures
+from calibration.registration.aligned import align_pair
+from calibration.registration.bursts import align_burst
 
 from . import simulators as sim
 from .sabotage import CASES, corner_full
@@ -147,3 +150,45 @@ def test_darks_brighter_than_the_exposures_are_refused_in_one_line():
     dark = Burst(np.stack([sim.exposed(generator, 0 * scene, offset=5000.0) for _ in range(3)]), calibration=True)
     with pytest.raises(ValueError, match="brighter"):
         measure_exposures([ExposurePair(sim.exposed(generator, scene), sim.exposed(generator, 16 * scene))], dark=dark)
+
+
+def test_frames_that_follow_one_another_are_flagged_and_independent_ones_are_not():
+    generator = np.random.default_rng(6)
+    electrons = generator.poisson(sim.random_scene(generator, 128), (9, 128, 128)).astype(float)
+    lagging = 0.9 * electrons[1:] + 0.1 * electrons[:-1]
+    lagging, free = (np.round(100 + 2 * one + generator.normal(0, 4, one.shape)) for one in (lagging, electrons))
+    found = measure_exposures(Burst(lagging))
+    assert ("frames correlated", "bad") in [(one.name, one.grade) for one in found.verdict.reasons]
+    lag = 0.09 * 80 / (0.82 * 80 + 4)  # of 80 electrons: shot noise and a read noise of 2 electrons
+    assert correlation_in_time(found.pairs) == pytest.approx(lag, rel=0.1)
+    assert correlation_in_time(align_burst(Burst(free))[0]) == 0
+
+
+def test_a_long_exposure_that_contains_the_short_one_is_flagged():
+    generator = np.random.default_rng(7)
+    scene = sim.random_scene(generator)
+    frames = [sim.exposed(generator, scene) for _ in range(9)]
+    for long in (np.sum(frames[:8], axis=0), np.mean(frames[:8], axis=0)):
+        found = measure_exposures([ExposurePair(frames[0], long)])
+        assert ("short contained", "bad") in [(one.name, one.grade) for one in found.verdict.reasons]
+        assert contained_share(found.pairs[0]) == pytest.approx(1 / 8, rel=0.1)
+        assert contained_share(align_pair(ExposurePair(frames[8], long))) == 0
+
+
+def test_sensitivities_of_pixels_and_sharp_scenes_are_no_contained_exposure():
+    generator = np.random.default_rng(8)
+    scene = sim.random_scene(generator)
+    uneven = scene * generator.normal(1.0, 0.05, scene.shape)
+    for electrons, ratio in ((uneven, 16), (uneven, 300), (scene, 300)):
+        short, long = sim.exposed(generator, electrons), sim.exposed(generator, ratio * electrons)
+        assert contained_share(align_pair(ExposurePair(short, long))) == 0
+
+
+def test_compression_of_the_long_exposure_alone_is_flagged():
+    cv2 = pytest.importorskip("cv2")
+    generator = np.random.default_rng(9)
+    scene = sim.random_scene(generator, mean=30.0)
+    long = sim.exposed(generator, 16 * scene, gain=0.1, offset=10.0).clip(0, 255).astype(np.uint8)
+    stored = cv2.imdecode(cv2.imencode(".jpg", long, [cv2.IMWRITE_JPEG_QUALITY, 80])[1], cv2.IMREAD_GRAYSCALE)
+    reasons = measure_exposures([ExposurePair(sim.exposed(generator, scene), stored)]).verdict.reasons
+    assert ["the long exposure was" in one.text for one in reasons if one.name == "compressed"] == [True]

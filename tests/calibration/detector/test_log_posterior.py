@@ -10,6 +10,7 @@ from scipy import stats
 
 from calibration.detector.cells import collect_cells
 from calibration.detector.levels import Levels, collect_levels
+from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, _start, maximum_likelihood
 from calibration.detector.posterior import potential_scale_reduction
 
@@ -188,3 +189,19 @@ def test_signals_of_a_wrong_scale_are_brought_to_the_likely_one(factor, change):
     assert final.offset is None
     assert float(np.median(final.levels[0].signal)) == pytest.approx(middle, rel=4e-3)
     assert posterior.rescaled(posterior.coordinates(2.0, 100.0, 2.0)) is not None
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_offset_above_dim_levels_makes_no_probabilities_above_one(share):
+    """Their signals' spread, taken to second order about no electrons, once did: bursts of two frames were refused or failed."""
+    electrons = np.random.default_rng(2).gamma(4.0, 40.0, 20_000)
+    one = collect_levels([readings(np.random.default_rng(3), electrons, share=share, step=1.0)])
+    masses = LevelMasses(one).masses(np.full(3, 2.0), one.signal[[2, 4, 12]], np.full(3, 0.15))
+    assert masses.max() < 1.0
+    np.testing.assert_allclose(masses.sum(axis=2), 1.0, atol=1e-9)
+
+
+def test_a_proposal_that_overflows_is_impossible_and_raises_no_warning(levels):
+    posterior = LogPosterior(levels)
+    with np.errstate(all="raise"):
+        assert np.isneginf(posterior(np.array([[-10.86, 710.0, 2.9], [-10.86, 900.0, 2.9]]))).all()
