@@ -198,7 +198,9 @@ def _report(out: Output, findings: Findings) -> None:
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"Pair {number}: {describe_registration(pair)}")
     out.line("\nDetector: " + describe_detector(findings))
-    out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
+    out.line(
+        "\nDivergences in units of 1e-4, each beside its floor: the value that samples of the model itself would reach"
+    )
     out.table(TABLE_HEADER, table_rows(findings.scores))
     out.line("\n" + "\n".join(judge(findings)))
 
