@@ -15,7 +15,7 @@ def benchmark(
         list[str] | None,
         typer.Argument(
             help="Benchmarks to run: rivals, slow-rivals, resolution, paper-table, ablations, needle, sabotage; "
-            "rivals by default."
+            "the first by default."
         ),
     ] = None,
     size: Annotated[int | None, typer.Option(help="Voxels along each edge; 64, or 48 with --quick.")] = None,
