@@ -97,8 +97,8 @@ def _registration(found: Part) -> str:
     text = (
         f"`{COMMAND} registration`. Pairs of 256² pixels, with an exposure ratio of 16 and an SNR of 2 to 5 in the short "
         "exposure, are rotated by up to 3° and shifted by up to 10 %. The error is the rms over the frame against the known "
-        "transform, in pixels. A failure is *reported* if `register` refuses the pair, and *silent* if it returns a transform with an "
-        "error above the goal."
+        "transform, in pixels. A failure is *reported* if `register` refuses the pair, and *silent* if it returns a transform "
+        "with an error above the goal."
     )
     return f"## Registration\n\n{text}\n\n{table(header, rows)}"
 
