@@ -203,8 +203,8 @@ def _astra(rows: dict[str, Cell]) -> str:
     return (
         f"ASTRA's SIRT on the CPU works slice by slice with one thread. It took {part:.0f} s for {slices} slices in the middle "
         f"of 512³ at the best number of iterations by the truth ({row['setting']}, {row['psnr of the slices']:.2f} dB there), "
-        f"which is {part * row['size'] / slices:.0f} s for all {row['size']} slices. `sirt-512`, with two threads and an automatic "
-        f"number of iterations, took {ours['seconds']:.0f} s."
+        f"which is {part * row['size'] / slices:.0f} s for all {row['size']} slices. `sirt-512`, with two threads and an "
+        f"automatic number of iterations, took {ours['seconds']:.0f} s."
     )
 
 
