@@ -263,12 +263,16 @@ def needle(folder: Path) -> str:
         header, rows = benchmark_needle.table(cells)
         for noise, left_out in dict.fromkeys(row[:2] for row in rows):
             chosen = [row[2:] for row in rows if row[:2] == (noise, left_out)]
-            parts += [f"## {noise.capitalize()}, {_tilts(left_out)} left out", _table(header[2:], chosen)]
+            parts += [f"## {_noise(noise).capitalize()}, {_tilts(left_out)} left out", _table(header[2:], chosen)]
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
             likeliest = min(chosen, key=lambda row: float(row[2]))
             parts += [f"Best by PSNR: {chosen[0][0]}; by NLL: {likeliest[0]}.", _absent(absent)]
         parts += [_command("needle", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "needle")])
+
+
+def _noise(noise: str) -> str:
+    return "no added noise" if noise == "as measured" else noise
 
 
 def _tilts(left_out: str) -> str:
@@ -279,7 +283,7 @@ def _needle_panels(cells: Content) -> list[dots.Panel]:
     """PSNR of every method, best first, for each noise and gap."""
     panels: dict[str, dict[str, float]] = {}
     for noise, left_out, method, psnr, *_ in benchmark_needle.table(cells)[1]:
-        panels.setdefault(f"{noise}, {_tilts(left_out)} left out", {})[method] = float(psnr)
+        panels.setdefault(f"{_noise(noise)}, {_tilts(left_out)} left out", {})[method] = float(psnr)
     return [(title, "PSNR of the left-out tilts (dB)", {"": values}) for title, values in panels.items()]
 
 
