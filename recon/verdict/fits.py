@@ -47,10 +47,10 @@ def _weight(tried: dict[float, float]) -> list[Finding]:
         return []
     best = min(tried, key=lambda weight: tried[weight])
     if best == min(tried):  # the fit follows something that is no noise
-        words = f"the held-out pixels prefer a weight below the lowest one tried, {best:.2g}"
+        words = f"held-out pixels prefer a weight of the regulariser below the lowest one tried, {best:.2g}"
         return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
     if best == max(tried):  # nothing but the regulariser helps: what is left is misfit, and the volume turns blocky
-        words = f"the held-out pixels prefer a weight above the highest one tried, {best:.2g}"
+        words = f"held-out pixels prefer a weight of the regulariser above the highest one tried, {best:.2g}"
         return [
             Finding(
                 "weight",
