@@ -28,28 +28,39 @@ if TYPE_CHECKING:
 def calibrate(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
     short: Annotated[
-        list[Path] | None, typer.Option(help="Short exposures in order; without --long, a stack or files of a burst.")
+        list[Path] | None,
+        typer.Option(help="Short exposures, in order; without --long, the frames of a burst (a stack or files)."),
     ] = None,
-    long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short one, or one for all.")] = None,
+    long: Annotated[
+        list[Path] | None, typer.Option(help="Long exposures: one for each short one, or one for all.")
+    ] = None,
     dark: Annotated[
-        list[Path] | None, typer.Option(help="Two or more frames without light: they fix the offset.")
+        list[Path] | None, typer.Option(help="Two or more frames without light; they fix the offset.")
     ] = None,
     flat: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Equal frames of even illumination; without --short a stack for each level of light (EMVA 1288)."
+            help="Equal frames of even illumination; without --short, a stack for each level of light (EMVA 1288)."
         ),
     ] = None,
-    flat_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each level of --flat, s.")] = None,
-    dark_time: Annotated[list[float] | None, typer.Option(help="Exposure time of each stack of --dark, s.")] = None,
+    flat_time: Annotated[
+        list[float] | None, typer.Option(help="Exposure time of each level of --flat, in seconds.")
+    ] = None,
+    dark_time: Annotated[
+        list[float] | None, typer.Option(help="Exposure time of each stack of --dark, in seconds.")
+    ] = None,
     kind: Annotated[
         str,
         typer.Option(
-            help="auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, physics-flow."
+            help="Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, "
+            "spline, physics-flow."
         ),
     ] = "auto",
     exposure_ratio: Annotated[
-        float | None, typer.Option(help="Long over short, if one detector setting took both: it fixes the offset.")
+        float | None,
+        typer.Option(
+            help="Exposure time of the long over that of the short exposure, at one detector setting; it fixes the offset."
+        ),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for report.html.")] = None,
     overwrite: OverwriteOption = False,
@@ -57,7 +68,7 @@ def calibrate(
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Learn a detector's gain, offset, read noise and noise model from short and long exposures of one scene."""
+    """Learn a detector's gain, offset, read noise and noise model from exposure pairs, a burst, or flats and darks."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.camera import MAPS, map_path
@@ -187,7 +198,9 @@ def _report(out: Output, findings: Findings) -> None:
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"Pair {number}: {describe_registration(pair)}")
     out.line("\nDetector: " + describe_detector(findings))
-    out.line("\nDivergences in units of 1e-4, each beside what the model's own samples would give")
+    out.line(
+        "\nDivergences in units of 1e-4, each beside its floor: the value that samples of the model itself would reach"
+    )
     out.table(TABLE_HEADER, table_rows(findings.scores))
     out.line("\n" + "\n".join(judge(findings)))
 

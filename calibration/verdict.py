@@ -118,11 +118,9 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
     found = []
     if repairs.changed > MOST_CHANGED:
         grade: Grade = "bad" if repairs.changed > 0.2 else "doubtful"
-        text = (
-            f"{repairs.changed:.1%} of the pixels lie in places that changed between the exposures; they were left out"
-        )
+        text = f"{repairs.changed:.1%} of the pixels lie in places that changed between the exposures and were left out"
         found.append(
-            Reason("scene changed", grade, text + ". Check the residual map, or expose a scene that stands still.")
+            Reason("scene changed", grade, text + ". Check the residual map, or record a scene that does not move.")
         )
     causes = {
         "blur": "blur, drift or another focus of one exposure",
@@ -141,10 +139,12 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
             Reason("scene misfit", "bad" if share > 5 * LEAST_SHARE else "doubtful", text + " (not modelled).")
         )
     elif left or correlation.found:
-        text += ". A kernel fitted between the exposures does not explain it all: take the exposures anew"
+        text += ". A kernel fitted between the exposures does not explain it completely: repeat the exposures"
         found.append(Reason("scene misfit", "bad", text + "."))
     else:
-        text += ". A kernel fitted between the exposures explains it; the figures are those after it, a few percent uncertain"
+        text += (
+            ". A kernel fitted between the exposures explains it; the corrected figures are uncertain by a few percent"
+        )
         found.append(Reason("scene misfit", "doubtful", text + "."))
     return found
 
@@ -155,17 +155,19 @@ def _correlation(
     found = []
     for name, deviation in (("rows", repairs.rows), ("columns", repairs.columns)):
         if deviation:
-            text = f"{name} have offsets of their own, {deviation:.3g} counts rms; they were taken out before the measurement"
-            found.append(Reason(f"{name[:-1]} offsets", "doubtful", text + ". Model them by ScanNoise(model)."))
+            text = f"{name} have individual offsets, {deviation:.3g} counts rms; they were subtracted before the measurement"
+            found.append(Reason(f"{name[:-1]} offsets", "doubtful", text + ". ScanNoise(model) models them."))
     if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
         lag = int(np.argmax(np.abs(correlation.value)))
         distance, value = tuple(int(step) for step in correlation.lags[lag]), correlation.value[lag]
-        text = f"pixels at the distance (y, x) = {distance} correlate by {value:+.3f}: the frames were filtered, resampled, or "
-        text += "carry afterglow or interference"
+        text = (
+            f"pixels at the distance (y, x) = {distance} have a correlation of {value:+.3f}: the frames were filtered "
+        )
+        text += "or resampled, or contain afterglow or interference"
         if correctable(correlation, repairs):
             text += (
-                f". If that keeps the mean, the variance was {figures.factor:.3g} times as large before, and the gain "
-                "reported is the one before; per pixel of the recorded frame it is "
+                f". If this keeps the mean, the variance before it was {figures.factor:.3g} times as large. The reported gain "
+                "is that before it; per pixel of the recorded frame the gain is "
                 f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Give raw frames to be sure"
             )
             grade: Grade = (
@@ -176,12 +178,12 @@ def _correlation(
         found.append(Reason("correlated pixels", grade, text + "."))
     found += compression(pairs)
     if correlation.period:
-        text = f"the noise repeats itself every {correlation.period:.3g} pixels: the frames were resampled "
+        text = f"the noise is periodic, every {correlation.period:.3g} pixels: the frames were resampled "
         if correlation.step != 1 and correctable(correlation, repairs):
-            text += f"by {1 / correlation.step:.2g} with linear interpolation; that was taken out of the gain, to a few percent"
+            text += f"by {1 / correlation.step:.2g} with linear interpolation; the gain is corrected for it, to a few percent"
             grade = "doubtful"
         else:
-            text, grade = text + "or compressed, so that the gain is not the camera's", "bad"
+            text, grade = text + "or compressed, so that the gain is not that of the camera", "bad"
         found.append(Reason("periodic noise", grade, text + ". Give raw frames."))
     return found
 
@@ -218,8 +220,8 @@ def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
 def _shape(detector: Detector, figures: Figures) -> list[Reason]:
     found = []
     line, gain = detector.line, detector.posterior.gain.median
-    by_line = " Gain is reported by photon transfer, which holds for any detector of independent events"
-    by_line += ", times its excess-noise factor" + (
+    by_line = " The reported gain is that of photon transfer, which applies to any detector of independent events"
+    by_line += ", times the excess-noise factor" + (
         "; without dark frames offset and read noise are not determined." if detector.offset is None else "."
     )
     if detector.misfit > LARGEST_MISFIT:
@@ -229,21 +231,25 @@ def _shape(detector: Detector, figures: Figures) -> list[Reason]:
         text = f"the histograms are more even than independent pixels can be (χ² per degree of freedom {detector.misfit:.2f})"
         found.append(Reason("too even", "doubtful", text + ": values were rescaled or filtered. Give raw frames."))
     if disagrees(detector):
-        text = f"the shape of the noise says {gain:.4g} counts/e⁻ and its variance {line.gain:.4g}."
+        text = f"the gain is {gain:.4g} counts/e⁻ by the shape of the noise and {line.gain:.4g} by its variance."
         grade: Grade = "bad" if abs(gain / line.gain - 1) > 5 * LARGEST_DISAGREEMENT else "doubtful"
         found.append(Reason("shape against variance", grade, text + by_line))
     if detector.codes > MOST_UNEVEN_CODES:
         text = (
             f"the converter's codes are uneven: their widths differ by {detector.codes:.0%} rms from their neighbours'"
         )
-        text += ". Frames that were rescaled and rounded again look so, and cameras that join two converters; gain and variance"
-        text += " hardly change, but a noise model that rounds evenly does not repeat these steps"
-        found.append(Reason("uneven codes", "doubtful", text + ". Give raw frames if these are not."))
+        text += (
+            ". Frames that were rescaled and rounded again show this, and so do cameras that combine two converters. "
+        )
+        text += "Gain and variance hardly change, but a noise model that rounds evenly does not reproduce these steps"
+        found.append(Reason("uneven codes", "doubtful", text + ". If the frames are not raw, give the raw ones."))
     if detector.uneven > LARGEST_UNEVENNESS:
-        text = f"the pixels' own variances differ by {detector.uneven:.0%} rms at equal signal (sCMOS, hot pixels)."
+        text = (
+            f"the variances of single pixels differ by {detector.uneven:.0%} rms at equal signal (sCMOS, hot pixels)."
+        )
         found.append(Reason("uneven pixels", "doubtful", text + " Flats and darks give per-pixel maps." + by_line))
     if line.bent:
-        text = "the variance is no straight line in the signal: saturation, a rescaled converter, or light that changed"
+        text = "the variance does not grow linearly with the signal: saturation, a rescaled converter, or light that changed"
         found.append(Reason("bent line", "doubtful", text + ". Look at the photon-transfer plot."))
     return found
 
@@ -253,19 +259,19 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures) -
     gain = figures.gain
     half = (gain.q95 - gain.q05) / (2 * gain.median)
     if half > WIDEST_GAIN:
-        text = f"the gain is known to ±{half:.0%} only; give more exposures, more contrast, or flats at several levels"
+        text = f"the uncertainty of the gain is ±{half:.0%}; give more exposures, more contrast, or flats at several levels"
         found.append(Reason("gain uncertain", "doubtful", text + "."))
     field = field_deviation(pairs)
     if field > MOST_UNEVEN_FIELD:
         text = f"at equal signal the noise's variance differs by {field:.0%} rms across the field: the frames were divided by a "
-        text += "flat field or corrected for shading, so that the gain is not one"
-        found.append(Reason("uneven field", "doubtful", text + ". Give frames as they were before."))
+        text += "flat field or corrected for shading, so that no single gain applies"
+        found.append(Reason("uneven field", "doubtful", text + ". Give the uncorrected frames."))
     shares = [full_share(pair) for pair in pairs]
     if max(shares) > 0.001:
         text = (
             f"{max(shares):.1%} of the pixels pile up at the brightest values, below the converter's end: a full well"
         )
-        found.append(Reason("saturation", "doubtful", text + ". Expose for a shorter time."))
+        found.append(Reason("saturation", "doubtful", text + ". Use a shorter exposure."))
     return found
 
 

@@ -24,8 +24,8 @@ def page() -> str:
     program: Any = typer.main.get_command(build_app())
     parts = [
         "# Commands",
-        "Every command ends with exit code 0 (done), 1 (could not be done: one line says why and what to do), 2 (wrong usage) or "
-        "130 (interrupted: one line says how to resume). With `--json` the last line of standard output is one JSON object.",
+        "Exit codes: 0 (done), 1 (failed; one line states why and what to do), 2 (wrong usage), 130 (interrupted; one line "
+        "states how to resume). With `--json` the last line of standard output is one JSON object.",
     ]
     for name, command in program.commands.items():
         parts.append(f"## noiseflow {name}")

@@ -91,7 +91,7 @@ class Reconstruction:
             return None
         return (
             "error bars of a quiet series cannot be relied on: the fit was least squares with one width for all pixels, "
-            "which is too wide where the sample is dark, and misalignment is in no error bar"
+            "which is too wide where the sample is dark, and no error bar covers misalignment"
         )
 
     @property

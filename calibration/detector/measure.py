@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from noiseflow.commands.console import Progress
 
 EXCESS_NOISE = (
-    "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise shows only gain times "
-    "the excess-noise factor: read 'gain' as that product."
+    "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only gain times "
+    "the excess-noise factor: 'gain' is then this product."
 )
 
 LEAST_GAIN = 1e-4

@@ -24,7 +24,7 @@ def describe_camera_verdict(camera: Camera) -> list[str]:
     """The grade and its reasons, a sentence each."""
     grade = camera.verdict.grade
     if grade == "good":
-        return ["Verdict: good. The figures can be believed within their intervals; no assumption fails its test."]
+        return ["Verdict: good. You can trust the figures within their intervals; every assumption passed its test."]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
     return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.reasons)]
 

@@ -30,9 +30,7 @@ from noiseflow.report import Report, provenance
 LARGEST_MISALIGNMENT = 0.1
 """Pixels of registration error that leave no trace in the residuals."""
 
-UNKNOWN_READ_NOISE = (
-    "The read noise is not identifiable from these exposures: read its upper bound; dark frames would fix it."
-)
+UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; dark frames would fix it."
 
 LEAST_DIVERGENCE = 5e-4
 """Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
@@ -89,8 +87,8 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     overall = chosen.evaluation.overall
     if overall.jsd > max(3 * overall.jsd_floor, LEAST_DIVERGENCE):
         text += (
-            f" Yet its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
-            "finite-sample floor: look at the histograms before trusting it."
+            f" However, its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
+            "finite-sample floor: look at the histograms before you use it."
         )
     return text
 
@@ -154,8 +152,8 @@ def describe_registration(pair: AlignedPair) -> str:
     ratio = f"long over short {1 / pair.scaling.slope:.4g} by their scale"
     if pair.exposure_ratio is not None and not pair.one_setting:
         ratio += (
-            f", not {pair.exposure_ratio:.4g} as given: one detector setting did not take both as they are, so that their "
-            "scale tells no offset"
+            f", not {pair.exposure_ratio:.4g} as given: the two exposures are not unprocessed frames of one detector "
+            "setting, so that their scale does not determine the offset"
         )
     return (
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
@@ -223,9 +221,9 @@ def describe_verdict(findings: Findings) -> list[str]:
     grade = findings.verdict.grade
     if grade == "good":
         return [
-            "Verdict: good. Gain, offset and read noise can be believed within their intervals; no assumption fails its test."
+            "Verdict: good. You can trust gain, offset and read noise within their intervals; every assumption passed its test."
         ]
-    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
+    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
     return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
 
 
@@ -237,8 +235,8 @@ def judge(findings: Findings) -> list[str]:
     if findings.burst is None and findings.pairs:
         worst = max(pair.registration.error_px for pair in findings.pairs)
         found.append(
-            f"The exposures lie on each other to {worst:.3f} px"
-            + (": too coarse for fine detail, so look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
+            f"The exposures are registered to {worst:.3f} px"
+            + (", which is too coarse for fine detail: look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
     return found
 
@@ -258,17 +256,17 @@ def _add_detector(page: Report, findings: Findings) -> None:
     page.text(words[0].upper() + words[1:])
     page.figure(
         photon_transfer_figure(findings.detector),
-        caption="Photon transfer: variance against signal, and what is left of it beside the line; band: 90 % of the posterior.",
+        caption="Photon transfer: variance against signal, and its residual from the line; band: 90 % of the posterior.",
     )
     if findings.correlation is not None:
         page.figure(
             correlation_figure(findings.correlation),
-            caption="Correlation of the residuals of neighbouring pixels: independent noise has none.",
+            caption="Correlation of the residuals of neighbouring pixels; zero for independent noise.",
         )
     if findings.figures is not None and findings.figures.read_noise is not None and findings.figures.offset is not None:
         page.figure(
             snr_figure(findings.figures, float(findings.detector.line.signal.max())),
-            caption="Signal-to-noise ratio of one pixel against its electrons, with the shot-noise limit.",
+            caption="Signal-to-noise ratio of one pixel against its number of electrons, with the shot-noise limit.",
         )
     page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
 
@@ -276,8 +274,8 @@ def _add_detector(page: Report, findings: Findings) -> None:
 def _add_models(page: Report, findings: Findings) -> None:
     page.heading("Noise models")
     caption = (
-        "NLL: negative log-likelihood of pixels kept apart from the fit, nats per pixel, lower is better. JSD (nats), "
-        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: what the model's own samples would give."
+        "NLL: negative log-likelihood of held-out pixels, nats per pixel; lower is better. JSD (nats), "
+        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: the value that samples of the model itself would reach."
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
     if findings.pixels is None:
@@ -285,11 +283,11 @@ def _add_models(page: Report, findings: Findings) -> None:
     histograms = histogram_figure(findings.pixels, findings.scores)
     page.figure(
         histograms,
-        caption="Residuals of the pixels kept apart at each level of signal (grey), with every model on top.",
+        caption="Residuals of the held-out pixels at each signal level (grey), with every model on top.",
     )
     page.figure(
         pit_figure(findings.scores),
-        caption="Each model on the pixels kept apart: histogram of its probability integral transform (PIT), and QQ.",
+        caption="Each model on the held-out pixels: histogram of its probability integral transform (PIT), and QQ plot.",
     )
 
 
@@ -304,7 +302,7 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
             caption="Overlay before and after registration. Magenta: short, green: long; grey where they agree.",
         )
         page.figure(
-            residual_figure(pair), caption="What is left: map, and row and column profiles. It must be structureless."
+            residual_figure(pair), caption="Residual: map, and row and column profiles. It should have no structure."
         )
     if len(findings.pairs) > most:
         page.text(f"{len(findings.pairs) - most} more pairs are not drawn.")

@@ -312,9 +312,11 @@ def main() -> None:
 
         calibration_page.write(json.loads(RESULTS.read_text(encoding="utf-8")))
         return
+    from recon.benchmarks.provenance import origin
+
     for part in [arguments.part] if arguments.part else [part for part in parts if part != "real" or arguments.data]:
         started = time.perf_counter()
-        result = measure(part, arguments) | {"seconds": time.perf_counter() - started}
+        result = measure(part, arguments) | {"seconds": time.perf_counter() - started} | origin()
         RESULTS.parent.mkdir(exist_ok=True)
         stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         RESULTS.write_text(json.dumps(stored | {part: result}, indent=1) + "\n")

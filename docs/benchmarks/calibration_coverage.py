@@ -108,16 +108,9 @@ def page(trials: dict[str, list[Row]]) -> str:
 
     lines = [
         "# Calibration: do the intervals cover?\n",
-        f"Written by `{COMMAND}` from the trials in `results/coverage_rows`. Simulated exposures of {SIZE}² pixels; gain 0.5 to "
-        "8 counts per electron, read noise 1 to 8 e⁻ and mean level 20 to 200 e⁻, uniform in the logarithm; long exposures are "
-        f"{RATIO:g} times the short ones. A cell says how many of the printed 90 % intervals hold the truth, and their median "
-        "half-width (relative; of the offset in electrons). Of 300 perfect intervals 87 to 93 % hold the truth in nine of ten "
-        "repetitions, of 100 of them 85 to 95 %. Exposures without darks or a known ratio hardly tell offset from read noise: "
-        "their intervals reach over what two priors say, little read noise and much, and since offset and read noise are "
-        "bounded (read noise from below, the offset by the darkest pixels) they hold the truth more often than nine in ten. "
-        "The gain's interval is theirs too: noise says the gain by its variance, and a little by its skewness, which read "
-        "noise dilutes. Where skewness misleads, they alone held the truth in 83 to 86 %, so that the intervals of exposures "
-        "without darks or a known ratio reach over photon transfer's, too. The command resumes rows of fewer than 300 trials.\n",
+        "Each cell shows how many of the reported 90 % intervals contain the truth, and their median half-width (relative; in "
+        "electrons for the offset). For perfect intervals, nine of ten repetitions of 300 trials lie between 87 and 93 %, of "
+        "100 trials between 85 and 95 %.\n",
         "| exposures | trials | refused | verdict good | gain | offset | read noise |\n|---|---|---|---|---|---|---|",
     ]
     cells = {f"{kind} {row['seed']}": row for kind, rows in trials.items() for row in rows}
@@ -130,7 +123,20 @@ def page(trials: dict[str, list[Row]]) -> str:
         refused = sum("refused" in row for row in rows)
         good = sum(row.get("verdict") == "good" for row in rows)
         lines.append(f"| {KINDS[kind]} | {len(rows)} | {refused} | {good} | " + " | ".join(columns) + " |")
-    return "\n".join(lines) + f"\n\n{measured_on([{'cells': cells, 'machines': []}])}\n"
+    method = (
+        f"## Method\n\nSimulated exposures have {SIZE}² pixels. Gain (0.5 to 8 counts per electron), read noise (1 to 8 e⁻) and "
+        "mean level (20 to 200 e⁻) are uniform in the logarithm; long exposures are "
+        f"{RATIO:g} times the short ones. Written by `{COMMAND}` from the trials in `results/coverage_rows`; the command resumes "
+        "rows of fewer than 300 trials.\n\n"
+        "Exposures without darks or a known ratio hardly separate offset from read noise. Their intervals cover two priors, "
+        "low and high read noise. Because offset and read noise are bounded (read noise from below, the offset by the darkest "
+        "pixels), these intervals contain the truth more often than nine times in ten. The same two priors apply to the gain: "
+        "the noise determines it by its variance and, to a lesser extent, by its skewness, which read noise dilutes. If the "
+        "skewness misleads, these priors alone contained the truth in 83 to 86 %. The intervals of exposures without darks or "
+        "a known ratio therefore also cover the result of photon transfer."
+    )
+    origin = measured_on([{"cells": cells, "machines": []}])
+    return "\n".join(lines) + f"\n\n{method}\n\n{origin}\n"
 
 
 def measure(kind: str, trials: int, stop: Callable[[], bool]) -> None:

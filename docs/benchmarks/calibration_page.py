@@ -2,38 +2,83 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from noiseflow.io import atomic_path
+from noiseflow.report import new_figure
 
 PAGE = Path(__file__).parent / "calibration.md"
+TRIALS = PAGE.parent / "results" / "calibration_rows" / "parameters.jsonl"
 COMMAND = "python docs/benchmarks/calibration.py"
 Part = dict[str, Any]
 
 
 def write(content: Part) -> None:
-    """Write the page."""
+    """Write the page and its picture."""
+    draw([json.loads(line) for line in TRIALS.read_text(encoding="utf-8").splitlines()], PAGE.with_suffix(".png"))
     with atomic_path(PAGE) as partial:
         partial.write_text(page(content), encoding="utf-8")
+
+
+def draw(trials: Sequence[Part], path: Path) -> None:
+    """The measured over the true gain and read noise of every trial, with the 90 % intervals."""
+    figure, axes = new_figure(2, width=12, height=3.6)
+    for axis, name, along, label, ticks in (
+        (axes[0, 0], "gain", "electrons", "mean level (e⁻)", (0.7, 0.8, 0.9, 1, 1.2, 1.4)),
+        (axes[0, 1], "read_noise", "read_noise", "true read noise (e⁻ rms)", (0.3, 0.5, 1, 2, 3)),
+    ):
+        trials = [trial for trial in trials if trial.get(f"{name}_found")]
+        at = np.array([trial[along] for trial in trials])
+        low, middle, high = (
+            np.array([trial[f"{name}_found"][key] / trial[name] for trial in trials])
+            for key in ("q05", "median", "q95")
+        )
+        covers = (low <= 1) & (high >= 1)
+        for chosen, colour, mark, words in (
+            (covers, "#0072B2", "o", "interval contains the truth"),
+            (~covers, "#D55E00", "s", "it does not"),
+        ):
+            bars = np.maximum([middle - low, high - middle], 0)[:, chosen]
+            axis.errorbar(at[chosen], middle[chosen], bars, fmt=mark, color=colour, ms=3, lw=0.7, label=words)
+        axis.axhline(1, color="black", lw=0.8)
+        axis.set(xscale="log", yscale="log", xlabel=label, ylabel=f"{name.replace('_', ' ')}, measured over true")
+        axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_yticks([], minor=True)
+        axis.set_ylim(ticks[0], ticks[-1] * 1.05)
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.legend(fontsize=8, title=f"{covers.sum()} of {len(covers)}", title_fontsize=8)
+    with atomic_path(path) as partial:
+        figure.savefig(partial, format="png", dpi=110, facecolor="white")
 
 
 def page(content: Part) -> str:
     """The page as Markdown."""
     head = (
         "# Calibration: registration, detector parameters, real detectors, speed\n\n"
-        f"Written by `{COMMAND} page` from `results/calibration.json`. Trials are kept line by line in "
-        "`results/calibration_rows`; interrupted runs resume."
+        "![Measured over true gain and read noise of 300 simulated pairs, with 90 % intervals](calibration.png)\n\n"
+        "*Gain and read noise of the simulated pairs of exposures under [Detector parameters](#detector-parameters): measured "
+        f"over true value. Page and picture are written by `{COMMAND} page` from `results/calibration.json` and "
+        "`results/calibration_rows`; interrupted runs resume.*"
     )
     parts = {"registration": _registration, "parameters": _parameters, "real": _real, "emva": _emva, "speed": _speed}
     return "\n\n".join([head, *(_part(name, make, content) for name, make in parts.items())]) + "\n"
 
 
 def _part(name: str, make: Any, content: Part) -> str:
-    return (
-        str(make(content[name])) if name in content else f"## {name.capitalize()}\n\nNot measured: `{COMMAND} {name}`."
-    )
+    if name not in content:
+        return f"## {name.capitalize()}\n\nNot measured: `{COMMAND} {name}`."
+    found = content[name]
+    if "recorded" in found:
+        origin = f"recorded by commit {found['recorded']}, measured on the code shortly before it"
+    else:
+        origin = f"commit {found['commit']}" if found.get("commit") else "an earlier commit, not recorded"
+    day = f", {found['date']}" if found.get("date") else ""
+    return f"{make(found)}\n\n*Measured on two cores; {origin}{day}.*"
 
 
 def _registration(found: Part) -> str:
@@ -50,9 +95,10 @@ def _registration(found: Part) -> str:
         if isinstance(one, dict)
     ]
     text = (
-        f"`{COMMAND} registration`. Pairs of 256² pixels, exposure ratio 16, SNR 2 to 5 in the short one, turned by up to 3° and "
-        "shifted by up to 10 %. Error: rms over the frame against the known transform. A failure is reported (`register` "
-        "refuses), or silent (it answers, with an error above the goal)."
+        f"`{COMMAND} registration`. Pairs of 256² pixels, with an exposure ratio of 16 and an SNR of 2 to 5 in the short "
+        "exposure, are rotated by up to 3° and shifted by up to 10 %. The error is the rms over the frame against the known "
+        "transform, in pixels. A failure is *reported* if `register` refuses the pair, and *silent* if it returns a transform "
+        "with an error above the goal."
     )
     return f"## Registration\n\n{text}\n\n{table(header, rows)}"
 
@@ -74,10 +120,10 @@ def _parameters(found: Part) -> str:
     error = (0.09 / max(number - failed, 1)) ** 0.5
     text = (
         f"`{COMMAND} parameters`. {number} simulated Poisson-Gaussian pairs of 384² pixels, {failed} refused: gain 0.5 to 20 "
-        "counts per electron, read noise 0.2 to 10 e⁻, mean level 1 to 500 e⁻, all uniform in the logarithm, 8 to 16 bits; "
-        "half of them with offset 0, so that the lower limit clips. Identifiable: the 90 % interval spans less than a factor "
-        f"of 1.5. A perfect interval's coverage scatters by {error:.1%} over so many trials. Goals: coverage 87 to 93 %, "
-        "median error of gain 1 %, of read noise 5 % where identifiable."
+        "counts per electron, read noise 0.2 to 10 e⁻, mean level 1 to 500 e⁻, all uniform in the logarithm, 8 to 16 bits. "
+        "Half of them have offset 0, so that the lower limit clips. A parameter is *identifiable* if its 90 % interval spans "
+        f"less than a factor of 1.5. The coverage of perfect intervals scatters by {error:.1%} over this number of trials. "
+        "Goals: coverage 87 to 93 %, median error of gain 1 %, of identifiable read noise 5 %."
     )
     return f"## Detector parameters\n\n{text}\n\n{table(header, rows)}"
 
@@ -106,16 +152,19 @@ def _real(found: Part) -> str:
     columns = ["detector", "gain, median", "offset, median", "read noise of the median pixel", "read noise, rms"]
     shares = found["zhuang_predicted"]
     text = (
-        f"`{COMMAND} real --data FOLDER`. Published maps of the same pixels:\n\n{table(columns, published)}\n\n"
+        f"`{COMMAND} real --data FOLDER`. Published maps of the same pixels (gain in counts/e⁻, offset in counts, read noise in "
+        f"e⁻):\n\n{table(columns, published)}\n\n"
         f"Measured from four short exposures and a long one of each colour:\n\n{table(header, rows)}\n\n"
-        "The gain comes out above the maps' by the factor given, as the scatter of these exposures does (about 20 % "
-        "above what the maps predict); χ² per degree of freedom far above 1 says that the camera's rescaled codes and "
-        "uneven pixels are no single Poisson-Gaussian detector, so that the intervals are too narrow. The offset agrees to "
-        "a few counts.\n\n"
-        f'The other detector\'s {shares["frames"]} frames: `calibrate` says "{found["zhuang_burst"]["refused"]}". '
-        "Variance of frame differences over what the maps predict: "
-        f"{shares['all']:.3f} over all pixels, {shares['dim']:.3f} over the dim 60 %, and {shares['still']:.3f} over the "
-        f"{shares['still_pixels']:.0%} of pixels where the scene stands still."
+        "- **Gain**: it exceeds that of the maps by the factor in the table. The scatter of these exposures does so too: it is "
+        "about 20 % above the prediction of the maps.\n"
+        "- **Intervals**: they are too narrow. A χ² per degree of freedom far above 1 shows that this camera, with rescaled "
+        "codes and uneven pixels, is not a single Poisson-Gaussian detector.\n"
+        "- **Offset**: it agrees to a few counts.\n\n"
+        f"`calibrate` refuses the {shares['frames']} frames of the other detector:\n\n"
+        f"> {found['zhuang_burst']['refused']}\n\n"
+        "The variance of frame differences, over the prediction of the maps, is "
+        f"{shares['all']:.3f} for all pixels, {shares['dim']:.3f} for the dimmest 60 %, and {shares['still']:.3f} for the "
+        f"{shares['still_pixels']:.0%} of pixels where the scene does not change."
     )
     return f"## Real detectors\n\n{text}"
 
@@ -128,16 +177,20 @@ def _emva(found: Part) -> str:
         for name, label in found["names"].items()
     ]
     text = (
-        f"`python docs/benchmarks/calibration_emva.py`, commit {found['commit']}. The packages emva1288 (the standard's "
+        "`python docs/benchmarks/calibration_emva.py`. The packages emva1288 (the standard's "
         f"reference implementation) and getframes measure the same frames: flats at {found['levels']} levels up to 1.2 "
         f"saturation capacities, {found['frames']} frames each, and {found['darks']} dark frames, 200² pixels; "
-        "levels of which half the "
-        "pixels are at the converter's end are left out. The emva1288 package takes two frames of each level for temporal "
-        "noise; its linearity error is the mean of the absolute deviations over the standard's range, and it reports their "
-        "extremes. Saturation is the level of largest variance, so that it comes in steps of the levels (7.5 %). noiseflow's "
-        "largest SNR is the largest measured, near a full well that cuts the noise; emva1288's is the root of its capacity. "
-        "The preset's read noise of the sCMOS camera is that of its usual pixel, both packages report the rms of all. "
-        "getframes extends its line to nine tenths of the level of largest variance, where single pixels saturate already."
+        "levels at which half of the pixels have the converter's largest value are left out.\n\n"
+        "- **Temporal noise**: emva1288 uses two frames of each level.\n"
+        "- **Linearity error**: that of emva1288 is the mean absolute deviation over the standard's range; emva1288 reports "
+        "the extremes.\n"
+        "- **Saturation**: the level of largest variance, and therefore in steps of the levels (7.5 %).\n"
+        "- **Largest SNR**: noiseflow reports the largest measured one, near a full well that reduces the noise; emva1288 "
+        "reports the square root of its capacity.\n"
+        "- **Read noise of the sCMOS camera**: the truth is that of a typical pixel; both packages report the rms of all "
+        "pixels.\n"
+        "- **Range**: getframes fits its line up to nine tenths of the level of largest variance, where single pixels already "
+        "saturate."
     )
     return f"## EMVA 1288\n\n{text}\n\n{table(['camera', 'figure', *tools], rows)}"
 
@@ -149,7 +202,8 @@ def _figure(value: float | None) -> str:
 def _speed(found: Part) -> str:
     interval = found["detector"]["gain"]
     return (
-        f"## Speed\n\n`{COMMAND} speed`: the command from files to model and report on a pair of {found['size']}² pixels takes "
+        f"## Speed\n\n`{COMMAND} speed`: from files to model and report, `noiseflow calibrate` on a pair of "
+        f"{found['size']}² pixels takes "
         f"{found['wall_seconds']:.0f} s, {found['processor_seconds']:.0f} s of processor time (goal: 60 s on two cores); gain "
         f"{interval['median']:.4f} ({interval['q05']:.4f} … {interval['q95']:.4f}), truth 2."
     )

@@ -65,12 +65,11 @@ def page(content: dict[str, Any]) -> str:
     text = (
         "# A raw series of 256² with tilts left out\n\n"
         "![PSNR of the left-out tilts for every method, a panel for each way to leave tilts out](needle_256.png)\n\n"
-        "The needle at full size, a raw HAADF-STEM series of 77 tilts of 256 × 256 pixels (data of usnistgov/etspy), aligned "
-        "as `noiseflow reconstruct --refine-alignment --tilt-axis 90` does. PSNR, NLL and what they mean are those of "
-        "{doc}`needle`. Least squares (L2) and the joint fit choose everything by themselves; WBP and SIRT "
-        "take the setting of the best PSNR on the tilts left out, which favours them. "
-        "Pixels that come from outside the raw images hold their neighbours' "
-        "values, in the tilts left out too.\n\n"
+        "This is the needle at full size, a raw HAADF-STEM series of 77 tilts of 256 × 256 pixels (data of usnistgov/etspy), "
+        "aligned as by `noiseflow reconstruct --refine-alignment --tilt-axis 90`. {doc}`needle` defines PSNR and NLL. Least "
+        "squares (L2) and the joint fit choose their settings automatically. WBP and SIRT take the settings with the best PSNR "
+        "on the left-out tilts, which favours them. Pixels from outside the raw images are filled with the values of their "
+        "neighbours, also in the left-out tilts.\n\n"
         "```sh\npython docs/benchmarks/needle_256.py needle_256_raw.mrc\n```\n"
     )
     for gap in GAPS:

@@ -54,11 +54,14 @@ def _accuracy(content: dict[str, Any]) -> str:
     size, steps = rows[0]["size"], rows[0]["num_steps"]
     draws = f", mean of {rows[0]['jsd_draws']} draws" if rows[0].get("jsd_draws", 1) > 1 else ""
     text = (
-        f"Each model is fitted to {size}² pixels of a clean and a noisy image, four fifths to fit, one fifth to judge; {steps} "
-        "steps for ours. **KL**: divergence from the truth in nats per pixel, on noise drawn afresh four times per pixel. "
-        "**NLL gap**: likelihood of the judging fifth against the truth's on the same pixels. **JSD/floor**: marginal "
-        "Jensen–Shannon divergence of fresh residuals over its mean under the model itself"
-        f"{draws}; 1 is perfect. One row:\n\n"
+        f"Each model is fitted to four fifths of {size}² pixels of a clean and a noisy image, and judged on the last fifth. The "
+        f"models of this library take {steps} steps.\n\n"
+        "- **KL**: divergence from the truth in nats per pixel, on new noise drawn four times for each pixel.\n"
+        "- **NLL gap**: negative log-likelihood of the last fifth minus that of the truth on the same pixels, in nats per "
+        "pixel.\n"
+        "- **JSD/floor**: marginal Jensen–Shannon divergence of new residuals over its mean under the model itself"
+        f"{draws}; 1 is perfect.\n\n"
+        "To measure one row, run:\n\n"
         "```sh\npython docs/benchmarks/noise_models.py accuracy --noise gamma --model SplineFlow\n```"
     )
     parts = [

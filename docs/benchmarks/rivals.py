@@ -54,22 +54,24 @@ def main() -> None:
 
 def run_time(folder: Path) -> str:
     """The page of run time against error."""
+    sizes = _sizes(folder)
     parts = [
         "# Run time against error",
-        "Each point is a whole run from tilt series to volume, set-up included; errors are computed outside the clock. "
-        "PSNR is over the range of the truth, after the gain and offset that suit best (which back-projection needs), or "
-        "raw, without them.",
+        *(
+            _wall_time(size) + f"\n\n*{size}³, one point for each setting; the other sizes are below.*"
+            for size in sizes[:1]
+        ),
+        "Each point of the pictures is a complete run from tilt series to volume, set-up included; errors are computed "
+        "outside the timed part. PSNR is over the range of the truth, either raw or after an affine match: the best gain and "
+        "offset, which back-projection needs.",
         _defaults(folder),
-        "The other tables show each method at its best setting, found by looking at the truth outside the clock, which "
-        "no user can do; the joint fit chooses its own weight and noise model within its time, and only its number of "
-        "steps is the best of three. "
-        "The oracle, a line in the figures, is the same fit given the true noise, at its "
-        "best weight. ASTRA's SIRT runs on the CPU, slice by slice; its GPU algorithms were not measured. One size is "
-        "one command:\n\n"
+        "The tables below show each method at its best setting, found from the truth outside the timed part, which no user can "
+        "do. The joint fit chooses its own weight and noise model within its time; only its number of steps is the best of "
+        "three. The oracle, a line in the figures, is the same fit with the true noise at its best weight. ASTRA's SIRT runs "
+        "on the CPU, slice by slice; its GPU algorithms were not measured. To measure one size, run:\n\n"
         "```sh\nnoiseflow benchmark rivals slow-rivals --size 64 --out docs/benchmarks/results\n"
         "python docs/benchmarks/rivals.py\n```",
     ]
-    sizes = _sizes(folder)
     for size in sizes:
         files = [*_files(folder, f"rivals-{size}-"), *_files(folder, f"slow-rivals-{size}-")]
         curves = _curves(folder, size)
@@ -78,7 +80,7 @@ def run_time(folder: Path) -> str:
         loads = [cell["load"] for file in files for cell in file["cells"].values()]
         parts += [
             f"## {size}³",
-            f"![PSNR over wall time for every method at {size}³]({_figure(size)})",
+            "" if size == sizes[0] else _wall_time(size),
             _table(header, rows),
             _unfinished(curves),
             f"{_runs(len(repeats))} Load of the machine before each run: {min(loads):.1f} to {max(loads):.1f}.",
@@ -88,13 +90,17 @@ def run_time(folder: Path) -> str:
     gaps = [f"- {', '.join(missing)} on a CPU: not measured yet."] if missing else []
     gaps += [
         "- 256³ and 512³: only the default settings.",
-        "- The method of the paper asks for 400 000 steps of about 17 s each on two cores; its curve shows the steps that "
-        "a minute sufficed for, and it is not ranked.",
-        "- quantem's implicit reconstruction runs with its own settings, but for poses, which are known here, and images "
-        "padded to the 79 pixels a side that it asks for. One pass over the data is its smallest step, and the first had "
-        "not ended after ten minutes on two cores, nor after 24 minutes on one.",
+        "- The method of the paper needs 400 000 steps of about 17 s each on two cores. Its curve shows only the first steps, "
+        "those of a minute, and it is not ranked.",
+        "- quantem's implicit reconstruction runs with its own settings, except for poses, which are known here, and images "
+        "padded to the 79 pixels a side that it needs. Its smallest step is one pass over the data; the first pass had not "
+        "ended after ten minutes on two cores, nor after 24 minutes on one.",
     ]
     return _joined([*parts, "## Not measured, or not to the end", "\n".join(gaps)])
+
+
+def _wall_time(size: int) -> str:
+    return f"![PSNR over wall time for every method at {size}³]({_figure(size)})"
 
 
 def _defaults(folder: Path) -> str:
@@ -113,8 +119,8 @@ def _defaults(folder: Path) -> str:
     return "\n\n".join(
         (
             "## With default settings",
-            "`noiseflow reconstruct` with `--method joint` and `--method l2`, without other options: weight, noise model "
-            "and number of steps are chosen by the program. Medians of three runs in turn, nothing else running.",
+            "`noiseflow reconstruct` with `--method joint` and `--method l2`, without other options: the program chooses weight, "
+            "noise model and number of steps. Times are medians of three runs in turn, with nothing else running.",
             _table(("scene", "method", "PSNR, raw (dB)", "seconds"), rows),
             "```sh\npython docs/benchmarks/joint.py speed --row chosen-64 --row chosen-96 --row chosen-256 --again\n```",
             measured_on([{"cells": cells, "machines": machines}]),
@@ -137,22 +143,11 @@ def paper_table(folder: Path) -> str:
     """The page of the paper's main table."""
     parts = [
         "# The main table of Kniesel et al. (CVPR 2022), made again",
-        "All seven methods on a scene like the paper's synthetic one: shells with virions among them, noise "
-        "that grows with the "
-        "signal, clipped, 79 tilts; 20 clean projections at angles between the tilts judge in 2D. As in the paper, errors are "
-        "min–max scaled, MSE is in units of 0.01 and DSSIM in units of 0.1; *published* are the paper's figures.",
-        "What differs from the paper: the size (it has 1000³), the scene's random numbers, and the noise, "
-        "of which the paper's model "
-        "is not published. Our L2 and joint fits are the sum of grids with this library's regulariser in place of the "
-        "nine-layer network; WBP "
-        "and SIRT are this library's, not IMOD's, at their best window, cutoff and number of iterations. "
-        "The supervised fit keeps "
-        "a flow fitted to clean and noisy images. Settings of all "
-        f"but the joint fits were searched by looking at the truth, in fits of {benchmark_search.STEPS} steps, "
-        f"of clean images {benchmark_paper.CLEAN_STEPS}. In "
-        "the printed table MSE and DSSIM of the last five rows are exchanged (the printed PSNR is that of "
-        "the other column); here "
-        "they are put right.",
+        "This page compares all seven methods on a scene like the paper's synthetic one: shells with virions among them, "
+        "noise that grows with the signal, clipped, 79 tilts. The 2D columns are measured on 20 clean projections at angles "
+        "between the tilts. As in the paper, errors are min–max scaled, MSE is in units of 0.01, DSSIM in units of 0.1 and "
+        "PSNR in dB; columns marked *published* are the paper's figures, and columns marked *affine* are matched by gain and "
+        "offset instead.",
     ]
     for name, content in _named_files(folder, "paper-table-"):
         header, rows = benchmark_paper.table(content["cells"])
@@ -160,7 +155,20 @@ def paper_table(folder: Path) -> str:
         picture = f"![Min–max PSNR of projections and volume, measured here and published]({_picture(name)})"
         parts += [f"## {_scene(name)}", picture, _table(header, rows), _standing(content["cells"]), _absent(absent)]
         parts += [_command("paper-table", name), measured_on([content])]
-    return _joined([*parts, _nothing(folder, "paper-table", " --size 96 --phantom cell")])
+    return _joined([*parts, _nothing(folder, "paper-table", " --size 96 --phantom cell"), _PAPER_DIFFERENCES])
+
+
+_PAPER_DIFFERENCES = (
+    "## What differs from the paper\n\n"
+    "- **Scene**: the size (the paper has 1000³), the random numbers, and the noise, whose model the paper does not publish.\n"
+    "- **Methods**: our L2 and joint fits use the sum of grids with this library's regulariser instead of the nine-layer "
+    "network. WBP and SIRT are those of this library, not of IMOD, at their best window, cutoff and number of iterations. The "
+    "supervised fit uses a flow that was fitted to clean and noisy images.\n"
+    "- **Settings**: those of all but the joint fits were searched with the truth, in fits of "
+    f"{benchmark_search.STEPS} steps ({benchmark_paper.CLEAN_STEPS} for clean images).\n"
+    "- **A correction**: the printed table exchanges MSE and DSSIM in its last five rows (its PSNR is that of the other "
+    "column); here they are put right."
+)
 
 
 def _standing(cells: Content) -> str:
@@ -175,8 +183,8 @@ def _standing(cells: Content) -> str:
         ("psnr min-max", "volume, min–max"),
     ):
         ranked = sorted(blind, key=lambda name: -blind[name][figure])
-        told = ", ".join(f"{name} {blind[name][figure]:.2f}" for name in ranked)
-        lines.append(f"- PSNR of the {words}, best first: {told}.")
+        scores = "; ".join(f"{name} {blind[name][figure]:.2f}" for name in ranked)
+        lines.append(f"- PSNR of the {words}, in dB, best first: {scores}.")
     return "\n".join(lines)
 
 
@@ -184,14 +192,8 @@ def ablations(folder: Path) -> str:
     """The page of the ablations."""
     parts = [
         "# What each part is worth",
-        "One thing changed at a time. PSNR of the volume and of 20 clean projections at angles between the "
-        "tilts. Least squares, L1 "
-        "and the oracle take the best weight that a bracketing search finds, in fits of "
-        f"{benchmark_search.STEPS} steps, and fields take as many; *parts* and "
-        "*flow layers* fit a radial flow at the same weight "
-        f"of {benchmark_ablations.WEIGHT:g}. The networks are the paper's nine layers, evaluated on the "
-        "whole voxel grid for all tilts "
-        "at once, with 300 steps of Adam and no total variation, on a scene half as wide.",
+        "Each table changes one part of the joint fit. PSNR, in dB, is that of the volume and of 20 clean projections at "
+        "angles between the tilts.",
     ]
     for name, content in _named_files(folder, "ablations-"):
         cells = content["cells"]
@@ -208,7 +210,15 @@ def ablations(folder: Path) -> str:
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), measured_on([content])]
     gaps = "- Networks wider than those in the table, and networks at the paper's 400 000 iterations."
-    return _joined([*parts, _nothing(folder, "ablations", " --size 64"), "## Not measured", gaps])
+    settings = (
+        "## Settings\n\n"
+        "- Least squares, L1 and the oracle take the best weight that a bracketing search finds, in fits of "
+        f"{benchmark_search.STEPS} steps; fields take as many steps.\n"
+        f"- *Parts* and *flow layers* fit a radial flow at the same weight, {benchmark_ablations.WEIGHT:g}.\n"
+        "- The networks have the paper's nine layers. They are evaluated on the whole voxel grid for all tilts at once, with "
+        "300 steps of Adam and no total variation, on a scene half as wide."
+    )
+    return _joined([*parts, _nothing(folder, "ablations", " --size 64"), settings, "## Not measured", gaps])
 
 
 def _remark(group: str, cells: Content) -> str:
@@ -216,7 +226,7 @@ def _remark(group: str, cells: Content) -> str:
     found = {key.split("/", 1)[1]: cell for key, cell in cells.items() if key.startswith(f"{group}/")}
     if group == "parts" and {"as it is", "likelihood not tabulated"} <= set(found):
         ratio = found["likelihood not tabulated"]["seconds"] / found["as it is"]["seconds"]
-        return f"Without the table the fit took {ratio:.1f} times as long, one run each."
+        return f"Without the tabulated likelihood the fit took {ratio:.1f} times as long (one run each)."
     joint = cells.get("likelihood/learnt noise (joint)")
     if group == "weight" and joint is not None:
         best = max(found, key=lambda name: found[name]["psnr raw"])
@@ -232,32 +242,37 @@ def needle(folder: Path) -> str:
     parts = [
         "# A real tilt series with tilts left out",
         "![PSNR of the left-out tilts for every method, in four panels by noise and left-out tilts, best first](needle.png)",
-        "The needle, a HAADF-STEM series of 91 tilts of 64 × 64 pixels that ships with the library "
-        "(`noiseflow/data/tilt_needle`). "
-        "Methods see some tilts and predict the others, with the one gain and offset that suit the given tilts: by least "
-        "squares for PSNR, most likely for NLL. **PSNR** is "
-        "against the left-out tilts as measured, over their range; its ceiling is their own noise and "
-        "misalignment. **NLL** is that of "
-        "the left-out tilts, as noisy as the given ones, under a Gaussian whose width depends on the "
-        "signal, fitted to the other "
-        "half of them: the same judge for all. PSNR weighs bright pixels and NLL dark ones, so hardly any method leads by "
-        "both; {doc}`../architecture` has two trials. Noise, where it is added: Poisson counts of so many in the brightest "
-        "pixel, and read noise of half a count. "
-        f"Least squares and L1 take {benchmark_search.STEPS} steps, so that they end where they would. Settings of all "
-        "but the joint fits are those of the best PSNR on the left-out "
-        "tilts, which favours them.",
+        "Each method reconstructs the needle, a HAADF-STEM series of 91 tilts of 64 × 64 pixels that ships with the library "
+        "(`noiseflow/data/tilt_needle`), from some of its tilts and predicts the others.",
+        "- **PSNR** compares the prediction with the measured left-out tilts, over their range, in dB. Their own noise and "
+        "misalignment limit it.\n"
+        "- **NLL** is the negative log-likelihood of the left-out tilts, which are as noisy as the given ones, in nats per "
+        "pixel; lower is better. It is computed under a Gaussian whose width depends on the signal, fitted to the other half "
+        "of these tilts, in the same way for all methods.\n"
+        "- PSNR weighs bright pixels and NLL dark ones, so that hardly any method leads by both; {doc}`../architecture` "
+        "reports two trials.\n"
+        "- One gain and offset, matched on the given tilts, are applied to all predictions: by least squares for PSNR, by "
+        "likelihood for NLL.\n"
+        "- In two of the tables noise is added: Poisson counts, with the stated number in the brightest pixel, and read noise "
+        "of half a count.\n"
+        f"- Least squares and L1 take {benchmark_search.STEPS} steps, so that they converge. The settings of all but the joint "
+        "fits are those with the best PSNR on the left-out tilts, which favours them.",
     ]
     for name, content in _named_files(folder, "needle-"):
         cells = content["cells"]
         header, rows = benchmark_needle.table(cells)
         for noise, left_out in dict.fromkeys(row[:2] for row in rows):
             chosen = [row[2:] for row in rows if row[:2] == (noise, left_out)]
-            parts += [f"## {noise.capitalize()}, {_tilts(left_out)} left out", _table(header[2:], chosen)]
+            parts += [f"## {_noise(noise).capitalize()}, {_tilts(left_out)} left out", _table(header[2:], chosen)]
             absent = [method for method in _METHODS if method not in [row[0] for row in chosen]]
             likeliest = min(chosen, key=lambda row: float(row[2]))
             parts += [f"Best by PSNR: {chosen[0][0]}; by NLL: {likeliest[0]}.", _absent(absent)]
         parts += [_command("needle", name), measured_on([content])]
     return _joined([*parts, _nothing(folder, "needle")])
+
+
+def _noise(noise: str) -> str:
+    return "no added noise" if noise == "as measured" else noise
 
 
 def _tilts(left_out: str) -> str:
@@ -268,7 +283,7 @@ def _needle_panels(cells: Content) -> list[dots.Panel]:
     """PSNR of every method, best first, for each noise and gap."""
     panels: dict[str, dict[str, float]] = {}
     for noise, left_out, method, psnr, *_ in benchmark_needle.table(cells)[1]:
-        panels.setdefault(f"{noise}, {_tilts(left_out)} left out", {})[method] = float(psnr)
+        panels.setdefault(f"{_noise(noise)}, {_tilts(left_out)} left out", {})[method] = float(psnr)
     return [(title, "PSNR of the left-out tilts (dB)", {"": values}) for title, values in panels.items()]
 
 

@@ -52,14 +52,15 @@ def page(content: Cell) -> str:
     parts = [
         "# Time and memory over size",
         "![Seconds and peak memory of the joint fit over voxels × tilts, shells of 64³ to the largest size measured](scale.png)",
-        "Every row is one command, `noiseflow reconstruct`, in a process of its own: 79 tilts, clipped noise, everything chosen. "
-        "Written by `python docs/benchmarks/scale.py page` from `results/scale.json`; "
-        "`python docs/benchmarks/scale.py run` measures the rows. Peak memory is the largest resident set that the operating "
-        "system saw, pages of mapped files included. *FSC 0.5* is the frequency, in cycles per voxel, at which the "
-        "shell correlation with the truth falls to one half. *Seam* is how much the volume jumps across the border of two "
-        "blocks, over neighbouring slices inside, at the border within the specimen where that is largest; beside it, the same "
-        "of the truth. *Load* is "
-        "the number of processes that waited for a core when the row began: where it is high, only processor time compares.",
+        "Every row of the table is one command, `noiseflow reconstruct` with default settings, in a separate process: 79 tilts, "
+        "clipped noise. `python docs/benchmarks/scale.py run` measures the rows; `python docs/benchmarks/scale.py page` writes "
+        "this page from `results/scale.json`.",
+        "- **Peak GiB**: the largest resident set that the operating system saw, including pages of mapped files.\n"
+        "- **FSC 0.5**: the frequency, in cycles per voxel, at which the Fourier shell correlation with the truth falls to 0.5.\n"
+        "- **Seam**: the step of the volume across the border of two blocks over that between neighbouring slices inside, at "
+        "the border within the specimen where this is largest; *truth* is the same ratio for the true volume.\n"
+        "- **Load**: the number of processes that waited for a core when the row began. If it is high, compare only the "
+        "processor time.",
         _table(rows),
         _growth(rows),
         _vacuum(rows),
@@ -68,7 +69,7 @@ def page(content: Cell) -> str:
         _astra(rows),
         _processes(rows),
         _simulated(_rows(content, "simulate/")),
-        "Seconds of different machines do not compare: on a Xeon, rows that were measured on both took 1.9 times as long.",
+        "Do not compare seconds of different machines: rows that were measured on both took 1.9 times as long on a Xeon.",
         measured_on([content]),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -88,24 +89,24 @@ def estimates(content: Cell) -> str:
     ]
     text += (
         "Not measured: computed by `python docs/benchmarks/scale.py page` for shells, 79 tilts, blocks of "
-        f"{_SLICES} slices, one thread a worker.\n\n" + "\n".join(lines) + "\n\n"
+        f"{_SLICES} slices, one thread for each worker.\n\n" + "\n".join(lines) + "\n\n"
     )
     if beside := " ".join(filter(None, (_beside(rows), _growth(rows)))):
         text += f"Measured ({{doc}}`scale`): {beside}\n\n"
     return text + (
-        f"- **Time**: at 512³ a slice of a block takes {slice_seconds:.2f} s of processor time, halo included, and what is "
-        f"settled first takes {start:.0f} s. Both grow with the area of a slice. The first runs on all workers, the second "
-        f"on one. The blocks are then put together at {_DISK / 1e6:.0f} MB a second, which is assumed. A volume without "
-        "vacuum takes as many times longer as `slab-512` does beside `shells-512`.\n"
+        f"- **Time**: at 512³ a slice of a block takes {slice_seconds:.2f} s of processor time, halo included, and the "
+        f"start, which all blocks share, takes {start:.0f} s. Both grow with the area of a slice. The blocks run on all "
+        f"workers, the start on one. The blocks are then joined at an assumed {_DISK / 1e6:.0f} MB a second. A volume without "
+        "vacuum takes longer by the ratio of `slab-512` to `shells-512`.\n"
         "- **Memory**: the estimate of `noiseflow reconstruct --dry-run`. The matrix of the projector alone is tilts × width × "
         "depth × 32 bytes, in every worker.\n"
-        "- **Disk**: the finished blocks with their halo, the volume, and the series, until the volume is whole.\n"
+        "- **Disk**: the finished blocks with their halo, the volume, and the series, until the volume is complete.\n"
         "- **Network**: the same blocks, written once and read once, and rows of the series, read once.\n\n"
-        "## What would break first\n\n"
-        "1. The matrix of the projector: 9 GiB at 2000 pixels of width and 79 tilts, 38 GiB at 4000. Wider images need tiles "
+        "## What would limit larger volumes\n\n"
+        "1. **The matrix of the projector**: 9 GiB at 2000 pixels of width and 79 tilts, 38 GiB at 4000. Wider images need tiles "
         "along x, or a projector without a matrix.\n"
-        "2. Settling runs on one worker: beyond a few dozen workers it takes most of the time.\n"
-        "3. One process puts the blocks together; 4000³ voxels are 238 GiB.\n"
+        "2. **The start** runs on one worker: beyond a few dozen workers it takes most of the time.\n"
+        "3. **Joining**: one process joins the blocks; 4000³ voxels are 238 GiB.\n"
     )
 
 
@@ -167,9 +168,9 @@ def _borders(rows: dict[str, Cell]) -> str:
         cells = [name, row["blocks"], f"{row['psnr']:.2f}", f"{row['psnr beside']:.2f}", f"{row['beside']:.3f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return (
-        "A specimen may well jump where a border happens to be. These series were reconstructed twice, the second time in blocks "
-        "with borders elsewhere, or whole; the last column is the largest of all borders, and 1 where blocks leave no trace.\n\n"
-        + "\n".join(lines)
+        "The specimen itself may have a step at a border. These series were therefore reconstructed twice, the second time as a "
+        "whole or in blocks with other borders. The last column is the largest ratio of all borders; it is 1 if blocks leave no "
+        "trace.\n\n" + "\n".join(lines)
     )
 
 
@@ -187,8 +188,8 @@ def _vacuum(rows: dict[str, Cell]) -> str:
     if not found:
         return ""
     return (
-        "Where a border lies in vacuum, the volume jumps there by at most this much of what neighbouring slices of its specimen "
-        f"differ by: {', '.join(f'{name} {seam:.1g}' for name, seam in found.items())}."
+        "At borders in vacuum, the largest step of the volume over the difference between neighbouring slices of the specimen: "
+        f"{', '.join(f'{name} {seam:.1g}' for name, seam in found.items())}."
     )
 
 
@@ -198,8 +199,8 @@ def _oracle(rows: dict[str, Cell]) -> str:
         return ""
     reached = oracle["psnr of the middle"] - joint["psnr of the middle"] <= 0.15
     return (
-        f"On the 64 slices in the middle of 512³, the volume has {joint['psnr of the middle']:.2f} dB, and a fit of these slices "
-        f"that knows the true noise {oracle['psnr of the middle']:.2f} dB at its best weight "
+        f"On the 64 slices in the middle of 512³, the volume has {joint['psnr of the middle']:.2f} dB, a fit of these slices "
+        f"with the true noise has {oracle['psnr of the middle']:.2f} dB at its best weight "
         f"({oracle['setting']}; the volume chose {joint['choices']['weight']:.3f}). The goal, at most 0.15 dB less, is "
         f"{'reached' if reached else 'missed'}."
     )
@@ -211,10 +212,10 @@ def _astra(rows: dict[str, Cell]) -> str:
         return ""
     part, slices = row["seconds of the slices"], row["slices"]
     return (
-        f"ASTRA's SIRT on the processor, which goes slice by slice with one thread, took {part:.0f} s for {slices} slices in the "
-        f"middle of 512³ at the number of iterations that suits the truth best ({row['setting']}, "
-        f"{row['psnr of the slices']:.2f} dB there): {part * row['size'] / slices:.0f} s for all {row['size']}, where "
-        f"`sirt-512`, with two threads and its number of iterations found by itself, took {ours['seconds']:.0f} s."
+        f"ASTRA's SIRT on the CPU works slice by slice with one thread. It took {part:.0f} s for {slices} slices in the middle "
+        f"of 512³ at the best number of iterations by the truth ({row['setting']}, {row['psnr of the slices']:.2f} dB there), "
+        f"which is {part * row['size'] / slices:.0f} s for all {row['size']} slices. `sirt-512`, with two threads and an "
+        f"automatic number of iterations, took {ours['seconds']:.0f} s."
     )
 
 
@@ -223,8 +224,8 @@ def _processes(rows: dict[str, Cell]) -> str:
         return ""
     one, two = (rows[name]["seconds"] for name in ("processes-1", "processes-2"))
     return (
-        f"256³ in four blocks: {two:.0f} s with two Dask workers of one thread, {one:.0f} s with one process of two threads; "
-        f"{one / two:.2f} of its speed, and the goal is 0.9 or more."
+        f"256³ in four blocks took {two:.0f} s with two Dask workers of one thread and {one:.0f} s with one process of two "
+        f"threads: {one / two:.2f} of its speed. The goal is 0.9 or more."
     )
 
 

@@ -108,15 +108,19 @@ def page(content: dict[str, Any]) -> str:
     header += [f"needle, {noise} (dB)" for noise in needle.NOISES] + ["time", "scenes"]
     picture = "![Mean gain of the volume when a number of the plan is made smaller or larger](schedule.png)"
     head = (
-        "# What each number of the plan earns\n\nA joint fit is a list of stages (`noiseflow reconstruct --dry-run` prints it); "
-        "`recon.joint.plan.Schedule` holds its numbers of steps and learning rates. Each row changes one of them. Gains are in "
-        f"the PSNR of the volume, over up to 25 scenes of {SIZE}³ voxels (five phantoms, five noises, one seed; two fits of a "
-        "scene differ by 0.1 to 0.3 dB, so only the mean and its standard error decide), and in that of the tilts left out of "
-        "the real needle. Time is the median ratio to the plan as it is; the machine had other work. The plan of these rows "
-        "also taught the noise model on the whole volume, which was given up since ({doc}`../architecture`).\n\n"
+        "A joint fit is a list of stages (`noiseflow reconstruct --dry-run` prints it); `recon.joint.plan.Schedule` contains "
+        "its numbers of steps and learning rates. Each row changes one of them.\n\n"
+        f"- **Gain, simulated**: change of the PSNR of the volume, over up to 25 scenes of {SIZE}³ voxels (five phantoms, five "
+        "noises, one seed). Two fits of a scene differ by 0.1 to 0.3 dB, so only the mean and its standard error are "
+        "significant.\n"
+        "- **Gain, needle**: change of the PSNR of the left-out tilts of the real needle.\n"
+        "- **Time**: median ratio to the unchanged plan; the machine had other work.\n\n"
+        "In these rows the noise model was also learnt on the whole volume, which was given up later "
+        "({doc}`../architecture`).\n\n"
         "```sh\npython docs/benchmarks/schedule.py run\n```"
     )
-    return "\n\n".join([head, picture, measured_on([content]), table(header, rows)]) + "\n"
+    title = "# What each number of the plan contributes"
+    return "\n\n".join([title, picture, head, table(header, rows), measured_on([content])]) + "\n"
 
 
 def panel(cells: dict[str, Any]) -> dots.Panel:

@@ -205,8 +205,8 @@ def page_of(result: dict[str, Any]) -> str:
 PAGE = """\
 # Speed and memory of likelihoods
 
-How long does a likelihood take inside a training loop, and how much memory? Seconds and peak gigabytes above the inputs, per
-10⁶ pixels, beside torch's own normal distribution and zuko's neural spline flow.
+How much time and memory does a likelihood take inside a training loop? The table shows seconds, and peak gigabytes above the
+inputs, per 10⁶ pixels, beside the normal distribution of torch and the neural spline flow of zuko.
 
 | model | type | gradient: first (s) | again (s) | (GB) | no gradient: first (s) | again (s) | wider (s) | (GB) | draws: \
 first (s) | again (s) | (GB) |
@@ -220,13 +220,13 @@ OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py
 wrote this page{quick}. `gradient` is one forward and one backward pass with respect to the signal and all parameters; the first
 one in a process also loads parts of torch. Without a gradient, inputs of 2¹⁸ pixels and more are looked up in a table that the
 first call builds; `wider` is a call with signals that reach 20 % further, which extends the table by the new rows. Memory is that
-of the first call. Each task runs in a process of its own: the median of three for float32, a single run for the other number
+of the first call. Each task runs in a separate process: the median of three for float32, a single run for the other number
 types. A dash marks a task that the model cannot do in that number type.
 
 ## What bounds the memory
 
 - Likelihoods of more than 2¹⁸ pixels are evaluated in pieces. Where a gradient is asked for, the graph of a piece is made again
-  in the backward pass, so that no more than one piece's graph exists at a time.
+  in the backward pass, so that only one graph exists at a time.
 - Shot noise with read noise, rounded or not, keeps its derivatives in place of a graph: 48 bytes per pixel at most.
 - `ScanNoise` is the exception: pixels that share an offset are evaluated together, line by line of the whole image.
 

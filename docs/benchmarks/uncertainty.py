@@ -36,35 +36,52 @@ from recon.uncertainty import error_bars, left_out_ranks, share_within, unseen_s
 HERE = Path(__file__).parent
 _SECTIONS = HERE / "results" / "uncertainty_sections"  # (volume, std, truth), z by x through the middle
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
-_HEAD = """# Error bars: do they hold the truth?
+_HEAD = """# Error bars: do they contain the truth?
 
-Written by `python docs/benchmarks/uncertainty.py page` from `results/uncertainty.json`; each row is one command. Error bars come
-from Langevin samples of the posterior: the learnt likelihood times the prior that regulariser and weight stand for. The 90 %
-interval is the volume ± 1.645·√(std² + bias²). What the missing wedge hides is known to the regulariser alone, and voxels that
-count as vacuum have no spread. Of tilts left out, the table shows the share of pixels inside the 90 % interval and, in brackets,
-the largest distance of the ranks' distribution from the uniform one."""
-_WHY = """Where coverage is lower, the truth lies above the interval: the regulariser takes contrast off thin walls and
-fine detail, and half of the error or more is in directions that no tilt saw (column "error unseen"), where
-nothing in the images can say so. Where it is higher (the slab), the regulariser is loose in those directions
-and the intervals are too wide. Per phantom: shells and virions are hollow, and the regulariser thins their walls;
-filaments are a few voxels wide and lose contrast; particles are compact and covered as they should be; the slab is
-cut off by the field of view, four fifths of its error is unseen, and its samples wander there more widely than the
-truth does. Blocks of slices give the same spread as one go under one noise model (a mean of 0.998 to 1.001 times,
-40³, blocks of 20 and of 10); where noise is chosen anew, blocks choose it on another slab, and the spread differs as
-that noise does. Error bars take noise model and weight as given: a weight that was chosen badly
-is not found out by them (8-bit particles fitted at commit 924b6ea with weight 0.006 in place of 1.1: 54 %
-covered). Column "wider by" is the factor on the half-width at which 90 % of the occupied voxels would be
-covered."""
-_LEFT_OUT = """Goal: 87 to 93 % of the pixels, and uniform ranks. A Gaussian's intervals hold the right share of clipped pixels
-by chance; the ranks show what is wrong: a distance below 0.02 under the right kind of noise, 0.17 and more
-under a Gaussian. On the real needle the check still fails: intervals are too wide. One cause was found. The noise
-model that describes a quiet series was not fitted to the end and was up to ten times too wide (a standard deviation of
-4900 against 720 detector units among bright pixels; now 630, and 88 % of the fitted pixels are covered): mended, which
-took the share from 98.2 to the one below. Another is likely, and was not tested: a quiet series is fitted and sampled by
-least squares, one width for all pixels, though what the volume leaves is about thirty times smaller where the sample is
-dark, so that samples would spread too much there. What it leaves is also misfit and no noise: it has a shape, and ranks
-need not be uniform under any noise model; misalignment is in no error bar. The program says that the error bars of a quiet series
-cannot be relied on."""
+![volume, standard deviation, true error](uncertainty.png)
+
+*Volume, standard deviation and true error of five phantoms with clipped noise, slices (z, x) through the middle.*
+
+Error bars come from Langevin samples of the posterior: the learnt likelihood times the prior that regulariser and weight
+define. The 90 % interval is the volume ± 1.645·√(std² + bias²). Only the regulariser determines what the missing wedge
+hides, and voxels that count as vacuum have no spread.
+
+Written by `python docs/benchmarks/uncertainty.py page` from `results/uncertainty.json`; each row is one command."""
+_WHY = """
+- **Coverage below 85 %**: the truth lies above the interval, because the regulariser lowers the contrast of thin walls
+  and fine detail. Half of the error or more is in directions that no tilt saw (column *error unseen*), about which the
+  images contain no information.
+- **Coverage above 95 %** (the slab): the regulariser is loose in these directions, and the intervals are too wide.
+- **By phantom**: shells and virions are hollow, and the regulariser thins their walls. Filaments are a few voxels wide and
+  lose contrast. Particles are compact, and their coverage is as it should be. The field of view cuts the slab off: four
+  fifths of its error is unseen, and its samples vary more widely there than the truth does.
+- **Blocks of slices** give the same spread as a whole fit under one noise model (a mean of 0.998 to 1.001 times, 40³,
+  blocks of 20 and of 10). If the noise model is chosen anew, blocks choose it on another slab, and the spread differs
+  accordingly.
+- **Limits**: error bars take noise model and weight as given. They do not reveal a badly chosen weight (8-bit particles
+  fitted at commit 924b6ea with weight 0.006 in place of 1.1: 54 % covered).
+
+In the table, *occupied voxels* and *vacuum* are the shares of voxels whose interval contains the truth, *truth above* and
+*truth below* the shares outside it, and *wider by* is the factor on the half-width at which 90 % of the occupied voxels
+would be covered. The last column is the time of the error bars over that of the fit."""
+_LEFT_OUT = """The table shows the share of pixels of left-out tilts inside the 90 % interval and, in brackets, the largest
+distance of the distribution of the ranks from the uniform one. Goal: 87 to 93 % of the pixels, and uniform ranks.
+
+For clipped pixels, the intervals of a Gaussian contain the right share by chance. The ranks show that it is wrong: their
+distance is below 0.02 under the right kind of noise, and 0.17 and more under a Gaussian.
+
+On the real needle the check still fails, because the intervals are too wide:
+
+- One cause was found and corrected, which reduced the share from 98.2 % to the one below. The noise model that describes a
+  quiet series was not fitted to the end and was up to ten times too wide (a standard deviation of 4900 against 720 detector
+  units among bright pixels; now 630, and 88 % of the fitted pixels are covered).
+- Another cause is likely, but was not tested. A quiet series is fitted and sampled by least squares, with one width for all
+  pixels, although the residuals are about thirty times smaller where the sample is dark; there, samples would spread too
+  much.
+- The residuals are also misfit, not only noise. They have structure, and ranks need not be uniform under any noise model.
+  No error bar covers misalignment.
+
+The program warns that the error bars of a quiet series cannot be relied on."""
 _LOW, _HIGH = 0.85, 0.95
 _GAP = 8  # every eighth tilt is left out
 Row = dict[str, Any]
@@ -144,7 +161,7 @@ def page(cells: dict[str, Row]) -> str:
     rows = [row for key, row in cells.items() if key.startswith("coverage/")]
     inside = sum(_LOW <= row["occupied covered"] <= _HIGH for row in rows)
     lines = [_HEAD, "", *_origin(cells), "## With the truth", ""]
-    lines += [f"Within 85 to 95 %: {inside} of {len(rows)} scenes.", _WHY, ""]
+    lines += [f"The coverage is within 85 to 95 % in {inside} of {len(rows)} scenes.", _WHY, ""]
     lines += [
         "| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | wider by "
         "| error unseen | error bars : fit |"
@@ -178,10 +195,10 @@ def page(cells: dict[str, Row]) -> str:
 
 
 def _origin(cells: dict[str, Row]) -> list[str]:
-    """What made the rows, and the picture."""
+    """What made the rows."""
     runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
     made = ", ".join(f"{date} at commit {commit}" for date, commit in runs)
-    return [f"Computed {made}, one thread.", "", "![volume, standard deviation, true error](uncertainty.png)", ""]
+    return [f"Computed {made}, one thread.", ""]
 
 
 def main() -> None:

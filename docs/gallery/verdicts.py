@@ -38,8 +38,8 @@ def draw():
             bar=(12, "12 voxels"),
             unit="attenuation",
         )
-        reasons = textwrap.shorten(" ".join(verdict.reasons), 190)
-        axis.set_xlabel(textwrap.fill(reasons, 52), fontsize=8, color=COLOURS[verdict.grade])
+        reasons = textwrap.shorten(". ".join(verdict.reasons), 215)
+        axis.set_xlabel(textwrap.fill(reasons, 46), fontsize=8, color=COLOURS[verdict.grade])
     return figure
 
 

@@ -23,7 +23,7 @@ from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
 from noiseflow.plugins import load_plugin, package_of, plugins
 
-_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "doctor")
+_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "measure", "doctor")
 _TYPED = "noiseflow.typed"
 _UNASKED = ("DEFAULT", "DEFAULT_MAP")
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
@@ -143,7 +143,7 @@ def _options(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
     show_version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Learn a microscope's noise, sample it, and reconstruct clean volumes from noisy tilt series."""

@@ -34,7 +34,7 @@ def demo(
     started = time.perf_counter()
     check_folder(out, holds=_FILES, overwrite=overwrite)
     out.mkdir(parents=True, exist_ok=True)
-    report = Report("noiseflow demo", "Everything below was made by the commands shown; repeat them on your own files.")
+    report = Report("noiseflow demo", "The commands shown made everything below; run them on your own files.")
     report.text(
         "Three uses on real data: calibrate a detector from a short and a long exposure, sample its noise, and reconstruct "
         "volumes from noisy tilt series."
@@ -118,4 +118,4 @@ def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
         axes[0], images, ("clean (long exposure)", "sampled noise", "real short exposure"), strict=True
     ):
         show_image(axis, image[100:300, 100:300], title, limits=(float(low), float(high)))
-    report.figure(figure, caption="The sampled image should be impossible to tell from the real short exposure.")
+    report.figure(figure, caption="The sampled image should look like the real short exposure.")

@@ -36,13 +36,13 @@ def sample(
     dtype: Annotated[
         str,
         typer.Option(
-            help="Number type to write: auto (the clean file's integers, where they hold the noisy values; else uint16, int16 or "
-            "int32 where the model rounds to whole numbers; else float32), float32, float64, uint8, uint16 or int16."
+            help="Number type to write: float32, float64, uint8, uint16, int16, or auto: the clean file's integer type if it "
+            "can store the noisy values, else uint16, int16 or int32 if the model rounds to whole numbers, else float32."
         ),
     ] = "auto",
     json: JsonOption = False,
 ) -> None:
-    """Put realistic noise on a clean image, stack or array of any number of axes (4D as .npy)."""
+    """Add realistic noise to a clean image, stack, or array with any number of axes (4D as .npy)."""
     import noiseflow
     from noiseflow import io
     from noiseflow.commands import sample_files
@@ -71,10 +71,16 @@ def sample(
 
 def evaluate(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
-    signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; once for each pair.")],
-    observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of the same size.")],
+    signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; repeat for each pair.")],
+    observation: Annotated[
+        list[Path], typer.Option("--observation", help="Noisy image of the same size; repeat for each pair.")
+    ],
     baselines: Annotated[
-        bool, typer.Option("--baselines", help="Fit Gaussian and Poisson models on one half, judge all on the other.")
+        bool,
+        typer.Option(
+            "--baselines",
+            help="Fit Gaussian and Poisson models to one half of the pixels, and judge all models on the other.",
+        ),
     ] = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",

@@ -18,33 +18,33 @@ def batch(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Folder of tilt series, or a CSV table: column tilts, and out and options where they differ."
+            help="Folder of tilt series, or a CSV table with a column tilts and, if needed, out and options of reconstruct."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
     table: Annotated[
         Path | None,
-        typer.Option(help="Table of verdicts and figures: .csv or .json; batch.csv beside the volumes if not given."),
+        typer.Option(help="Table of verdicts and figures, .csv or .json; batch.csv beside the volumes by default."),
     ] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
     options: Annotated[
         str,
         typer.Option(help="Further options of reconstruct for all series, in quotes: '--method sirt --thickness 64'."),
     ] = "",
-    workers: Annotated[int, typer.Option(min=1, help="Series at a time; they share this machine's cores.")] = 1,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Number of series to reconstruct at a time; they share this machine's cores.")
+    ] = 1,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the series.")
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Leave out series that the table lists as done; resume those that were interrupted."
-        ),
+        typer.Option("--resume", help="Skip series that the table lists as done; resume those that were interrupted."),
     ] = False,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Reconstruct many tilt series, and write one table of verdicts and figures. One that fails does not stop the others."""
+    """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
     from noiseflow import io
     from recon.scale.cluster import client_of
     from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, require_own_table, write_table

@@ -14,24 +14,23 @@ def benchmark(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="rivals, slow-rivals, resolution, paper-table, ablations, needle, sabotage; the first alone if not given."
+            help="Benchmarks to run: rivals, slow-rivals, resolution, paper-table, ablations, needle, sabotage; "
+            "the first by default."
         ),
     ] = None,
     size: Annotated[int | None, typer.Option(help="Voxels along each edge; 64, or 48 with --quick.")] = None,
     noise: Annotated[str, typer.Option(help="Noise of the scene, as in `noiseflow simulate`.")] = "clipped",
     phantom: Annotated[str, typer.Option(help="Volume of the scene, as in `noiseflow simulate`.")] = "shells",
     quick: Annotated[
-        bool, typer.Option("--quick", help="A small scene and few settings: under three minutes.")
+        bool, typer.Option("--quick", help="Use a small scene and few settings; takes less than three minutes.")
     ] = False,
-    method: Annotated[
-        str | None, typer.Option(help="Method of sabotage: joint, or l2 with --quick, if not given.")
-    ] = None,
+    method: Annotated[str | None, typer.Option(help="Method of sabotage; joint by default, l2 with --quick.")] = None,
     in_turn: Annotated[
-        bool, typer.Option("--in-turn", help="Sabotage spoils one scene in each way, not three: a third of the time.")
+        bool, typer.Option("--in-turn", help="Sabotage one scene in each way instead of three, in a third of the time.")
     ] = False,
-    repeats: Annotated[int, typer.Option(help="Repeats of every timed curve, in turn; medians are reported.")] = 3,
+    repeats: Annotated[int, typer.Option(help="Repeats of every timed curve; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
-    again: Annotated[str, typer.Option(help="Recompute the kept results whose name contains this.")] = "",
+    again: Annotated[str, typer.Option(help="Recompute stored results whose name contains this text.")] = "",
     out: Annotated[
         Path, typer.Option("--out", help="Folder for results and figures; an interrupted run resumes there.")
     ] = Path("noiseflow-benchmark"),

@@ -16,10 +16,11 @@ def compare(
     volume: Annotated[Path, typer.Argument(help="Volume to judge, from any program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
     angles: Annotated[
-        Path | None, typer.Option(help="Angle file; projections at these angles are compared too.")
+        Path | None, typer.Option(help="Angle file; projections at these angles are also compared.")
     ] = None,
     mode: Annotated[
-        str, typer.Option(help="Projections are line integrals (linear) or exp(-line integral) (transmission).")
+        str,
+        typer.Option(help="Projections with --angles: line integrals (linear) or exp(-line integral) (transmission)."),
     ] = "linear",
     report: Annotated[Path | None, typer.Option("--report", "--plot", help="Folder for a page with pictures.")] = None,
     overwrite: OverwriteOption = False,

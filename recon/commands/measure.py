@@ -18,13 +18,17 @@ if TYPE_CHECKING:
 
 def measure(
     volume: Annotated[Path, typer.Argument(help="Volume (z, y, x): .mrc, .rec, .tif or .npy.")],
-    region: Annotated[str, typer.Option(help="Part to measure, voxels: z0:z1,y0:y1,x0:x1; all by default.")] = ":,:,:",
+    region: Annotated[
+        str, typer.Option(help="Region to measure, in voxels: z0:z1,y0:y1,x0:x1; the whole volume by default.")
+    ] = ":,:,:",
     above: Annotated[float | None, typer.Option(help="Count the voxels of the region above this attenuation.")] = None,
-    line: Annotated[str | None, typer.Option(help="Profile from z,y,x to z,y,x, voxels: z0,y0,x0:z1,y1,x1.")] = None,
-    level: Annotated[float, typer.Option(help="Share of the truth that intervals should hold.")] = 0.9,
+    line: Annotated[
+        str | None, typer.Option(help="Line profile between two points, in voxels: z0,y0,x0:z1,y1,x1.")
+    ] = None,
+    level: Annotated[float, typer.Option(help="Probability with which an interval should contain the truth.")] = 0.9,
     json: JsonOption = False,
 ) -> None:
-    """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals where it has error bars.
+    """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals if it has error bars.
 
     Error bars are the files VOLUME_std, VOLUME_bias and VOLUME_fsc.csv that `noiseflow reconstruct --uncertainty 16` writes.
     """

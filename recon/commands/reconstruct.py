@@ -49,36 +49,40 @@ def reconstruct(
     ],
     angles: Annotated[
         Path | None,
-        typer.Option(help="Angle file; by default the .rawtlt, .tlt or .mdoc beside the stack, or its own."),
+        typer.Option(
+            help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file beside the stack, or the stack itself."
+        ),
     ] = None,
-    transforms: Annotated[Path | None, typer.Option(help="IMOD's .xf alignment to apply to the stack.")] = None,
+    transforms: Annotated[Path | None, typer.Option(help="Alignment of IMOD (.xf) to apply to the stack.")] = None,
     method: Annotated[
         str,
-        typer.Option(help=f"One of {', '.join(method_names())}."),
+        typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}."),
     ] = "auto",
     preset: Annotated[
         str | None,
         typer.Option(help="A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
     ] = None,
-    mode: Annotated[str, typer.Option(help="transmission (bright field) or linear (HAADF, EDX).")] = "transmission",
+    mode: Annotated[
+        str, typer.Option(help="Image formation: transmission (bright field) or linear (HAADF, EDX).")
+    ] = "transmission",
     thickness: Annotated[
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
     ] = None,
-    weight: Annotated[float | None, typer.Option(help="Weight of the regulariser.")] = None,
+    weight: Annotated[
+        float | None, typer.Option(help="Weight of the regulariser; chosen automatically if not given.")
+    ] = None,
     regulariser: Annotated[
         str | None,
-        typer.Option(
-            help=f"What a fitted volume is expected to look like: {', '.join(regulariser_names())}; {DEFAULT} by default."
-        ),
+        typer.Option(help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {DEFAULT} by default."),
     ] = None,
     uncertainty: Annotated[
         int,
         typer.Option(
             min=0,
-            help="Write error bars, VOLUME_std and VOLUME_bias, from so many samples of the posterior; 16 are usual.",
+            help="Write error bars, VOLUME_std and VOLUME_bias, from this number of samples of the posterior; 16 are usual.",
         ),
     ] = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of the fit, or iterations.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Number of steps of the fit, or of iterations.")] = None,
     window: Annotated[
         str | None,
         typer.Option(
@@ -88,41 +92,48 @@ def reconstruct(
     denoiser: Annotated[
         str | None,
         typer.Option(
-            help="Of the denoised methods: nlm (the default), tv, wavelet, wiener, bm3d, or one of your own, "
-            "package.module:function (module:function runs that code)."
+            help="Denoiser of the denoised methods: nlm (the default), tv, wavelet, wiener, bm3d, or your own, "
+            "package.module:function (this runs that code)."
         ),
     ] = None,
-    noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model to keep fixed.")] = None,
-    save_noise_model: Annotated[Path | None, typer.Option(help="Write the learnt noise model here.")] = None,
+    noise_model: Annotated[
+        Path | None, typer.Option(help="Calibrated noise model (.safetensors); it is kept fixed.")
+    ] = None,
+    save_noise_model: Annotated[
+        Path | None, typer.Option(help="File for the learnt noise model (.safetensors).")
+    ] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
     invert_contrast: Annotated[
         bool, typer.Option("--invert-contrast", help="Swap bright and dark before anything else.")
     ] = False,
-    mask: Annotated[Path | None, typer.Option(help="Image or stack, 0 at the pixels to leave out of the fit.")] = None,
-    mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave NaN and infinite pixels out.")] = False,
+    mask: Annotated[
+        Path | None, typer.Option(help="Image or stack that is 0 at the pixels to leave out of the fit.")
+    ] = None,
+    mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave out NaN and infinite pixels.")] = False,
     refine_alignment: Annotated[
-        bool, typer.Option("--refine-alignment", help="Find the tilt axis and the shift of every image first.")
+        bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
     ] = False,
     tilt_axis: Annotated[
         float | None,
         typer.Option(
-            help="Direction of the tilt axis in the images, degrees from y (up) anticlockwise; with --refine-alignment, roughly."
+            help="Direction of the tilt axis in the images, degrees anticlockwise from y (up); with "
+            "--refine-alignment, a rough value."
         ),
     ] = None,
     keep_tilts: Annotated[bool, typer.Option("--keep-tilts", help="Keep tilts that do not fit the others.")] = False,
     defocus: Annotated[
         float,
         typer.Option(
-            help="Blur to model in fitted methods: pixels per voxel out of the plane of focus, such as 0.02; left out if below "
-            "a quarter of a pixel."
+            help="Blur by depth that fitted methods model: pixels per voxel out of the plane of focus, such as 0.02; ignored "
+            "below a quarter of a pixel."
         ),
     ] = 0.0,
     slices_at_once: Annotated[
         int | None,
-        typer.Option(min=1, help="Reconstruct in blocks of so many slices; chosen automatically for large volumes."),
+        typer.Option(min=1, help="Reconstruct in blocks of this many slices; chosen automatically for large volumes."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Reconstruct blocks in so many processes at a time (extra [distributed]).")
+        int | None, typer.Option(min=1, help="Number of processes that reconstruct blocks (extra 'distributed').")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the blocks.")
@@ -132,10 +143,12 @@ def reconstruct(
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None,
     fsc: Annotated[
         bool,
-        typer.Option("--fsc", help="Reconstruct the even and the odd tilts too: their correlation is in the report."),
+        typer.Option(
+            "--fsc", help="Also reconstruct the even and the odd tilts, and report their Fourier shell correlation."
+        ),
     ] = False,
     reference: Annotated[
-        Path | None, typer.Option(help="Volume that the report correlates the result with, where --fsc is not given.")
+        Path | None, typer.Option(help="Volume to correlate the result with in the report, if --fsc is not given.")
     ] = None,
     dry_run: Annotated[
         bool,
@@ -151,7 +164,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a clean volume, and the noise model with it, from one noisy tilt series.
 
-    Ctrl-C saves the state and says how to resume; pressed twice, it stops at once. Tilts may come in any order.
+    Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
     from noiseflow.io import locked, require_other
     from noiseflow.io.mapped import is_large

@@ -20,22 +20,25 @@ _VALIDATION, _TEST = 14, 20
 
 def simulate(
     folder: Annotated[
-        Path, typer.Argument(help="Folder for tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc.")
+        Path,
+        typer.Argument(help="Folder to write tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc to."),
     ],
     size: Annotated[int, typer.Option(help="Voxels along each edge, up to 1000 and beyond.")] = 64,
-    tilts: Annotated[str, typer.Option(help="START:STOP:STEP in degrees, both ends included.")] = "-59.5:57.5:1.5",
+    tilts: Annotated[
+        str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")
+    ] = "-59.5:57.5:1.5",
     phantom: Annotated[
-        str, typer.Option(help="shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")
+        str, typer.Option(help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")
     ] = "shells",
     noise: Annotated[
         str,
         typer.Option(
-            help="clipped, gaussian, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file."
+            help="Noise: clipped, gaussian, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file."
         ),
     ] = "clipped",
     clip: Annotated[
         bool,
-        typer.Option("--clip", help="Clip pixel values to the range from zero to the brightest signal there can be."),
+        typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal."),
     ] = False,
     defocus: Annotated[
         float,
@@ -43,12 +46,14 @@ def simulate(
             help="Blur of the tilts by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."
         ),
     ] = 0.0,
-    mode: Annotated[str | None, typer.Option(help="transmission or linear; by default the noise's own.")] = None,
+    mode: Annotated[
+        str | None, typer.Option(help="Image formation: transmission or linear; by default that of the noise.")
+    ] = None,
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Simulate a tilt series of a known volume with known noise, and clean projections at other angles to judge by."""
+    """Simulate a tilt series of a known volume with known noise, and clean projections at other angles for evaluation."""
     from noiseflow import io
     from recon.simulate.simulation import angles_between, tilt_range
     from recon.simulate.streaming import Simulation

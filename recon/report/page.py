@@ -120,7 +120,7 @@ def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str
         rows = [row for row in rows if row[0] != "denoiser"]
     depth = outcome.volume.attenuation.shape[0]
     if not any(name == "thickness" for name, _, _ in rows):
-        rows.append(("thickness", f"{depth} voxels", "as deep as the images are wide, where nothing else is asked for"))
+        rows.append(("thickness", f"{depth} voxels", "default: as deep as the images are wide"))
     return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
 
 
@@ -132,13 +132,13 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
     if name == "weight" and tried:
         return f"highest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
     if name == "noise model" and outcome.method == "joint":
-        return "clipping and rounding as the pixel values show them; of the candidates the one that predicts held-out pixels best"
+        return "clipping and rounding detected from the pixel values; the candidate that predicts held-out pixels best"
     if name in ("intensity", "offset"):
         return "estimated from the images, then learnt in the fit"
     if name in ("tilts left out", "beam drift"):
-        return "each tilt against a coarse volume of the others"
+        return "comparison of each tilt with a coarse volume of the others"
     if name in ("tilt axis (°)", "axis offset (pixels)", "largest shift (pixels)"):
-        return "where volumes explain tilts left out of them best"
+        return "volumes with this axis explain left-out tilts best"
     return "set by the method" if outcome.method != "joint" else "found from the data"
 
 
@@ -184,9 +184,7 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     }
     report.heading("Tilt series")
     words = sprites.in_words().replace(f"{sprites.original[0]} × ", "").replace(f"{sprites.shape[0]} × ", "")
-    caption = (
-        f"A good fit leaves noise without structure in the residuals; waves along the tilts mean misalignment. {words}"
-    )
+    caption = f"The residuals of a good fit show noise without structure; waves along the tilts indicate misalignment. {words}"
     report.widget("tilts", data, caption=caption)
 
 
@@ -207,7 +205,7 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
             charts.append(figure)
     if charts:
         report.heading("Beam and detector")
-        report.charts(charts, caption="Estimated from the images, then learnt in the fit.")
+        report.charts(charts, caption="Estimated from the images, and then learnt in the fit.")
 
 
 def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
@@ -218,7 +216,7 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     )
     use = slice(None) if tilt_series.mask is None else strided(tilt_series.mask, _PREVIEW)
     report.heading("Noise")
-    caption = "The data are pixels of the tilt series, against the clean projections of the volume; the model is exact."
+    caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
     device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
     rows = contrast_slab(tilt_series, _MOST_PIXELS // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
@@ -239,7 +237,7 @@ def _in_words(structure: SpatialStructure) -> str:
         or max(structure.rows, structure.columns) > 1 + 10 * _MATTERS
     ):
         return words
-    return words.partition("; a per-pixel")[0] + "; that is more than chance, and too little to matter"
+    return words.partition("; a per-pixel")[0] + "; this is more than chance, but too small to matter"
 
 
 def _add_course(report: Report, outcome: Reconstruction) -> None:
@@ -259,7 +257,7 @@ def _add_course(report: Report, outcome: Reconstruction) -> None:
         charts.append(figure)
     if charts:
         report.heading("Convergence")
-        report.charts(charts, caption="Negative log-likelihood of pixels that the fit never saw: lower is better.")
+        report.charts(charts, caption="Negative log-likelihood of pixels that the fit never saw; lower is better.")
 
 
 def _add_resolution(

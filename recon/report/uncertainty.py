@@ -36,7 +36,7 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
     axis.fill_between(band.frequency, band.low, band.high, color=COLOURS["accent"], alpha=0.3)
     axis.axhline(0.5, color=COLOURS["warm"], linewidth=1, linestyle="--")
     axis.set_ylim(0, 1.05)
-    words = "The lower edge counts the bias in full, the upper edge not at all."
+    words = "The lower edge counts the bias in full, the upper edge ignores it."
     report.charts([figure], caption=f"Falls to 0.5 at {band.in_words(voxel_size)}. {words}")
 
 

@@ -15,9 +15,9 @@ from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Result, Verdict
 
 _WORDS = {
-    "good": "Good: nothing speaks against this volume.",
+    "good": "Good: no check found a fault in this volume.",
     "doubtful": "Doubtful: parts of this volume may be wrong.",
-    "bad": "Bad: do not use this volume before its first reason is mended.",
+    "bad": "Bad: do not use this volume until you have corrected the first reason.",
 }
 
 
@@ -45,8 +45,8 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
         _chart("Residual of each tilt", "rms, detector units", angles, {"residual": residuals.residual.std((1, 2))}),
     ]
     caption = (
-        "What each image differs by from the projection of the volume, by linear regression. Scatter about zero is chance; "
-        "waves and steps are shifts, wrong angles, or a specimen that changes. A volume follows part of each difference."
+        "Difference of each image from the projection of the volume, by linear regression. Scatter about zero is chance; "
+        "waves and steps indicate shifts, wrong angles, or a specimen that changes. The volume follows part of each difference."
     )
     report.charts(charts, caption=caption)
 

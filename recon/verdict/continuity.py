@@ -37,7 +37,7 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
     if not far.any():
         return evidence, []
     named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[coarse.order][far][:5])
-    words = f"the image at {named} does not continue those beside it: it belongs to another tilt, or to another object"
+    words = f"the image at {named} does not fit between its neighbours: it belongs to another tilt or another object"
     strength = float(min(2.9, (beyond / max(usual, 1e-30))[far].max() / _LONE))
     return evidence, [Finding("tilts", strength, words, "check its angle, or leave it out")]
 
@@ -59,6 +59,6 @@ def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
         return evidence, []
     where = int(np.argmax(apart))
     between = f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on"
-    words = f"the images {between} do not continue each other: the specimen changed"
-    advice = "reconstruct both parts apart, or check whether one of them was turned over"
+    words = f"the images {between} do not match at the border: the specimen changed"
+    advice = "reconstruct both parts separately, or check whether one of them was flipped"
     return evidence, [Finding("specimen", 2.9, words, advice, "seen")]

@@ -37,7 +37,7 @@ def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
     evidence = {"held-out NLL jump": jump}
     if jump < _JUMP:
         return evidence, []
-    words = f"the held-out likelihood ended {jump:.2g} nats per pixel worse than it had been"
+    words = f"the held-out likelihood at the end was {jump:.2g} nats per pixel worse than before"
     return evidence, [Finding("fit", min(3.5, 1 + jump / (5 * _JUMP)), words, "compare with --method l2 or sirt")]
 
 
@@ -47,13 +47,16 @@ def _weight(tried: dict[float, float]) -> list[Finding]:
         return []
     best = min(tried, key=lambda weight: tried[weight])
     if best == min(tried):  # the fit follows something that is no noise
-        words = f"held-out pixels want less of the regulariser than the lowest weight tried, {best:.2g}"
+        words = f"held-out pixels prefer a weight of the regulariser below the lowest one tried, {best:.2g}"
         return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
     if best == max(tried):  # nothing but the regulariser helps: what is left is misfit, and the volume turns blocky
-        words = f"held-out pixels want more of the regulariser than the highest weight tried, {best:.2g}"
+        words = f"held-out pixels prefer a weight of the regulariser above the highest one tried, {best:.2g}"
         return [
             Finding(
-                "weight", 2.0, words, "compare with --method l2, and align: what is left is misfit rather than noise"
+                "weight",
+                2.0,
+                words,
+                "compare with --method l2, and align the series: the residuals are misfit rather than noise",
             )
         ]
     return []

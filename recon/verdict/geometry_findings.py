@@ -41,25 +41,25 @@ def geometry_findings(
         "signal at the sides": edge,
     }
     if structure < _STRUCTURE:
-        words = "neighbouring pixels of the images share nothing beyond chance: there is no object to see"
+        words = "neighbouring pixels of the images are not correlated: no object is visible"
         return evidence, [Finding("noise", 10.0, words, "use a longer exposure, or check the file")]
     findings = [*_axis(axis), *_angles(angles), *_objects(objects), *_thicker(thicker)]
     if edge > _EDGE and beyond > 0.5:
-        words = f"the object goes on beyond the sides of the images, with {edge:.0%} of the mean signal there"
+        words = f"the object extends beyond the sides of the images, with {edge:.0%} of the mean signal there"
         findings.append(
             Finding("field", min(3.5, max(1.0, 2 * beyond)), words, "use a larger field of view, or a smaller object")
         )
     if beyond >= 1:
         words = (
-            f"{gap.share:.0%} of the structure of tilts left out in gaps is not explained by the others, where a right volume "
-            f"would leave {expected.share:.0%}"
+            f"{gap.share:.0%} of the structure of tilts left out in gaps is not explained by the others, where a correct volume "
+            f"would leave {expected.share:.0%} unexplained"
         )
         findings.append(
             Finding("consistency", min(beyond, 3.5), words, "check axis, shifts and angles of the series", "general")
         )
     if gap.error > _BLUNT:
         words = (
-            f"noise hides how much of the left-out tilts is explained, {gap.error:.0%} of their structure either way"
+            f"noise hides how much of the left-out tilts is explained: the error is ±{gap.error:.0%} of their structure"
         )
         findings.append(
             Finding("noise", min(2.9, gap.error / _BLUNT), words, "average exposures, or bin the images", "general")
@@ -90,7 +90,7 @@ def _objects(gain: Gain) -> list[Finding]:
             "specimen",
             min(6.0, 1 + gain.share / _OBJECTS),
             words,
-            "reconstruct the parts apart; the specimen moved or changed between them",
+            "reconstruct the parts separately; the specimen moved or changed between them",
         )
     ]
 

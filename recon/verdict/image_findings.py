@@ -44,18 +44,16 @@ def image_findings(residuals: Residuals, found: dict[str, Distortion]) -> tuple[
     smooth, limit = _smooth_part(residuals), _RESIDUAL + _taken(residuals, found)
     evidence["smooth residuals"] = smooth
     if share - 3 * error > limit and smooth > _SMOOTH:
-        words = (
-            f"{smooth:.0%} of what the residuals share is smooth and differs from tilt to tilt: the background moves"
-        )
+        words = f"{smooth:.0%} of the structure common to the residuals is smooth and differs between tilts: the background moves"
         findings.append(Finding("beam", 1.5, words, "subtract the background of each image first"))
     if share - 3 * error > limit:
-        words = f"the residuals still hold {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
+        words = f"the residuals contain {share:.0%} of the images' structure; neighbours along y correlate by {white['y']:.2f}"
         findings.append(
             Finding(
                 "residuals",
                 min(3.5, (share - 3 * error) / limit),
                 words,
-                "look at the residuals in the report for what moves",
+                "look for the moving part in the residuals of the report",
                 "general",
             )
         )
@@ -107,7 +105,7 @@ def _shifts(found: dict[str, Distortion], edge: float) -> list[Finding]:
         return []
     if off > strengths[where]:
         where, size = "across the axis", float(np.hypot(size, across.mean))
-    words = f"the images are shifted {where} against the volume, by {size:.2f} pixels rms and more where the volume followed them"
+    words = f"the images are shifted {where} against the volume, by at least {size:.2f} pixels rms"
     return [
         Finding("alignment", max(strengths[where], off), words, "align the series first, or use --refine-alignment")
     ]
@@ -131,8 +129,8 @@ def _geometry(found: dict[str, Distortion], edge: float) -> list[Finding]:
     if strengths[what] < 1:
         return []
     words = (
-        f"along the series the images {what} against the volume: tilt angles are wrong, the tilt axis is turned, or the specimen "
-        "or its magnification changes"
+        f"along the series the images {what} against the volume: tilt angles are wrong, the tilt axis is rotated, or the "
+        "specimen or its magnification changes"
     )
     return [
         Finding("geometry", strengths[what], words, "check the angle file and --tilt-axis, or use --refine-alignment")
@@ -148,7 +146,7 @@ def _turned(found: dict[str, Distortion], edge: float) -> list[Finding]:
     if strength < 1:
         return []
     size = max(abs(turn.mean), turn.smooth)
-    words = f"the images are turned against the volume, by {size:.2f} pixels at their edge and more: the tilt axis is another"
+    words = f"the images are rotated against the volume, by at least {size:.2f} pixels at their edge: the tilt axis is wrong"
     return [Finding("axis", strength, words, "give --tilt-axis, or use --refine-alignment")]
 
 

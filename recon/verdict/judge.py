@@ -119,7 +119,9 @@ def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
     densest = float(max(layers[0], layers[-1]) / max(float(layers.mean()), 1e-30))
     if densest < _FULL:
         return {"densest face": densest}, []
-    words = f"the volume is {densest:.1f} times as dense at its top or bottom as on average: the object goes on beyond"
+    words = (
+        f"the volume is {densest:.1f} times as dense at its top or bottom as on average: the object extends beyond it"
+    )
     advice = "leave out --thickness, or give a larger one"
     return {"densest face": densest}, [Finding("thickness", min(2.9, densest / _FULL), words, advice, "seen")]
 
@@ -127,6 +129,6 @@ def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
 def _good(gap: Unexplained, residuals: Residuals) -> str:
     white = max(abs(value) for value in residuals.whiteness().values())
     return (
-        f"tilts left out in gaps are explained to {min(1.0, 1 - gap.share):.1%} of their structure, and neighbouring residuals "
-        f"correlate by {white:.2f} at most; the sign of the tilt angles and their zero cannot be seen in images"
+        f"the volume explains {min(1.0, 1 - gap.share):.1%} of the structure of tilts left out in gaps, and neighbouring "
+        f"residuals correlate by at most {white:.2f}; images do not determine the sign and the zero of the tilt angles"
     )

@@ -35,13 +35,13 @@ def saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) -> 
     for name, share in shares.items():
         limit = _SATURATED if name != empty else _BLANK
         if share > limit and (noisy or name != empty) and (name != empty or tilt_series.mode == "transmission"):
-            sentence = f"{share:.1%} of the pixels and all their neighbours stand at the {name} limit {ends[name]:.4g}"
+            sentence = f"{share:.1%} of the pixels and all their neighbours are at the {name} limit, {ends[name]:.4g}"
             strength = 1 + 2 * min(1.0, share / (10 * limit))
             findings.append(Finding("saturation", strength, sentence, _ADVICE, "seen"))
     strong = "high" if empty == "low" else "low"
     pile, of_near = _pile(images, ends[strong])
     if pile > _PILE and of_near > _OF_NEAR:
-        sentence = f"{pile:.1%} of the pixels stand at the {strong} limit {ends[strong]:.4g}, more than near it"
+        sentence = f"{pile:.1%} of the pixels are at the {strong} limit, {ends[strong]:.4g}, more than just inside it"
         findings.append(Finding("saturation", 1 + min(1.9, 20 * pile), sentence, _ADVICE, "seen"))
     return {"saturated": shares, "at the limit of contrast": pile}, findings
 
@@ -76,6 +76,6 @@ def cliff(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str,
     ratio, top = float(ratios[largest]), float(tops[largest])
     if ratio < _CLIFF:
         return {"cliff": ratio}, []
-    sentence = f"the pixel values end abruptly at {top:.4g}, as if brighter ones had wrapped around or been taken out"
+    sentence = f"the pixel values end abruptly at {top:.4g}, as if brighter ones had wrapped around or been removed"
     advice = "check the number type in which the images were saved"
     return {"cliff": ratio}, [Finding("saturation", 2.0, sentence, advice, "seen")]

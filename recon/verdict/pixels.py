@@ -67,7 +67,7 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
         if count:
             size = images.shape[1 if name == "rows" else 2]
             strength = 1.5 + min(2.0, 20 * count / size)
-            sentence = f"{count} of {size} {name} hold one value in all tilts, unlike their neighbours"
+            sentence = f"{count} of {size} {name} have one value in all tilts, unlike their neighbours"
             findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
     return {"dead lines": dead}, findings
 
@@ -90,7 +90,7 @@ def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
     share = float(dead.mean())
     if constant.all() or share < _REGION:
         return {"dead pixels": share}, []
-    sentence = f"{share:.1%} of the pixels hold one value in all tilts, unlike those around"
+    sentence = f"{share:.1%} of the pixels have one value in all tilts, unlike those around them"
     strength = 1.5 + min(1.4, 10 * share)
     return {"dead pixels": share}, [Finding("lines", strength, sentence, "mask them with --mask FILE", "seen")]
 
@@ -107,7 +107,7 @@ def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     share = counts[name] / residuals.residual[..., 0].size
     if share < _STREAKS:
         return {"streaks": counts}, []
-    sentence = f"{counts[name]} {name} of single images stand apart from those beside them"
+    sentence = f"{counts[name]} {name} of single images differ from those beside them"
     advice = "mask them with --mask FILE, or leave these images out"
     return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
@@ -126,9 +126,7 @@ def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dic
     evidence = {"filled borders": share}
     if share < _BORDERS:
         return evidence, []
-    sentence = (
-        f"{share:.0%} of the images have borders that hold one value, up to {filled.max():.0f} pixels wide on average"
-    )
+    sentence = f"{share:.0%} of the images have borders of one value, up to {filled.max():.0f} pixels wide on average"
     return evidence, [Finding("lines", 2.0, sentence, "mask these borders with --mask FILE", "seen")]
 
 
@@ -156,7 +154,9 @@ def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], 
     evidence = {"largest step between columns": size}
     if size < _SEAM_STEP or apart[where] < _SEAM * usual:
         return evidence, []
-    words = f"all images step between columns {where} and {where + 1}, as where two parts of a detector meet"
+    words = (
+        f"all images have a step between columns {where} and {where + 1}, as at the border of two parts of a detector"
+    )
     return evidence, [Finding("pattern", 2.0, words, "correct the images with flats and darks first", "seen")]
 
 
@@ -193,7 +193,9 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     size = evidence["fixed pattern"]["share of contrast"]
     if ratio < _PATTERN or size < _PATTERN_CONTRAST or alike > _ALIKE:
         return evidence, []
-    sentence = f"the residuals hold a pattern of the detector's pixels, {size:.1%} of the contrast and {ratio:.1f} times chance"
+    sentence = (
+        f"the residuals contain a pattern of the detector: {size:.1%} of the contrast, {ratio:.1f} times that of chance"
+    )
     return evidence, [
         Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")
     ]
@@ -210,7 +212,7 @@ def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
     evidence = {"steady structure": {"share": share, "score": score, "part": part}}
     if share < _STEADY or score < _STEADY_CHANCE or part < _STEADY_PART:
         return evidence, []
-    sentence = f"all residuals hold the same smooth structure, {share:.1%} of that of the images, whatever the tilt"
+    sentence = f"all residuals contain the same smooth structure, {share:.1%} of that of the images, at every tilt"
     advice = "correct the images with flats and darks, or for uneven illumination"
     return evidence, [Finding("pattern", min(2.9, share / _STEADY), sentence, advice)]
 

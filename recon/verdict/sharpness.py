@@ -23,7 +23,7 @@ _SCALES, _ALIKE, _BETTER = (0.5, 0.7, 1.4, 2.0), 0.9, 0.1  # correlation of rows
 _RUN, _SPAN = 8, 30.0  # tilts before and after a step, and degrees at most: over more, good slabs change by 0.77
 _STEP, _STEP_SCORE = 0.75, 4.0  # share of the fine structure that is lost, good series 0.68; standard errors
 _LAGS = (1, 4)  # pixels: what is shared so far is free of white noise, and what is lost in between is fine structure
-_ADVICE = "leave the blurred tilts out, or blur all alike"
+_ADVICE = "leave out the blurred tilts, or blur all tilts equally"
 
 
 def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
@@ -40,7 +40,7 @@ def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[d
     evidence = {"blur": {"growth": growth, "score": score, "step": step}}
     findings = _magnified(images.sum(2))
     if growth > _GROWTH and score > _GROWTH_SCORE:
-        words = f"the images are the more blurred the more they are tilted, by {np.sqrt(growth):.1f} pixels towards 90°"
+        words = f"the blur of the images grows with their tilt, to {np.sqrt(growth):.1f} pixels towards 90°"
         findings.append(Finding("resolution", min(2.9, growth / _GROWTH), words, _ADVICE))
     if step > _STEP:
         words = (

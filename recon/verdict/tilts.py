@@ -66,15 +66,19 @@ def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
         words = f"all tilt angles lie within ±{np.abs(angles).max():.2f}°, as if they were radians"
         findings.append(Finding("angles", 10.0, words, "give the tilt angles in degrees", "seen"))
     if wedge > _WEDGE:
-        words = f"{wedge:.0f}° of 180° have no tilt, so most directions of the volume are guessed"
-        findings.append(Finding("range", wedge / _WEDGE, words, "add tilts, or trust only what faces the beam", "seen"))
+        words = f"{wedge:.0f}° of 180° have no tilt, so most directions of the volume are not measured"
+        findings.append(
+            Finding("range", wedge / _WEDGE, words, "add tilts, or trust only structures that face the beam", "seen")
+        )
     if inner > _GAP and len(directions) >= _FEWEST:
         words = f"the tilts leave a gap of {inner:.0f}° inside their range"
         findings.append(
-            Finding("range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks across it", "seen")
+            Finding(
+                "range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks in these directions", "seen"
+            )
         )
     if len(directions) < _FEWEST:
-        words = f"{len(directions)} different tilt angles are too few for fine detail"
+        words = f"{len(directions)} tilt angles are too few for fine detail"
         findings.append(Finding("range", min(2.9, _FEWEST / len(directions)), words, "take more tilts", "seen"))
     return evidence, findings
 
@@ -89,7 +93,7 @@ def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
     if repeated == 0:
         return {"repeated images": 0}, []
     share = repeated / tilt_series.num_tilts
-    words = f"{repeated} of {tilt_series.num_tilts} images are copies of another one, to the last pixel"
+    words = f"{repeated} of {tilt_series.num_tilts} images are exact copies of another image"
     finding = Finding("repeats", min(2.9, 1 + 3 * share), words, "leave the copies out", "seen")
     return {"repeated images": repeated}, [finding]
 
@@ -161,7 +165,7 @@ def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Findin
     if share <= _FOREIGN_SHARE:
         return evidence, []
     named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[foreign][:5])
-    words = f"{int(foreign.sum())} of {len(foreign)} tilts hardly resemble what the others predict ({named} …)"
+    words = f"{int(foreign.sum())} of {len(foreign)} tilts hardly resemble the prediction from the others ({named} …)"
     advice = "look at these images and their angles, or leave them out"
     return evidence, [Finding("tilts", min(4.0, 1 + share / _LEFT_OUT), words, advice)]
 

@@ -18,8 +18,8 @@ from noiseflow.io import write
 from .conftest import textured_scene
 
 PARTS = (
-    *("Photon transfer", "Posterior of gain", "Residuals of the pixels kept apart", "QQ", "PIT", "row and column"),
-    *("before and after registration", "Verdict", "suffices", "lie on each other", "excess noise"),
+    *("Photon transfer", "Posterior of gain", "Residuals of the held-out pixels", "QQ", "PIT", "row and column"),
+    *("before and after registration", "Verdict", "suffices", "are registered to", "excess noise"),
 )
 """What a reader of the report must find."""
 
