@@ -322,9 +322,6 @@ def _fitted(
     if candidates:
         selection = select(signal, observation, candidates=candidates, num_steps=NUM_STEPS, seed=seed)
         found |= {one.name: one.model for one in selection.candidates}
-    shot = found.get("poisson")
-    if isinstance(shot, noiseflow.Poisson) and float(shot.log_gain.exp()) < digitisation.step:
-        found["poisson"] = noiseflow.Digitised(shot, *digitisation)  # several electrons make one code
     return {name: found[name].cpu().eval() for name in names}
 
 

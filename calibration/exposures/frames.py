@@ -99,7 +99,7 @@ class Burst:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
-                f"{self.name} holds one frame only (shape {frames.shape}); noise shows between frames: give "
+                f"{self.name} {_holds(self.name)} one frame only (shape {frames.shape}); noise shows between frames: give "
                 + (
                     "at least two"
                     if self.calibration
@@ -255,6 +255,11 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibrat
     for frame in frames[1:]:
         _require_same_size(frames[0], "the first frame", frame, "a later one")
     return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"), calibration)
+
+
+def _holds(name: str) -> str:
+    """The verb after the name of frames, such as "the burst" or "the dark frames"."""
+    return "hold" if name.endswith("frames") else "holds"
 
 
 def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -> list[Burst]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
-from noiseflow.distributions.levels import Levels, between
+from noiseflow.distributions.levels import Levels, between, log_sum
 
 _NEAR = 1e-3  # of a level: a value computed as gain·k + offset must count as having reached k
 
@@ -157,3 +157,74 @@ class PoissonDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.rate * self.gain**2
+
+
+class SpreadPoissonDistribution(PoissonDistribution):
+    """Scaled and shifted Poisson distribution whose masses are spread evenly over cells as wide as the gain.
+
+    It has the density that `PoissonDistribution.log_prob` gives, between the grid points too, and draws that follow it.
+
+    Args:
+        signal: detector units, any shape.
+        gain, offset: numbers: counts per electron, and counts at zero dose.
+    """
+
+    discrete: ClassVar[bool] = False
+
+    def _cells(self, value: Tensor) -> Tensor:
+        """Cells below a value: that of k electrons lies between k and k + 1."""
+        return self._count(value) + 0.5
+
+    def cdf(self, value: Tensor) -> Tensor:
+        cells = self._cells(value)
+        whole = torch.floor(cells)
+        part = torch.where(torch.isfinite(cells), cells - whole, torch.zeros_like(cells))
+        inside = torch.where(torch.isfinite(whole), whole, torch.full_like(whole, -1.0))
+        return self.masses_up_to(whole - 1, beyond=False) + part * torch.exp(self._log_mass(inside))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self.cdf(value)
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        first, last = self._cells(low), self._cells(high)
+        left, right = torch.floor(first), torch.floor(last)
+        within, ends = left == right, []
+        for whole, share in ((left, torch.where(within, last - first, left + 1 - first)), (right, last - right)):
+            possible = torch.isfinite(whole) & (share > 0)
+            log_share = torch.log(torch.where(possible, share, torch.ones_like(share)))
+            mass = self._log_mass(torch.where(possible, whole, torch.full_like(whole, -1.0)))
+            ends.append(log_share + mass)
+        ends[1] = torch.where(within, torch.full_like(ends[1], -math.inf), ends[1])
+        return log_sum(torch.stack([*ends, between(self, left, torch.maximum(left, right - 1))]))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        rate = self.rate
+        low = torch.full_like(rate, -0.5).expand_as(value)
+        spread = 12 * (torch.sqrt(rate) + 1)
+        return bisect_quantile(self, value, self._value(low), self._value((rate + spread).expand_as(value)))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        count = self._poisson((*sample_shape, *self.batch_shape), generator)
+        place = torch.rand(count.shape, generator=generator, dtype=count.dtype, device=count.device)
+        return self._value(count + place - 0.5)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The lower edge of the cell of no electron, and infinity."""
+        low, high = super().limits
+        return low - 0.5 * self.gain.detach(), high
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """All values from the lower edge of the cell of no electron."""
+        return constraints.greater_than_eq(float(self.limits[0]))  # type: ignore[no-untyped-call]
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        """Gauss-Legendre nodes of each cell, two of them: exact to the third moment."""
+        nodes, weights = super().quadrature()
+        apart = self.gain.detach() / (2 * math.sqrt(3.0))
+        return torch.cat([nodes - apart, nodes + apart]), torch.cat([weights, weights]) / 2
+
+    @property
+    def variance(self) -> Tensor:
+        return super().variance + self.gain**2 / 12

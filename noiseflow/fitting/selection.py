@@ -16,6 +16,7 @@ from noiseflow.fitting.contest import Contest, Progress, mean_and_error
 from noiseflow.fitting.judged_pixels import JudgedPixels
 from noiseflow.models import baselines, flow, mixture, physical, physics_flow
 from noiseflow.models.around import ForeignModel, as_noise_model
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 
@@ -183,7 +184,7 @@ def select(
         found = detect_digitisation(as_tensor(observation).detach().reshape(-1)[pixels.use].cpu().numpy())
     if found.found:
         wrapped = {
-            name: model if model.describes_single_readings else model.behind(lambda inner: Digitised(inner, *found))
+            name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model
             for name, model in wrapped.items()
         }
     contest = Contest(wrapped, pixels, seed, num_steps, progress)
@@ -194,6 +195,11 @@ def select(
     if refit:
         contest.learn_all(chosen.name)
     return Selection(judged, chosen, found)
+
+
+def _needs_converter(model: NoiseModelBase) -> bool:
+    """Whether rounding and clipping are put around a candidate: the grid of a `Poisson` model is its own, not the converter's."""
+    return isinstance(model, baselines.Poisson) or not model.describes_single_readings
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:

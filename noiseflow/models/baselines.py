@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.textbook import GaussianDistribution as GaussianDistribution
 from noiseflow.distributions.textbook import PoissonDistribution as PoissonDistribution
+from noiseflow.distributions.textbook import SpreadPoissonDistribution
 from noiseflow.models.base import NoiseModelBase
+
+_NEAR_STEP = 0.2  # of a rounding step: a gain so near to it may be the step itself, as where single events are counted
 
 
 class Gaussian(NoiseModelBase):
@@ -50,6 +55,8 @@ class Poisson(NoiseModelBase):
     Args:
         gain: counts per electron.
         offset: counts at zero dose.
+        spread: draw from that density too, evenly within the cells. Behind a converter whose steps are finer than the gain,
+            pixel values between the grid points are then possible.
 
     Example:
         >>> import noiseflow, torch
@@ -58,16 +65,21 @@ class Poisson(NoiseModelBase):
         200.0
     """
 
-    describes_single_readings = True
-
-    def __init__(self, gain: float = 1.0, offset: float = 0.0) -> None:
+    def __init__(self, gain: float = 1.0, offset: float = 0.0, *, spread: bool = False) -> None:
         super().__init__()
+        self.spread = spread
         self.log_gain = nn.Parameter(torch.tensor(math.log(gain)))
         self.offset = nn.Parameter(torch.tensor(float(offset)))
 
+    @property
+    def describes_single_readings(self) -> bool:
+        """Whether pixel values lie on the grid: not where the masses are spread."""
+        return not self.spread
+
     def forward(self, signal: Tensor) -> PoissonDistribution:
         wide = torch.promote_types(self.log_gain.dtype, torch.float32)
-        return PoissonDistribution(signal, torch.exp(self.log_gain.to(wide)), self.offset)
+        kind = SpreadPoissonDistribution if self.spread else PoissonDistribution
+        return kind(signal, torch.exp(self.log_gain.to(wide)), self.offset)
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
@@ -78,8 +90,42 @@ class Poisson(NoiseModelBase):
         self.offset.copy_(offset)
         self.requires_grad_(False)
 
+    @torch.no_grad()
+    def settle(
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
+    ) -> None:
+        """Choose how the grid lies on the steps of a converter: likelihood decides, for (N,) signals and observations.
+
+        Where the gain is a step, as of a counter of single events, grid and levels may be one. A coarser grid of unknown spacing
+        would call levels impossible, so its masses are spread.
+        """
+        step = 0.0 if behind is None else behind(self).step
+        if behind is None or not step > 0:
+            return
+        gain, offset = float(self.log_gain.exp()), float(self.offset)
+        places = [(gain, offset, gain >= step)]
+        if abs(gain - step) <= _NEAR_STEP * step:
+            nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
+            places += [(step, nearest + more * step, False) for more in (-2, -1, 0, 1, 2)]
+            places.append((step, 0.0, False))
+        found: list[float] = []
+        for place in places:
+            self._move_to(*place)
+            found.append(float(behind(self)(signal.double()).log_prob(observation.double()).mean()))
+        self._move_to(*places[max(range(len(places)), key=found.__getitem__)])
+
+    def _move_to(self, gain: float, offset: float, spread: bool) -> None:
+        self.log_gain.fill_(math.log(gain))
+        self.offset.fill_(offset)
+        self.spread = spread
+
+    def config(self) -> dict[str, Any]:
+        """Whether the masses are spread."""
+        return {"spread": True} if self.spread else {}
+
     def extra_repr(self) -> str:
-        return f"gain={math.exp(self.log_gain.item()):.4g}, offset={self.offset.item():.4g}"
+        spread = ", spread=True" if self.spread else ""
+        return f"gain={math.exp(self.log_gain.item()):.4g}, offset={self.offset.item():.4g}{spread}"
 
 
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:

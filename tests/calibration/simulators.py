@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 
 Image = NDArray[np.float64]
 GAIN, OFFSET, READ_NOISE, RATIO = 2.0, 100.0, 3.0, 16.0
@@ -74,6 +74,25 @@ def straggled(generator: np.random.Generator, electrons: Image, *, gain: float, 
     counts = generator.poisson(electrons)
     charge = np.where(counts > 0, generator.gamma(np.maximum(shape * counts, 1e-9), gain / shape), 0.0)
     return np.round(20 + charge + 2.0 * generator.standard_normal(electrons.shape))
+
+
+def landau_pulse(gain: float, scale: float) -> Any:
+    """Landau distribution of the energy of one electron, counts, cut off at its 2 % tail as the energy is; mean `gain`."""
+    low, high = stats.landau.ppf([1e-6, 0.98])
+    nodes = np.linspace(low, high, 20_001)
+    below = (stats.landau.cdf(nodes) - stats.landau.cdf(low)) / (stats.landau.cdf(high) - stats.landau.cdf(low))
+    mean = np.sum(np.diff(below) * (nodes[1:] + nodes[:-1]) / 2)
+    return stats.rv_histogram((np.diff(below), gain + scale * (nodes - mean)), density=False)
+
+
+def landau_straggled(
+    generator: np.random.Generator, electrons: Image, *, gain: float, scale: float, offset: float, read: float
+) -> Image:
+    """Pixel values of a direct detector whose electrons deposit energies as `landau_pulse` says; `electrons` is flat."""
+    counts = generator.poisson(electrons)
+    pulses = landau_pulse(gain, scale).rvs(size=int(counts.sum()), random_state=generator)
+    charge = np.bincount(np.repeat(np.arange(counts.size), counts), pulses, minlength=counts.size)
+    return np.round(offset + charge + read * generator.standard_normal(counts.size))
 
 
 def afterglow(image: Image, rest: float, *, axis: int = 1) -> Image:

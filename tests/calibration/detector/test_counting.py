@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from calibration.detector.models import Pixels, _special, fit_models, simplest_sufficient
+from noiseflow.commands.sample_files import stored
 
 from ..simulators import counted_with_dead_time
 
@@ -47,3 +48,18 @@ def test_shot_noise_finer_than_the_codes_is_rounded_to_them_and_needs_no_flexibl
     drawn = shot.model(torch.full((1000,), 100.0)).sample()
     assert torch.equal(drawn, drawn.round())
     assert shot.evaluation.overall.jsd < 3 * shot.evaluation.overall.jsd_floor
+
+
+@pytest.mark.parametrize(("gain", "read_noise"), [(2.0, 0.0), (2.0, 0.3), (1.0, 0.0)])
+def test_shot_noise_of_a_count_or_more_per_electron_is_rounded_to_the_codes(gain: float, read_noise: float):
+    generator = np.random.default_rng(3)
+    electrons, blocks = np.exp(generator.normal(4.0, 0.6, 16_000)), np.arange(16_000) // 64
+    counts = generator.poisson(electrons) + read_noise * generator.standard_normal(electrons.size)
+    pixels = Pixels(100 + gain * electrons, np.round(100 + gain * counts), blocks % 2 == 0, blocks)
+    (shot,) = fit_models(pixels, kinds=("poisson",))
+    drawn = shot.model(torch.full((1000,), 221.3)).sample(generator=torch.Generator().manual_seed(0))
+    assert torch.equal(drawn, drawn.round())
+    assert stored(drawn.numpy(), "auto", np.dtype(np.float32), shot.model).dtype == np.uint16
+    codes = shot.model(torch.tensor([221.3])).log_prob(torch.arange(0.0, 500.0, float(shot.model.step))[:, None])
+    assert float(codes.exp().sum()) == pytest.approx(1.0, abs=1e-4)
+    assert np.isfinite(shot.nll)

@@ -34,6 +34,7 @@ def detector(read_noise: float) -> noiseflow.PoissonGaussian:
 MODELS = {
     "Gaussian": lambda: noiseflow.Gaussian(),
     "Poisson": lambda: noiseflow.Poisson(0.05, -0.2),
+    "spread Poisson": lambda: noiseflow.Poisson(0.05, -0.2, spread=True),
     "signal-dependent Gaussian": lambda: noiseflow.SignalDependentGaussian(),
     "radial": lambda: noiseflow.RadialFlow(mean_preserving=True),
     "spline": lambda: noiseflow.SplineFlow(),
