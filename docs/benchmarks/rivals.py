@@ -241,8 +241,8 @@ def needle(folder: Path) -> str:
         "the left-out tilts, as noisy as the given ones, under a Gaussian whose width depends on the "
         "signal, fitted to the other "
         "half of them: the same judge for all. PSNR weighs bright pixels and NLL dark ones, so that hardly any method leads "
-        "by both; {doc}`../architecture` has two trials. Noise, where it is added: Poisson counts of so many in the brightest pixel, and "
-        "read noise of half a count. "
+        "by both; {doc}`../architecture` has two trials. Noise, where it is added: Poisson counts of so many in the "
+        "brightest pixel, and read noise of half a count. "
         f"Least squares and L1 take {benchmark_search.STEPS} steps, so that they end where they would. Settings of all "
         "but the joint fits are those of the best PSNR on the left-out "
         "tilts, which favours them.",
