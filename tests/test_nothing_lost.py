@@ -381,7 +381,7 @@ def test_an_image_on_a_full_disk_is_an_error_of_the_system_and_leaves_the_old_on
     path = tmp_path / name
     io.write(path, np.zeros((3, 4), np.float32))
     before = path.read_bytes()
-    with no_file_larger_than(50_000), pytest.raises(OSError, match="space|too large") as error:
+    with no_file_larger_than(50_000), pytest.raises(OSError, match=r"space|too large") as error:
         io.write(path, np.ones((300, 300), np.float32))
     assert error.value.errno in (errno.ENOSPC, errno.EFBIG)
     assert path.read_bytes() == before
