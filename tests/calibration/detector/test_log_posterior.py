@@ -188,3 +188,12 @@ def test_signals_of_a_wrong_scale_are_brought_to_the_likely_one(factor, change):
     assert final.offset is None
     assert float(np.median(final.levels[0].signal)) == pytest.approx(middle, rel=4e-3)
     assert posterior.rescaled(posterior.coordinates(2.0, 100.0, 2.0)) is not None
+
+
+def test_read_noise_that_a_wide_step_hides_is_not_possible():
+    """Below a tenth of the step of pixel values, nothing tells read noises apart."""
+    electrons = np.random.default_rng(2).gamma(2.0, 20.0, 20_000)
+    posterior = LogPosterior([collect_levels([readings(np.random.default_rng(3), electrons, step=4.0)])], (99.0, 0.7))
+    assert posterior.step == 4
+    sets = np.array([[2.0, 99.0, 0.19], [2.0, 99.0, 0.21]])
+    assert np.isneginf(posterior(posterior.coordinates(*sets.T))).tolist() == [True, False]
