@@ -94,6 +94,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
     ],
     "noiseflow/fitting/observation_table.py": [
+        (
+            "if self.error <= self._tolerance:",
+            "self.error <= self._tolerance",
+            "no measured error is the tolerance itself",
+        ),
         ("_MAX_LEVELS = 1024", "numbers", "both kinds of table keep the stated error"),
         ("_CHUNK = 2**18", "numbers", SPEED),
         ("_CHUNK = 2**18", "2 ** 18", SPEED),
@@ -169,6 +174,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("widest = _WIDEST if", "dense.device.type == 'cpu'", SPEED),
     ],
     "recon/metrics/metrics.py": [
+        ("max(1, _SLAB_ELEMENTS // (depth", "1", SPEED),
         (
             "product += float(np.sum(centred * (other - means[1])))",
             "other - means[1]",

@@ -109,6 +109,16 @@ def test_names_of_files_move_no_cursor(tmp_path: Path, refused, capsys) -> None:
     assert "\x1b" not in refused("sample", tmp_path / "none\x1b.safetensors", image, "-o", tmp_path / "n.npy")
 
 
+@pytest.mark.parametrize("words", [["sample", f"--{ESCAPE}"], [ESCAPE], ["simulate", "new", "--size", ESCAPE]])
+def test_what_was_typed_wrongly_moves_no_cursor(words: list[str], capsys) -> None:
+    with pytest.raises(SystemExit) as end:
+        noiseflow.commands.cli.main(words)
+    told = capsys.readouterr()
+    assert end.value.code == 2
+    assert "Usage" in told.err
+    assert not set("\x1b\u202e") & set(told.out + told.err)
+
+
 def test_pages_hold_no_control_characters(tmp_path: Path) -> None:
     report = Report(ESCAPE, ESCAPE)
     report.text(ESCAPE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -125,6 +126,57 @@ def test_foreign_files_among_the_states_stay(tmp_path: Path) -> None:
     left = {file.name for file in tmp_path.iterdir()}
     assert left >= {"mine.safetensors", "current.safetensors"}
     assert not left & {"fit-001.safetensors", dead.name}
+
+
+def test_files_of_others_in_the_folder_of_a_checkpoint_stay(files: Path, tmp_path: Path, run, refused) -> None:
+    """Noise models and volumes that noiseflow wrote are no states either."""
+    out, folder = tmp_path / "volume.npy", tmp_path / "volume.npy.checkpoint"
+    (folder / "blocks-mine").mkdir(parents=True)
+    noiseflow.save(noiseflow.Gaussian(), folder / "mine.safetensors")
+    io.write(folder / "blocks-mine" / "volume.npy", np.ones((3, 4), np.float32))
+    (folder / "run.json").write_text('{"mine": 1}')
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    assert "run.json was not written by noiseflow" in refused(*reconstruct(files, out, "--steps", 3))
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+    (folder / "run.json").unlink()
+    del before[folder / "run.json"]
+    run(*reconstruct(files, out, "--steps", 3))
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+
+
+def test_a_noise_model_that_bears_the_name_of_a_state_is_not_replaced(tmp_path: Path) -> None:
+    path = noiseflow.save(noiseflow.Gaussian(), tmp_path / "current.safetensors")
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match="as a state"):
+        write_state(path, {"a": 1})
+    assert path.read_bytes() == before
+
+
+def test_no_series_of_a_batch_is_replaced_by_the_volume_of_another(files: Path, tmp_path: Path, refused) -> None:
+    for name in "ab":
+        shutil.copytree(files / "new", tmp_path / name)
+    table = tmp_path / "series.csv"
+    table.write_text("tilts,out\na/tilts.mrc,b/tilts.mrc\nb/tilts.mrc,b/volume.mrc\n")
+    before = (tmp_path / "b" / "tilts.mrc").read_bytes()
+    words = ["batch", table, "-o", tmp_path / "out", "--options", "--method wbp"]
+    for more in ([], ["--overwrite"]):
+        assert "would be lost" in refused(*words, *more)
+    assert (tmp_path / "b" / "tilts.mrc").read_bytes() == before
+    assert "is an input too" in refused("batch", table, "-o", tmp_path / "out", "--table", table, "--overwrite")
+    assert table.read_text().startswith("tilts,out")
+
+
+def test_no_image_of_a_folder_that_is_the_input_is_replaced(files: Path, tmp_path: Path, refused) -> None:
+    """Neither asked nor unasked: they may have been written by noiseflow."""
+    stack = io.read(files / "new" / "tilts.mrc").data
+    for number, image in enumerate(stack):
+        io.write(tmp_path / f"{number:02d}.tif", image)
+    shutil.copy(files / "new" / "tilts.rawtlt", tmp_path)
+    for more in ([], ["--overwrite"]):
+        assert "is an input too" in refused(
+            "reconstruct", tmp_path, "-o", tmp_path / "03.tif", "--method", "wbp", *more
+        )
+    assert np.array_equal(io.read(tmp_path / "03.tif").data, stack[3])
 
 
 @pytest.mark.parametrize("looks", range(1, 4))
@@ -321,6 +373,19 @@ def test_an_output_folder_that_is_deleted_is_told(files: Path, tmp_path: Path) -
     assert "does not exist any more" in last
     assert "--resume" not in last
     assert "Traceback" not in told
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.mrc", "a.npy"])
+def test_an_image_on_a_full_disk_is_an_error_of_the_system_and_leaves_the_old_one(name: str, tmp_path: Path) -> None:
+    """NumPy says only how many pixels it wrote."""
+    path = tmp_path / name
+    io.write(path, np.zeros((3, 4), np.float32))
+    before = path.read_bytes()
+    with no_file_larger_than(50_000), pytest.raises(OSError, match=r"space|too large") as error:
+        io.write(path, np.ones((300, 300), np.float32))
+    assert error.value.errno in (errno.ENOSPC, errno.EFBIG)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
 def test_a_noise_model_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None:

@@ -87,12 +87,24 @@ class _Group(TyperGroup):
             return super().make_context(*words, **more)
         except KeyboardInterrupt:
             end_stopped(f"stopped; {START_AGAIN}")
+        except Exception as error:
+            _spell_out(error)
+            raise
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as stop:
             end_stopped(f"{ctx.invoked_subcommand} stopped; {str(stop) or START_AGAIN}")
+        except Exception as error:
+            _spell_out(error)
+            raise
+
+
+def _spell_out(error: Exception) -> None:
+    """What was typed is part of a usage error, which moves no cursor."""
+    if isinstance(message := getattr(error, "message", None), str):
+        error.message = printable(message)  # type: ignore[attr-defined]
 
 
 class _ListCommand(TyperCommand):

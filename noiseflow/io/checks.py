@@ -86,7 +86,7 @@ def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{kind} {path} {'is no file' if path.exists() else 'does not exist'}; check the path")
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
     if "\0" in text:
         raise ValueError(f"{path} is no text; an {kind} holds {holds}")
     return text.splitlines()

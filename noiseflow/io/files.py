@@ -6,14 +6,18 @@ import contextlib
 import errno
 import importlib.util
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from noiseflow.io.folder import files_of
 from noiseflow.io.image_file import WRITE_SUFFIXES
 from noiseflow.io.ownership import require_own
 from noiseflow.io.partials import REPLACED, clear_leftovers, link_target, partial_folder
+
+_CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 
 
 def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, overwrite: bool = True) -> Path:
@@ -52,16 +56,22 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
 
 
 def require_other(output: str | Path, *inputs: str | Path | None) -> None:
-    """Refuse an output that would replace one of the inputs.
+    """Refuse an output that would replace one of the inputs, or one of the images of a folder that is an input.
 
     Raises:
         ValueError: it would.
     """
     target = Path(output)
+    if not target.exists():
+        return
     for source in inputs:
-        path = None if source is None else Path(str(source).partition("::")[0])
-        if path is not None and path.exists() and target.exists() and target.samefile(path):
+        if source is not None and any(path.exists() and target.samefile(path) for path in _parts(source)):
             raise ValueError(f"{output} is an input too and would be lost; name another output")
+
+
+def _parts(source: str | Path) -> list[Path]:
+    path = Path(str(source).partition("::")[0])
+    return [path, *files_of(path)] if path.is_dir() else [path]
 
 
 def check_folder(
@@ -146,7 +156,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """A name for a temporary file, renamed onto `path` when the block succeeds; of a link, onto its target."""
     with partial_folder(path) as folder:
         partial = folder / Path(path).name
-        yield partial
+        try:
+            yield partial
+        except OSError as error:
+            if error.errno is None and _CUT_SHORT.fullmatch(str(error)):  # NumPy's, which hides the system's reason
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+            raise
         put_in_place(partial, path)
 
 

@@ -20,6 +20,8 @@ from noiseflow.plugins import load_plugins
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
+_LEAST_BYTES = 4
+"""That a file holds for each bin, level or pixel of a model that has many: at least one number in single precision."""
 MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
@@ -129,7 +131,7 @@ def load(path: str | Path) -> nn.Module:
     metadata, tensors = _open(Path(path))
     try:
         description = json.loads(metadata["model"])
-        _check_sizes(description, sum(tensor.numel() for tensor in tensors.values()))
+        _check_sizes(description, sum(tensor.nbytes for tensor in tensors.values()))
         with torch.device("meta"):  # takes no memory, whatever the description claims
             _check_parameters(_build(description), tensors)
         model = _build(description)
@@ -169,17 +171,17 @@ def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> No
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")
 
 
-def _check_sizes(description: Mapping[str, Any], num_parameters: int, *, depth: int = 0) -> None:
+def _check_sizes(description: Mapping[str, Any], num_bytes: int, *, depth: int = 0) -> None:
     """Refuse what could only cost memory and time: a size larger than the parameters it would have, and models nested
     without end."""
     inner = description.get("models", {})
     if depth > _DEEPEST or len(inner) > _DEEPEST:
         raise ValueError("models within models without end; fit and save the model again")
     largest = max(_whole_numbers(description["arguments"]), default=0)
-    if largest > max(num_parameters, _LARGEST_USUAL_SIZE):
-        raise ValueError(f"a size of {largest} with {num_parameters} parameters; fit and save the model again")
+    if largest > max(num_bytes // _LEAST_BYTES, _LARGEST_USUAL_SIZE):
+        raise ValueError(f"a size of {largest} with {num_bytes} bytes of parameters; fit and save the model again")
     for child in inner.values():
-        _check_sizes(child, num_parameters, depth=depth + 1)
+        _check_sizes(child, num_bytes, depth=depth + 1)
 
 
 def _whole_numbers(value: Any) -> Iterator[int]:

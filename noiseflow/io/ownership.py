@@ -55,10 +55,10 @@ def is_own(path: Path) -> bool:
         if kind in TIFF_SUFFIXES:
             return _tiff_is_own(path)
         if kind == ".safetensors":
-            return _tensors_are_own(path)
+            return (tensors_format(path) or "").startswith(MARK)
         with path.open("rb") as stream:
             head = stream.read(1024)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
     if kind in MRC_SUFFIXES:
         last = 224 + 80 * (int.from_bytes(head[220:224], "little") - 1)
@@ -90,10 +90,14 @@ def _tiff_is_own(path: Path) -> bool:
         return str(tags["Software"].value).startswith(MARK)
 
 
-def _tensors_are_own(path: Path) -> bool:
-    with path.open("rb") as stream:
-        length = int.from_bytes(stream.read(8), "little")
-        if length > path.stat().st_size:
-            return False
-        header: dict[str, Any] = json.loads(stream.read(length))
-    return str(header["__metadata__"]["format"]).startswith(MARK)
+def tensors_format(path: Path) -> str | None:
+    """The format's name in the metadata of a safetensors file; None where there is no such file, or no name."""
+    try:
+        with path.open("rb") as stream:
+            length = int.from_bytes(stream.read(8), "little")
+            if length > path.stat().st_size:
+                return None
+            header: dict[str, Any] = json.loads(stream.read(length))
+        return str(header["__metadata__"]["format"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None

@@ -22,6 +22,7 @@ from noiseflow.models.layers import tail_layer as tail_layer
 from noiseflow.models.standardisation import Standardisation, interpolate_cubic
 
 _NUM_NODES = 257
+_MOST_LAYERS = 1000
 _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 
 
@@ -227,12 +228,15 @@ class RadialFlow(ConditionalFlow):
     A conditional affine layer, then radial layers of which those next to the data depend on the signal.
 
     Args:
-        num_layers: number of radial layers.
+        num_layers: number of radial layers, at most 1000.
         num_conditional: how many of them depend on the signal, half of them by default; with none, all signals share the shape
             of the noise and only its location and scale vary.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
+
+    Raises:
+        ValueError: too many layers.
 
     Example:
         >>> import noiseflow, torch
@@ -250,6 +254,10 @@ class RadialFlow(ConditionalFlow):
         width: int = 32,
         neighbourhood: int = 1,
     ) -> None:
+        if (
+            num_layers > _MOST_LAYERS
+        ):  # each is an object: a file that claims many would cost far more than its own size
+            raise ValueError(f"num_layers is {num_layers}; a radial flow has at most {_MOST_LAYERS} layers")
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
         radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]

@@ -54,6 +54,7 @@ def batch(
     if table.suffix.lower() not in (".csv", ".json"):
         raise ValueError(f"--table {table}: name a .csv or a .json file")
     require_own_table(table, overwrite=overwrite)
+    io.require_other(table, source, noise_model)
     words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
     jobs, skipped = jobs_of(source, out, words), left_out(source)
     if skipped:

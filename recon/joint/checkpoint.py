@@ -27,7 +27,7 @@ from noiseflow.io import atomic_path, output_folder
 from noiseflow.io.ownership import is_own
 from noiseflow.io.partials import clear_all_leftovers
 from recon.joint.stages import Stage
-from recon.joint.state_files import discard_states
+from recon.joint.state_files import discard_states, is_state
 from recon.joint.state_files import read_state as read_state
 from recon.joint.state_files import write_state as write_state
 
@@ -35,7 +35,9 @@ StepReport = Callable[[str, int, int, str], None]
 """``report(title, done, total, note)`` after every step of every fit."""
 
 _FORMAT = "noiseflow checkpoint 2"
+_RUN_START = b'{\n "format": "noiseflow checkpoint '
 _RUN, _CURRENT, _BLOCKS = "run.json", "current.safetensors", "blocks-"
+_ROW = "[0-9]" * 7
 _RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
 
 
@@ -187,14 +189,14 @@ class Journal:
 
     def forget(self, prefix: str) -> None:
         """Remove what fits of this prefix have reached: their block is kept, and their states are larger than it."""
-        for file in self.folder.glob(f"{_slug(prefix)}*.safetensors"):
+        for file in filter(is_state, self.folder.glob(f"{_slug(prefix)}*.safetensors")):
             file.unlink()
 
     def discard(self) -> None:
         """Remove the journal: its run is complete, or is not wanted any more."""
-        for blocks in self.folder.glob(f"{_BLOCKS}*"):
+        for blocks in self.folder.glob(f"{_BLOCKS}{'[0-9a-f]' * 8}"):
             clear_all_leftovers(blocks)
-            for file in blocks.glob("*.npy"):
+            for file in blocks.glob(f"*-{_ROW}-{_ROW}.npy"):
                 if is_own(file):
                     file.unlink()
             if not any(blocks.iterdir()):
@@ -225,12 +227,21 @@ class Journal:
         write_state(path, state)
 
     def _start(self) -> None:
+        self._require_own()
         self.discard()
         description = {"format": _FORMAT, "library_version": version("noiseflow"), "settings": self.settings}
         description["choices"] = self._choices
         with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
             partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
         self._fresh = False
+
+    def _require_own(self) -> None:
+        run = self.folder / _RUN
+        head = run.read_bytes()[: len(_RUN_START)] if run.is_file() else b""
+        if head and head != _RUN_START:
+            raise FileExistsError(
+                f"{run} was not written by noiseflow and would be lost; move it, or name another output"
+            )
 
     def _check_settings(self) -> None:
         advice = f"give the same input and options, or leave out --resume to start over ({self.folder})"

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from noiseflow.io.ownership import is_own, require_own
+from noiseflow.io.ownership import tensors_format
 from noiseflow.io.partials import clear_all_leftovers
 from noiseflow.io.tensor_files import save_tensors
 
@@ -21,10 +21,18 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     Raises:
         OSError: the disk is full, the folder is gone, or the like; an earlier state stays. A file of others is not replaced.
     """
-    require_own(path, overwrite=False)
+    if not is_state(path) and path.exists():
+        raise FileExistsError(
+            f"{path} was not written by noiseflow as a state of a reconstruction; move it out of this folder"
+        )
     tensors: dict[str, Tensor] = {}
     description = json.dumps(_packed(state, tensors))
     save_tensors(path, tensors, {"format": FORMAT, "state": description})
+
+
+def is_state(path: Path) -> bool:
+    """Whether a file was written by `write_state`; noise models and files of others are none."""
+    return (tensors_format(path) or "").startswith(FORMAT.rstrip("0123456789"))
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -56,7 +64,10 @@ def discard_states(folder: Path, *descriptions: str) -> None:
     if not folder.is_dir():
         return
     clear_all_leftovers(folder)
-    for file in (*(file for file in folder.glob("*.safetensors") if is_own(file)), *map(folder.joinpath, descriptions)):
+    for file in (
+        *(file for file in folder.glob("*.safetensors") if is_state(file)),
+        *map(folder.joinpath, descriptions),
+    ):
         file.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

@@ -194,12 +194,11 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
 
     def score(volume: Tensor) -> float:
         predicted = unseen.predict(volume).astype(np.float64).ravel()
-        return float(np.corrcoef(predicted, measured)[0, 1]) if np.ptp(predicted) > 0 else -1.0
+        return float(np.corrcoef(predicted, measured)[0, 1]) if min(np.ptp(predicted), np.ptp(measured)) > 0 else -1.0
 
     return rest, score
 
 
 def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
     """Some tilts and some rows of a series."""
-    mask = None if tilt_series.mask is None else tilt_series.mask[:, rows]
-    return replace(tilt_series, images=tilt_series.images[:, rows], mask=mask).select(tilts)
+    return (tilt_series if rows == slice(None) else tilt_series.rows(rows)).select(tilts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import ctypes
 import json
@@ -61,7 +62,8 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
 
     Raises:
         FileNotFoundError: there is no such folder or table, or no series in it.
-        ValueError: a table without the column, two series of the same volume, or an option that names the volume.
+        ValueError: a table without the column, two series of the same volume, a volume that would replace another series or a
+            file among its options, or an option that names the volume.
     """
     if source.is_dir():
         jobs = [
@@ -79,10 +81,32 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
         raise ValueError(
             f"{named} among the options would be the volume of every series; name volumes in the column 'out'"
         )
+    _require_apart(jobs)
     twice = next((target for target in targets if targets.count(target) > 1), None)
     if twice is not None:
         raise ValueError(f"{twice} would be the volume of two series; name them in a table with a column 'out'")
     return jobs
+
+
+def _require_apart(jobs: Sequence[Job]) -> None:
+    """Each series refuses itself as its volume; here it is another's, read before or after."""
+    read: dict[tuple[int, int], Job] = {}
+    for job in jobs:
+        for path in (job.tilts, *map(Path, job.words)):
+            with contextlib.suppress(OSError, ValueError):
+                read.setdefault(_identity(path), job)
+    for job in jobs:
+        with contextlib.suppress(OSError):
+            other = read.get(_identity(job.out))
+            if other is not None and _identity(job.tilts) != _identity(job.out):
+                raise ValueError(
+                    f"{job.out} would be lost: it is read for {other.tilts}; name another volume for {job.tilts}"
+                )
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_dev, found.st_ino
 
 
 def reconstruct_all(jobs: Sequence[Job], *, workers: int, client: Any = None) -> Iterator[Row]:
@@ -236,7 +260,9 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
         running.processes.add(process)
     said, told = process.communicate()
     running.processes.discard(process)
-    lines = told.decode(errors="replace").strip().splitlines()
+    lines = [
+        text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))
+    ]  # a box of usage
     last = lines[-1].removeprefix("noiseflow: ") if lines else ""
     if process.returncode:
         return None, last or f"exit {process.returncode}"

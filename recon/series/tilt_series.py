@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -108,7 +108,7 @@ class TiltSeries:
         return part
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
-        """The series of some of its tilts, by index, boolean mask or slice.
+        """The series of some of its tilts, by index, boolean mask or slice; these may be flat, where the whole is not.
 
         Evenly spaced tilts are views of the images, so mapped ones stay on the disk; others go to a temporary file where the
         images are mapped and large.
@@ -116,7 +116,11 @@ class TiltSeries:
         tilts = evenly(tilts, self.num_tilts)
         images, mask = _sections(self.images, tilts), None if self.mask is None else _sections(self.mask, tilts)
         beam = None if self.beam is None else self.beam[tilts]
-        return replace(self, images=images, tilt_angles=self.tilt_angles[tilts], mask=mask, beam=beam)
+        part = self.with_images(images, mask)
+        object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
+        object.__setattr__(part, "beam", beam)
+        _check_angles(part.tilt_angles)
+        return part
 
 
 def _sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised, io
+from noiseflow.io.angles import LARGEST_ANGLE
 from noiseflow.io.checks import number
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, TiltSeries
@@ -136,7 +137,7 @@ def tilt_range(text: str) -> NDArray[np.float64]:
     """Angles of ``START:STOP:STEP`` in degrees, both ends included.
 
     Raises:
-        ValueError: not three numbers, or no angle in the range.
+        ValueError: not three numbers, no angle in the range, or angles of more than two full turns.
     """
     try:
         start, stop, step = (number(part) for part in text.split(":"))
@@ -144,6 +145,8 @@ def tilt_range(text: str) -> NDArray[np.float64]:
         raise ValueError(f"tilts '{text}': give START:STOP:STEP in degrees, such as -60:60:2") from None
     if not (step and np.isfinite([start, stop, step]).all() and (stop - start) / step >= 0):
         raise ValueError(f"tilts '{text}': the step does not lead from start to stop")
+    if max(abs(start), abs(stop)) > LARGEST_ANGLE:
+        raise ValueError(f"tilts '{text}': angles are degrees within ±{LARGEST_ANGLE}")
     if (stop - start) / step > 10_000:
         raise ValueError(f"tilts '{text}': more than 10000 tilts; give a larger step")
     return np.round(start + step * np.arange(int((stop - start) / step + 1e-6) + 1), 6)

@@ -205,3 +205,12 @@ def test_a_proposal_that_overflows_is_impossible_and_raises_no_warning(levels):
     posterior = LogPosterior(levels)
     with np.errstate(all="raise"):
         assert np.isneginf(posterior(np.array([[-10.86, 710.0, 2.9], [-10.86, 900.0, 2.9]]))).all()
+
+
+def test_read_noise_that_a_wide_step_hides_is_not_possible():
+    """Below a tenth of the step of pixel values, nothing tells read noises apart."""
+    electrons = np.random.default_rng(2).gamma(2.0, 20.0, 20_000)
+    posterior = LogPosterior([collect_levels([readings(np.random.default_rng(3), electrons, step=4.0)])], (99.0, 0.7))
+    assert posterior.step == 4
+    sets = np.array([[2.0, 99.0, 0.19], [2.0, 99.0, 0.21]])
+    assert np.isneginf(posterior(posterior.coordinates(*sets.T))).tolist() == [True, False]

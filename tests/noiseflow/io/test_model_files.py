@@ -159,3 +159,35 @@ def test_no_size_that_a_file_claims_costs_memory(kind: str, tmp_path: Path) -> N
         finally:
             os._exit(2)
     assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.parametrize("count", [1_000_000, 4_000_000])
+@pytest.mark.parametrize("kind", sorted(kinds()))
+def test_no_size_that_the_parameters_allow_costs_much_more_than_the_file(kind: str, count: int, tmp_path: Path) -> None:
+    """A file of 4 MB whose every size is as large as its parameters could be, or as their number."""
+    with torch.device("meta"):
+        noiseflow.Mixture()  # imports what it needs
+    arguments = inspect.signature(kinds()[kind].__init__).parameters
+    sizes = {name: count for name, each in arguments.items() if type(each.default) is int and name != "neighbourhood"}
+    inner = {"model": {"kind": "Gaussian", "arguments": {}}} if "model" in arguments else {}
+    metadata = {"format": "noiseflow noise model", "format_version": str(FORMAT_VERSION), "units": "counts"}
+    for name, size in sizes.items():
+        metadata["model"] = json.dumps({"kind": kind, "arguments": {name: size}, "models": inner})
+        save_file({"a": torch.zeros(4_000_000, dtype=torch.int8)}, tmp_path / "claims.safetensors", metadata)
+        child = os.fork()
+        if child == 0:
+            signal.alarm(60)
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            try:
+                noiseflow.load(tmp_path / "claims.safetensors")
+            except ValueError:
+                small = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 160 * 1024  # KiB
+                os._exit(0 if small else 1)
+            finally:
+                os._exit(2)
+        assert os.waitpid(child, 0)[1] == 0, name
+
+
+def test_a_flow_of_very_many_layers_is_refused() -> None:
+    with pytest.raises(ValueError, match="at most 1000 layers"):
+        noiseflow.RadialFlow(1001)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.metrics.evaluation import TABLE_HEADER, kl_divergence, pixel_log_prob, table_row
+from noiseflow.metrics.evaluation import TABLE_HEADER, _num_groups, kl_divergence, pixel_log_prob, table_row
 
 
 def test_divergences_of_known_vectors() -> None:
@@ -231,6 +231,14 @@ def test_masses_of_many_signals_are_those_of_each() -> None:
     exact = model(signal[:, None]).log_interval_prob(bounds[:, :-1], bounds[:, 1:]).exp().mean(0)
     # readings a step apart move across an edge by no more than a sixteenth of a step within a group
     np.testing.assert_allclose(metrics.residual_masses(model, signal, edges), exact, rtol=0.02, atol=1e-9)
+
+
+@pytest.mark.parametrize("middle", [-3.0, 0.0, 40.0])
+def test_signals_are_told_apart_by_their_range_wherever_it_lies(middle: float) -> None:
+    model = noiseflow.Digitised(noiseflow.Gaussian(0.5), step=0.1)
+    signal, edges = middle + torch.linspace(-2, 2, 100), torch.linspace(-1, 1, 21)
+    here, there = (_num_groups(model, each, edges, 16) for each in (signal, signal - middle + 100))
+    assert here == there > 16
 
 
 def test_residuals_that_are_all_equal_have_a_divergence() -> None:

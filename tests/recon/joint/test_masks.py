@@ -64,3 +64,15 @@ def test_the_coarse_start_follows_the_pixels_in_use_alone() -> None:
 def started(series: TiltSeries) -> torch.Tensor:
     options = {"num_steps": 80, "generator": torch.Generator().manual_seed(0)}
     return coarse_start(series, estimate_response(series), VolumeGrid.of(series), **options)
+
+
+def test_the_intensity_of_the_coarse_start_is_that_of_the_pixels_in_use_alone() -> None:
+    """A masked stripe, for which the mean stands in, must not dim or brighten the beam."""
+    density = make_phantom("shells", 51, generator=np.random.default_rng(0))
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 10.0))
+    mask = np.ones(clean.images.shape, dtype=bool)
+    mask[:, :, 20:36] = False
+    response, generator = Transmission(1.0), torch.Generator().manual_seed(0)
+    series = replace(clean, mask=mask)
+    coarse_start(series, response, VolumeGrid.of(series), num_steps=100, generator=generator)
+    assert float(response(torch.zeros(1)).detach()) == pytest.approx(1, abs=0.05)  # 1.30 where the stripe counts

@@ -1,15 +1,18 @@
 """SIRT, weighted back-projection and the error measures."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from recon.methods import reconstruct
 from recon.metrics.metrics import compare, fourier_shell_correlation, match
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import wbp
+from recon.series.tilt_series import VolumeGrid
 from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import make_phantom, shells
 from recon.simulate.simulation import Acquisition, add_noise, clean_tilt_series, tilt_range
@@ -110,6 +113,23 @@ def test_simulated_series_has_the_peak_and_the_noise_asked_for():
     assert -math.log(clean.images[1].min()) == pytest.approx(float((unit * volume).sum(0).max()), rel=1e-4)
     noise = add_noise(clean, SkewedNoise(0.1, 0.0), seed=1).images - clean.images
     assert noise.std() == pytest.approx(0.1, rel=0.05)
+
+
+@pytest.mark.parametrize("text", ["-1e30:1e30:1e29", "0:721:7", "-721:0:7", "-6_0:60:10", "nan:60:1", "0:inf:1"])
+def test_tilt_range_refuses_what_are_no_angles(text):
+    with pytest.raises(ValueError, match="tilts"):
+        tilt_range(text)
+
+
+@pytest.mark.parametrize("blank", [[2, 3], [0, 5, 10], [1, 6, 11], [2, 7, 12], [3, 8], [4, 9]])
+def test_blank_images_among_those_left_out_stop_no_search_for_the_window(blank):
+    """As of a closed shutter: whichever views are left out, a volume comes out."""
+    volume = make_phantom("shells", 16, generator=np.random.default_rng(0))
+    series, _ = clean_tilt_series(volume, tilt_range("-60:60:10"))
+    images = series.images.copy()
+    images[blank] = 0
+    series = replace(series, images=images)
+    assert np.isfinite(reconstruct(series, VolumeGrid.of(series), method="wbp").volume.attenuation).all()
 
 
 def test_tilt_range_includes_both_ends():
