@@ -145,10 +145,10 @@ def tilt_range(text: str) -> NDArray[np.float64]:
         raise ValueError(f"tilts '{text}': give START:STOP:STEP in degrees, such as -60:60:2") from None
     if not (step and np.isfinite([start, stop, step]).all() and (stop - start) / step >= 0):
         raise ValueError(f"tilts '{text}': the step does not lead from start to stop")
-    if max(abs(start), abs(stop)) > LARGEST_ANGLE:
-        raise ValueError(f"tilts '{text}': angles are degrees within ±{LARGEST_ANGLE}")
     if (stop - start) / step > 10_000:
         raise ValueError(f"tilts '{text}': more than 10000 tilts; give a larger step")
+    if max(abs(start), abs(stop)) > LARGEST_ANGLE:
+        raise ValueError(f"tilts '{text}': angles are degrees within ±{LARGEST_ANGLE}")
     return np.round(start + step * np.arange(int((stop - start) / step + 1e-6) + 1), 6)
 
 
