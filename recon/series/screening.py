@@ -87,11 +87,19 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
     A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. The tilts whose residual
     likelihood stands out most from their neighbours' are taken out and the rest is done again, until none stands out.
+
+    Raises:
+        ValueError: half of the images or more are blank.
     """
     count = tilt_series.num_tilts
     none = np.zeros(count, dtype=np.bool_)
     if count < _FEWEST:
         return Screening(np.ones(count), np.zeros(count), none, none, np.zeros(count))
+    blank = int(sum(np.ptp(image) == 0 for image in tilt_series.images))
+    if 2 * blank >= count:
+        raise ValueError(
+            f"{blank} of {count} images are blank, the same value in all pixels; give the tilts with a specimen"
+        )
     lowered, _ = without_level(tilt_series)
     coarse = replace(lowered, images=coarse_images(lowered, _WIDTH, _HEIGHT), mask=None, beam=None)
     bad = none
