@@ -118,7 +118,7 @@ class JointReconstructor:
         """
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
-        run = self._slab(start, tilt_series, self._model(start, tilt_series, grid), np.arange(grid.height), progress)
+        run = self._slab(tilt_series, self._model(start, tilt_series, grid), start.noise, progress)
         return self._finish(run, tilt_series, grid)
 
     @kept_memory()
@@ -126,8 +126,8 @@ class JointReconstructor:
         """Choose noise model, weight and response for all slices of a series: the first two on the slab of most contrast, the
         response on it and on the slab of least contrast, where vacuum tells a dimmer beam from a haze as in a whole fit."""
         start = self._start(tilt_series, grid)
-        part, model, rows = self._slabs(start, tilt_series, grid)
-        run = self._slab(start, part, model, rows, progress)
+        part, model = self._slabs(start, tilt_series, grid)
+        run = self._slab(part, model, start.noise, progress)
         run.fit_whole()
         return run.settled(start)
 
@@ -167,7 +167,7 @@ class JointReconstructor:
         skipped as vacuum; arguments as of a call. It takes the memory of a few slices, for a whole volume may not fit."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
-        part, model, _ = self._slabs(start, tilt_series, grid)
+        part, model = self._slabs(start, tilt_series, grid)
         facts, rows, _ = self._facts(part, model, start.noise)
         share = self._occupied_share(start, model, grid)
         return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
@@ -198,16 +198,14 @@ class JointReconstructor:
         rough = coarse_start(tilt_series, response, grid, generator=generator)
         return Start(rough, response, height, noise_share(tilt_series.images))
 
-    def _slabs(
-        self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid
-    ) -> tuple[TiltSeries, TomographySignal, NDArray[np.int64]]:
-        """The slices of most and of least contrast, their signal model, and their numbers."""
+    def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
+        """The slices of most and of least contrast, and their signal model."""
         num_slices = self._num_slices(grid)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
         rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
         part = tilt_series.rows(rows)
-        return part, self._model(start, part, replace(grid, height=len(rows)), rows=rows), rows
+        return part, self._model(start, part, replace(grid, height=len(rows)), rows=rows)
 
     def _occupied_share(self, start: Start, model: TomographySignal, grid: VolumeGrid) -> float:
         """The share of the voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
@@ -286,14 +284,13 @@ class JointReconstructor:
 
     def _slab(
         self,
-        start: Start,
         tilt_series: TiltSeries,
         whole: TomographySignal,
-        numbers: NDArray[np.int64],
+        noise: float,
         progress: Progress | None,
     ) -> PlannedRun:
-        """A run whose choices are made; `numbers` are those of its slices among the ones that `start` knows."""
-        facts, rows, given = self._facts(tilt_series, whole, start.noise)
+        """A run whose choices are made."""
+        facts, rows, given = self._facts(tilt_series, whole, noise)
         simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
@@ -301,7 +298,7 @@ class JointReconstructor:
         if facts.quiet and given is None:
             simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
         models = {"simple": simple, "chosen": simple if given is None else given}
-        part = self._part(whole, rows, start.rows(numbers[rows]))
+        part = self._part(whole, rows)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
@@ -332,12 +329,10 @@ class JointReconstructor:
         )
         return PlannedRun(facts, stages, runner)
 
-    def _part(self, whole: TomographySignal, rows: slice, rough: Tensor) -> TomographySignal:
-        """The signal model of some rows, which begins with the coarse volume of these rows alone: choices then do not depend on
-        whether the whole volume is fitted, or in blocks."""
+    def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
         made = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
-        made.start_from(rough.to(self.device))
+        made.start_from(whole.field.volume()[:, rows])
         part = whole.with_field(made)
         part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         return part

@@ -8,11 +8,10 @@ import torch
 
 import noiseflow
 from recon.benchmarks import needle as benchmark_needle
-from recon.benchmarks.scenes import make_scene
 from recon.fields.fields import VoxelField
 from recon.joint.candidates import first_noise, noise_candidates
 from recon.joint.joint import JointReconstructor
-from recon.joint.plan import Schedule, total_steps
+from recon.joint.plan import total_steps
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import block_mask
 from recon.metrics.metrics import compare
@@ -282,13 +281,3 @@ def test_a_dim_part_counts_as_vacuum_only_where_noise_could_have_made_it(noise, 
     noisy = add_noise(series, noiseflow.Gaussian(noise * float(series.images.std()) / 4), seed=0)
     occupancy = JointReconstructor().signal_model(noisy, VolumeGrid.of(noisy)).occupancy
     assert (occupancy is None or bool(occupancy.mask[12:20, 12:20, 18:26].all())) == kept  # (z, x, y)
-
-
-def test_blocks_and_whole_volumes_make_the_same_choices():
-    made = make_scene(24, phantom="particles", noise="clipped", tilts="-60:60:6")
-    short = Schedule(settle=8, candidate=8, adapt=4, refine=4, trial=10, whole=16)
-    fit = JointReconstructor(slab=6, num_steps=1, schedule=short)
-    whole, settled = fit(made.noisy, made.grid), fit.settle(made.noisy, made.grid)
-    assert settled.weight == whole.weight
-    for one, other in zip(settled.noise_model.parameters(), whole.noise_model.parameters(), strict=True):
-        torch.testing.assert_close(one, other)
