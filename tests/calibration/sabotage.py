@@ -27,6 +27,18 @@ def _emccd(seed: int, *, dark: bool) -> Case:
     return Case(short, long, {"dark": darks} if dark else {}, gain=150.0)
 
 
+def _integrating(seed: int, *, rest: float, deviation: float) -> Case:
+    """A photomultiplier that scans: pulses of random height, afterglow of `rest` along x, an offset of each row."""
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator)
+    exposures = []
+    for times in (1, RATIO):
+        image = sim.photomultiplied(generator, times * scene, gain=10.0, shape=4.0, offset=100.0, read=3.0)
+        glowing = sim.afterglow(image, rest) if rest else image
+        exposures.append(np.round(glowing + deviation * generator.standard_normal((len(scene), 1))))
+    return Case(*exposures, gain=10.0 * (1 + 1 / 4))
+
+
 def _gain_error(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
     short, long = clean(generator, scene)
     return short, np.round(long - 4e-6 * np.maximum(long - 100, 0) ** 2)
@@ -184,6 +196,8 @@ CASES: dict[str, Maker] = {
     "full well below the converter's end": lambda s: pair(s, _soft_saturation),
     "EMCCD, gain × F² 150": lambda s: _emccd(s, dark=False),
     "EMCCD, gain × F² 150, darks": lambda s: _emccd(s, dark=True),
+    "photomultiplier, gain × F² 12.5": lambda s: _integrating(s, rest=0.0, deviation=0.0),
+    "photomultiplier, afterglow 0.3, row offsets": lambda s: _integrating(s, rest=0.3, deviation=20.0),
     "averaged short (4 frames), unknown": lambda s: replace(
         pair(s, lambda g, x: (np.round(np.mean([exposed(g, x) for _ in range(4)], 0)), exposed(g, RATIO * x))), gain=0.5
     ),

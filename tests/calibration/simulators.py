@@ -69,11 +69,13 @@ def counted_with_dead_time(generator: np.random.Generator, rate: Image, *, dead_
     return counts
 
 
-def straggled(generator: np.random.Generator, electrons: Image, *, gain: float, shape: float) -> Image:
-    """Pixel values of a direct detector: each electron deposits a gamma-distributed energy of mean `gain`."""
+def photomultiplied(
+    generator: np.random.Generator, electrons: Image, *, gain: float, shape: float, offset: float, read: float
+) -> Image:
+    """Pixel values of an integrating detector: each electron gives a pulse of gamma-distributed height of mean `gain`."""
     counts = generator.poisson(electrons)
     charge = np.where(counts > 0, generator.gamma(np.maximum(shape * counts, 1e-9), gain / shape), 0.0)
-    return np.round(20 + charge + 2.0 * generator.standard_normal(electrons.shape))
+    return np.round(offset + charge + read * generator.standard_normal(electrons.shape))
 
 
 def landau_pulse(gain: float, scale: float) -> Any:
