@@ -94,12 +94,13 @@ class Matcher:
         return values, inside
 
     def centred(self, found: Match) -> Match:
-        """The same with the volume's mass above the middle of its width and depth.
+        """The same with the object in the middle of the volume's width and depth.
 
         Shifts determine an object up to its place. In the middle it fits a thin volume, and its shifts do not depend on the scale
-        of the stated tilt angles, as those of an object far from the axis do.
+        of the stated tilt angles, as those of an object far from the axis do. Voxels count by their squares: noise, which SIRT
+        keeps positive, fills the field with mass of its own.
         """
-        place = torch.tensor([_middle(found.volume.sum(other)) for other in ((1, 2), (0, 1))]) * self.binning
+        place = torch.tensor([_middle(found.volume.square().sum(other)) for other in ((1, 2), (0, 1))]) * self.binning
         across = self._moves @ place.to(self._moves)
         moves = torch.stack([torch.zeros_like(across), across], -1)
         return replace(found, shifts=found.shifts + moves @ frame(found.axis, moves))

@@ -95,7 +95,7 @@ def test_an_object_far_from_the_axis_is_moved_onto_it():
     place = np.arange(48) - 23.5
     for others in ((1, 2), (0, 1)):
         mass = volume.sum(others)
-        assert abs(mass @ place / mass.sum()) < 2.5  # noise that SIRT keeps positive fills the field, unevenly
+        assert abs(mass @ place / mass.sum()) < 2  # noise that SIRT keeps positive fills the field, unevenly
 
 
 def test_aligned_images_are_those_of_an_aligned_microscope():
