@@ -135,6 +135,22 @@ def test_only_noise_models_of_a_free_name_are_registered(kind: type, error: type
         noiseflow.register(kind)
 
 
+def is_refused_within(mebibytes: int, path: Path) -> bool:
+    """Whether a process of its own refuses the file in less than a minute and this much more memory."""
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        try:
+            noiseflow.load(path)
+        except ValueError:
+            small = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < mebibytes * 1024  # KiB
+            os._exit(0 if small else 1)
+        finally:
+            os._exit(2)
+    return os.waitpid(child, 0)[1] == 0
+
+
 @pytest.mark.parametrize("kind", sorted(kinds()))
 def test_no_size_that_a_file_claims_costs_memory(kind: str, tmp_path: Path) -> None:
     """Every whole number as large as any may be without parameters for it, and every list long: refused, or small."""
@@ -147,18 +163,7 @@ def test_no_size_that_a_file_claims_costs_memory(kind: str, tmp_path: Path) -> N
     inner = {"model": {"kind": "Gaussian", "arguments": {}}} if "model" in defaults else {}
     metadata["model"] = json.dumps({"kind": kind, "arguments": claims, "models": inner})
     save_file({"a": torch.zeros(1)}, tmp_path / "claims.safetensors", metadata)
-    child = os.fork()
-    if child == 0:
-        signal.alarm(60)
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        try:
-            noiseflow.load(tmp_path / "claims.safetensors")
-        except ValueError:
-            small = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024  # KiB
-            os._exit(0 if small else 1)
-        finally:
-            os._exit(2)
-    assert os.waitpid(child, 0)[1] == 0
+    assert is_refused_within(100, tmp_path / "claims.safetensors")
 
 
 @pytest.mark.parametrize("count", [1_000_000, 4_000_000])
@@ -174,18 +179,7 @@ def test_no_size_that_the_parameters_allow_costs_much_more_than_the_file(kind: s
     for name, size in sizes.items():
         metadata["model"] = json.dumps({"kind": kind, "arguments": {name: size}, "models": inner})
         save_file({"a": torch.zeros(4_000_000, dtype=torch.int8)}, tmp_path / "claims.safetensors", metadata)
-        child = os.fork()
-        if child == 0:
-            signal.alarm(60)
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            try:
-                noiseflow.load(tmp_path / "claims.safetensors")
-            except ValueError:
-                small = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 160 * 1024  # KiB
-                os._exit(0 if small else 1)
-            finally:
-                os._exit(2)
-        assert os.waitpid(child, 0)[1] == 0, name
+        assert is_refused_within(160, tmp_path / "claims.safetensors"), name
 
 
 def test_a_flow_of_very_many_layers_is_refused() -> None:
