@@ -16,6 +16,7 @@ from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import KINDS, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
+from calibration.exposures.codes import below_joins
 from calibration.exposures.frames import Burst, ExposurePair, Image
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
@@ -142,12 +143,14 @@ def measure_exposures(
     if dark is not None:
         pattern = dark_pattern(exposures, dark)
         exposures = exposures if pattern is None else without_pattern(exposures, pattern)
+    exposures, (join, joined) = below_joins(exposures)
     burst = None
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
     else:
         pairs = [align_pair(pair) for pair in exposures]
     pairs, repairs = repaired(pairs)
+    repairs = replace(repairs, join=join, joined=joined)
     correlation = correlation_of(pairs)
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]

@@ -21,6 +21,7 @@ from calibration.detector.independence import contained_share, correlation_in_ti
 from calibration.detector.measure import Detector
 from calibration.detector.repair import LEAST_SHARE, Repairs
 from calibration.detector.shape import field_deviation
+from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed
 from calibration.exposures.frames import rails
 from calibration.registration.aligned import AlignedPair
@@ -33,7 +34,7 @@ LEAST_MISFIT = 0.8
 """χ² per degree of freedom below which the histograms are more even than independent pixels can be: over the thousand cells of
 a usual calibration it scatters by 0.05. Bursts share their frames, which takes some scatter away."""
 
-WIDEST_GAIN = 0.04
+WIDEST_GAIN = 0.03
 """Half-width of the gain's 90 % interval, relative, above which too few electrons or too little contrast were recorded:
 twice the goal."""
 
@@ -101,9 +102,9 @@ def judge_calibration(
     reasons = [
         *_scene(repairs, correlation),
         *_independence(pairs),
-        *_correlation(pairs, correlation, repairs, figures),
+        *_correlation(pairs, correlation, repairs, figures, detector.electrons),
         *_shape(detector, figures),
-        *_range(pairs, detector, figures),
+        *_range(pairs, detector, figures, repairs),
     ]
     return verdict_of(reasons)
 
@@ -150,13 +151,15 @@ def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
 
 
 def _correlation(
-    pairs: Sequence[AlignedPair], correlation: Correlation, repairs: Repairs, figures: Figures
+    pairs: Sequence[AlignedPair], correlation: Correlation, repairs: Repairs, figures: Figures, electrons: bool
 ) -> list[Reason]:
     found = []
     for name, deviation in (("rows", repairs.rows), ("columns", repairs.columns)):
         if deviation:
             text = f"{name} have individual offsets, {deviation:.3g} counts rms; they were subtracted before the measurement"
             found.append(Reason(f"{name[:-1]} offsets", "doubtful", text + ". ScanNoise(model) models them."))
+    if electrons:  # which no filter leaves, and which tell the gain whatever correlates
+        return found
     if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
         lag = int(np.argmax(np.abs(correlation.value)))
         distance, value = tuple(int(step) for step in correlation.lags[lag]), correlation.value[lag]
@@ -254,8 +257,14 @@ def _shape(detector: Detector, figures: Figures) -> list[Reason]:
     return found
 
 
-def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures) -> list[Reason]:
+def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, repairs: Repairs) -> list[Reason]:
     found = []
+    if repairs.joined:
+        text = f"pixels brighter than {repairs.join:.5g} counts ({repairs.joined:.1%}) use fewer of the converter's codes: two "
+        text += "converters joined into one frame (high dynamic range), or companded values. "
+        few = repairs.joined <= MOST_JOINED
+        text += "They were treated as clipped: figures and noise models are those of the darker pixels" if few else "No gain fits both"
+        found.append(Reason("joined converters", "doubtful" if few else "bad", text + ". Record with one converter setting."))
     gain = figures.gain
     half = (gain.q95 - gain.q05) / (2 * gain.median)
     if half > WIDEST_GAIN:

@@ -23,6 +23,10 @@ UNRESOLVED = 0.1, 0.4
 electrons, beyond which no electron shows. The prior ends there. Coarser codes than electrons cannot tell less, and the
 likelihood would be a field of peaks where electrons and codes keep step."""
 
+MOST_WRONG = 12
+"""Electrons by which a start may miss the offset: from 12 pixels of 10 electrons each the photon-transfer line extrapolates
+to the offset within this."""
+
 MOST_ELECTRONS = 1e60
 """Electrons of a pixel beyond which a proposal is impossible: their squares are still finite numbers. Noise that does not depend
 on the signal lets the posterior reach gains as small as its prior allows, far below this, by which it is recognised."""
@@ -110,7 +114,7 @@ def maximum_likelihood(
     """
     best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
     for _ in range(NUM_RESCALINGS):
-        best = _climb(log_posterior, best)
+        best = _by_whole_electrons(log_posterior, _climb(log_posterior, best))
         moved = log_posterior.rescaled(best)
         if moved is None:
             break
@@ -126,6 +130,17 @@ def _climb(log_posterior: LogPosterior, start: Image) -> Image:
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-2, "maxiter": 400}
     found = minimize(lambda p: -float(log_posterior(p)[0]), start, method="Nelder-Mead", options=options)
     return np.asarray(found.x)
+
+
+def _by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
+    """The maximum beside others whose offset differs by whole electrons: where single electrons show, each has a peak there."""
+    gain, offset, read_noise = (value.item() for value in log_posterior.parameters(best))
+    if read_noise > UNRESOLVED[1]:
+        return best
+    shift = gain * np.arange(-MOST_WRONG, MOST_WRONG + 1)
+    others = log_posterior.coordinates(np.full(shift.shape, gain), offset + shift, np.full(shift.shape, read_noise))
+    other = others[int(np.argmax(log_posterior(others)))]
+    return best if np.array_equal(other, others[MOST_WRONG]) else _climb(log_posterior, other)
 
 
 def _start(log_posterior: LogPosterior) -> Image:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.detector.cells import collect_cells
+from calibration.detector.electrons import electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
@@ -62,6 +63,7 @@ class Detector:
             are uneven, of several codes together, which tell the shape of the noise.
         uneven: relative deviation of the pixels' own variances, at equal signal, in a burst of four frames or more; 0: none.
         codes: relative deviation (rms) of the widths of the converter's codes; 0: none.
+        electrons: single electrons show as peaks of the pixel values, one gain apart.
         dark_deviation: of the dark frames over time, counts rms, without rounding; None without dark frames.
 
     Example:
@@ -84,6 +86,7 @@ class Detector:
     uneven: float = 0.0
     dark_deviation: float | None = None
     codes: float = 0.0
+    electrons: bool = False
 
 
 def measure_detector(
@@ -140,7 +143,17 @@ def measure_detector(
         )
     line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=MERGED if codes else 1)
-    return Detector(posterior, line, levels, offset, chi_squared, unevenness(pairs), dark_deviation(dark), codes)
+    return Detector(
+        posterior,
+        line,
+        levels,
+        offset,
+        chi_squared,
+        uneven=unevenness(pairs),
+        dark_deviation=dark_deviation(dark),
+        codes=codes,
+        electrons=electrons_show(levels, float(posterior.most_likely[0])),
+    )
 
 
 def _with_cells(

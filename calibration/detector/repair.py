@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ CLEAR = 5.0
 """Standard errors beyond which row offsets are there."""
 
 
-@described(changed="of the pixels", rows="counts", columns="counts")
+@described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")
 @dataclass(frozen=True)
 class Repairs:
     """What was found and modelled before the detector was measured.
@@ -37,6 +37,8 @@ class Repairs:
         scene_after: the same after a kernel was fitted between the exposures; as `scene` where none was.
         refitted: whether any was.
         rows, columns: standard deviation of the offsets taken out of each row or column; 0: none was.
+        join: brightness from which on a second converter read the pixels; infinite: none. A few are treated as clipped.
+        joined: share of those pixels.
     """
 
     changed: float = 0.0
@@ -45,7 +47,8 @@ class Repairs:
     refitted: bool = False
     rows: float = 0.0
     columns: float = 0.0
-    names: tuple[str, ...] = field(default=())
+    join: float = np.inf
+    joined: float = 0.0
 
 
 def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:

@@ -60,7 +60,9 @@ def saturated(frame: Image, *, margin: int = 0) -> Mask:
     return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
 
 
-def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float = 3.5) -> Mask:
+def clear_of_rails(
+    frame: Image, level: Image, mask: Mask, *, deviations: float = 3.5, upper_only: bool = False
+) -> Mask:
     """Pixels whose level lies at least some standard deviations off the converter's clipping limits, so that no noise is cut off.
 
     Args:
@@ -68,8 +70,10 @@ def clear_of_rails(frame: Image, level: Image, mask: Mask, *, deviations: float 
         level: (y, x) the signal by other pixel values than the frame's own: a choice by these would cut their noise.
         mask: (y, x) pixels to judge the noise by.
         deviations: the distance asked for.
+        upper_only: the lower limit does not count.
     """
     low, high = rails(frame)
+    low = -np.inf if upper_only else low
     clear = np.ones(frame.shape, bool)
     for rail, side in ((low, 1.0), (high, -1.0)):
         if np.isfinite(rail):

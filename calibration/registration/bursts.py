@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.masks import Mask, MaskCounts, defects, restless, saturated
+from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
@@ -84,6 +84,8 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     frames = burst.frames
     hot, dead = defects(frames)
     trusted = ~(hot | dead | np.any([saturated(frame) for frame in frames], axis=0))
+    if trusted.any():  # a choice by single readings would cut their noise; their mean tells nothing of their differences
+        trusted &= clear_of_rails(frames[0], frames.mean(0), trusted, upper_only=True)
     if trusted.sum() < MINIMUM_PIXELS:
         raise ValueError(
             f"only {int(trusted.sum())} pixels of {burst.name} can be used; give frames that are not saturated"
