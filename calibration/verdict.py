@@ -22,8 +22,8 @@ from calibration.detector.measure import Detector
 from calibration.detector.repair import LEAST_SHARE, Repairs
 from calibration.detector.shape import field_deviation
 from calibration.exposures.codes import MOST_JOINED
-from calibration.exposures.compression import block_compressed
-from calibration.exposures.frames import rails
+from calibration.exposures.compression import block_compressed, wavelet_compressed
+from calibration.exposures.frames import Image, rails
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 
@@ -210,13 +210,15 @@ def _independence(pairs: Sequence[AlignedPair]) -> list[Reason]:
 
 
 def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
-    """Whether the first frame, or its long exposure, went through block compression."""
+    """Whether the first frame, or its long exposure, went through lossy compression."""
     first = pairs[0]
-    end = " compressed in blocks of 8 × 8 pixels (JPEG or the like), which removes noise and adds its own. Give raw frames."
-    if block_compressed(first.short):
-        return [Reason("compressed", "bad", "the frame was" + end)]
-    if first.frames == 1 and block_compressed(first.long):
-        return [Reason("compressed", "doubtful", "the long exposure was" + end)]
+    looked_at: tuple[tuple[Image, str, Grade], ...] = ((first.short, "frame", "bad"), (first.long, "long exposure", "doubtful"))
+    for frame, name, grade in looked_at:
+        kind = "in blocks of 8 × 8 pixels (JPEG)" if block_compressed(frame) else ""
+        kind = kind or ("by wavelets (JPEG 2000)" if wavelet_compressed(frame) else "")
+        if kind and (name == "frame" or first.frames == 1):
+            text = f"the {name} was compressed {kind} or the like, which removes noise and adds its own. Give raw frames."
+            return [Reason("compressed", grade, text)]
     return []
 
 
