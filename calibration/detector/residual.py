@@ -68,7 +68,8 @@ def residual_of(pair: AlignedPair) -> Residual:
     spread = np.ones(pair.mask.shape)
     spread[pair.mask] = spread_by_level(level, difference)
     z = np.zeros(pair.mask.shape)
-    z[pair.mask] = np.clip((difference - np.median(difference)) / spread[pair.mask], -CUT, CUT)
+    cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
+    z[pair.mask] = cut - cut.mean()  # not the median, which skewed noise has off its mean: pixels would seem correlated
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
     return Residual(
         z / max(scale, np.finfo(float).tiny), pair.mask, float(pair.share[pair.mask].mean()), spread * scale

@@ -35,6 +35,10 @@ ROUNDS = 12
 PER_LEVEL = 5000
 """Differences that tell the spread at a level: to 2 % of its variance."""
 
+LEAST_VARIANCE = 0.05
+"""Of the mean variance, below which the line of variance is not followed: at no light it may cross zero, and pixels there would
+count as many times noisier than it says."""
+
 CUT = 5.0
 """Standard deviations at which differences are cut, so that single outliers do not speak for all pixels."""
 
@@ -116,7 +120,7 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
     )  # of the frames themselves: given it, Poisson counts have just its variance, however steep the scene
     squares = frames.var(axis=0, ddof=1)
     line = fit_line(level, squares)
-    spread = np.sqrt(np.maximum(line(level), 1e-3 * squares.mean()))
+    spread = np.sqrt(np.maximum(line(level), LEAST_VARIANCE * squares.mean()))
     differences = (frames[1::2] - frames[:-1:2]) / spread
     number = min(24, differences.size // PER_LEVEL + 1)  # so that the levels' own errors are no unevenness
     spread *= spread_by_level(np.tile(level, len(differences)), differences.ravel(), num_levels=number)[: len(level)]
@@ -162,7 +166,7 @@ def _products(frames: Image, spread: Image) -> tuple[Image, float]:
         order = generator.permutation(len(frames))
         even = order[: len(order) // 2 * 2]
         difference = (frames[even[::2]] - frames[even[1::2]]) / (np.sqrt(2) * spread)
-        squares = np.clip(difference - np.median(difference, axis=1, keepdims=True), -CUT, CUT) ** 2
+        squares = np.clip(difference - difference.mean(axis=1, keepdims=True), -CUT, CUT) ** 2
         squares = squares / squares.mean(axis=1, keepdims=True) - 1
         number, power = len(squares), power + float(np.mean(squares**2)) / ROUNDS
         total += (squares.sum(0) ** 2 - (squares**2).sum(0)) / (number * (number - 1))
