@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: demo test test-shard test-slow fuzz soak mutation check lint docs clean
+.PHONY: demo test test-shard test-slow fuzz soak mutation check lint docs gallery clean
 
 demo: .venv/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
@@ -49,6 +49,10 @@ lint: .venv/test-ready
 docs: .venv/test-ready
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
+
+# Draws the pictures of the gallery again, in docs/images.
+gallery: .venv/test-ready
+	set -e; for program in $(filter-out %/drawing.py,$(wildcard docs/gallery/*.py)); do $(BIN)/python $$program; done
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

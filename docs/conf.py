@@ -5,18 +5,26 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "tutorials")]
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE / "tutorials")]
 
 project = "noiseflow"
 author = "The noiseflow developers"
 copyright = f"2026, {author}"
 version = release = installed_version("noiseflow")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]
-exclude_patterns = ["_build", "examples"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "examples", "gallery/GALLERY_HEADER.rst", "gallery/generated/index.rst"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.xref_missing", "myst.header"]
+suppress_warnings = ["myst.xref_missing", "myst.header", "sphinx_gallery.config"]  # the last: no back references
 
 autosummary_generate = True
 autodoc_typehints = "description"
@@ -25,6 +33,20 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
 napoleon_use_rtype = False
 napoleon_use_ivar = True
+
+# Pages only: the pictures are in docs/images, where `make gallery` draws them. Notebooks bring the shared functions with them.
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "gallery/generated",
+    "ignore_pattern": r"(drawing|import_graph)\.py$",
+    "plot_gallery": False,
+    "within_subsection_order": "FileNameSortKey",
+    "first_notebook_cell": "%%writefile drawing.py\n" + (HERE / "gallery" / "drawing.py").read_text(encoding="utf-8"),
+    "notebook_images": True,
+    "remove_config_comments": True,
+    "show_signature": False,
+    "write_computation_times": False,
+}
 
 smartquotes_action = "qe"  # without dashes: two hyphens begin an option
 

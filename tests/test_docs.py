@@ -141,14 +141,46 @@ def test_gallery_draws_its_pictures(name: str, tmp_path: Path, monkeypatch: pyte
     assert picture.stat().st_size > 4_000
 
 
-def test_gallery_shows_every_program_and_its_small_picture() -> None:
+def test_gallery_lists_every_program_once_and_each_shows_its_small_picture() -> None:
     page = (GALLERY / "index.md").read_text(encoding="utf-8")
-    assert all(f"{{literalinclude}} {name}.py\n" in page for name in DRAWN)
-    pictures = [*(ROOT / "docs" / "images" / "gallery").glob("*.png")]
+    groups = [
+        re.findall(r"^   gallery/(\w+)\.py$", part, flags=re.MULTILINE) for part in page.split("minigallery::")[1:]
+    ]
+    listed = [name for group in groups for name in group]
+    assert len(groups) == 2
+    assert sorted(listed) == [
+        name for name in DRAWN if name != "import_graph"
+    ]  # the page of the architecture shows that
+    shown = set()
+    for name in listed:
+        program = (GALLERY / f"{name}.py").read_text(encoding="utf-8")
+        (picture,) = re.findall(r"^\.\. image:: /(images/\S+)$", program, flags=re.MULTILINE)
+        assert f'# sphinx_gallery_thumbnail_path = "{picture}"\n' in program, name
+        shown.add(ROOT / "docs" / picture)
+    pictures = {*(ROOT / "docs" / "images" / "gallery").glob("*.png")}
     assert len(pictures) >= 16
-    assert all(f"images/gallery/{picture.name}" in page for picture in pictures)
-    pictures += (ROOT / "docs" / "images" / "tutorials").glob("*.png")
+    assert pictures < shown
+    assert all(picture.is_file() for picture in shown)
+    pictures |= {*(ROOT / "docs" / "images" / "tutorials").glob("*.png")}
     assert all(picture.stat().st_size < 150_000 for picture in pictures)
+
+
+@pytest.mark.parametrize(
+    ("name", "picture"),
+    [("pit", "gallery/pit.png"), ("overview", "overview.png"), ("geometry", "geometry.svg")],
+)
+def test_gallery_programs_draw_the_committed_picture_by_default(
+    name: str, picture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "docs" / "gallery"
+    copy.mkdir(parents=True)
+    (tmp_path / "docs" / "images" / "gallery").mkdir(parents=True)
+    shutil.copy(GALLERY / "drawing.py", copy)
+    monkeypatch.setattr(sys, "argv", [f"{name}.py"])
+    call = re.findall(r"^    main\(.*\)$", (GALLERY / f"{name}.py").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    drawing = runpy.run_path(str(copy / "drawing.py"))
+    exec(call[0].strip(), {"main": drawing["main"], "draw": lambda: drawing["new_figure"]()[0]})
+    assert (tmp_path / "docs" / "images" / picture).is_file()
 
 
 def test_reference_explains_every_option_of_every_command() -> None:

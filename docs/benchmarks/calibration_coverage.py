@@ -1,4 +1,4 @@
-"""Do the intervals cover? `python docs/benchmarks/calibration_coverage.py [--trials N] [--only WORD] [--minutes M]`.
+"""Do the intervals cover? `python docs/benchmarks/calibration_coverage.py [--trials N] [--only WORD] [--minutes M] [--page]`.
 
 Simulated exposures of 128² pixels of Poisson-Gaussian detectors with random parameters are measured as `noiseflow calibrate`
 does; a 90 % interval should hold the truth nine times in ten. Trials are kept line by line in ``results/coverage_rows``, and an
@@ -19,9 +19,10 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 # this folder holds a file of the package's name, which must not hide the package; the simulators are those of the tests
-sys.path = [path for path in sys.path if Path(path or ".").resolve() != HERE] + [str(HERE.parents[1])]
+sys.path = [path for path in sys.path if Path(path or ".").resolve() != HERE] + [str(HERE.parents[1]), str(HERE)]
 ROWS = HERE / "results" / "coverage_rows"
-PAGE = HERE / "calibration_coverage.md"
+MACHINES = ROWS / "machines.json"  # rows name theirs by its place in this list
+PAGE, PICTURE = HERE / "calibration_coverage.md", HERE / "calibration_coverage.png"
 COMMAND = "python docs/benchmarks/calibration_coverage.py"
 SIZE, RATIO, FRAMES = 128, 16.0, 8
 STEP = 20  # trials of one kind before the next kind's turn, so that an interrupted run has all of them
@@ -64,7 +65,7 @@ def found_of(kind: str, seed: int) -> Row:
         ratio = RATIO if kind == "ratio known" else None
         exposures = [ExposurePair(taken(scene), taken(RATIO * scene), ratio)]
         dark = Burst(np.stack([taken(0 * scene) for _ in range(FRAMES)]), calibration=True) if kind == "darks" else None
-    row: Row = {"seed": seed, "truth": truth} | origin()
+    row: Row = {"seed": seed, "truth": truth, "machine": machine_number()} | origin()
     started = time.process_time()
     try:
         found = measure_exposures(exposures, dark=dark)
@@ -87,6 +88,23 @@ KINDS: dict[str, str] = {
 }
 
 
+def machines() -> list[dict[str, Any]]:
+    """The machines that rows name by number."""
+    found: list[dict[str, Any]] = json.loads(MACHINES.read_text(encoding="utf-8")) if MACHINES.exists() else []
+    return found
+
+
+def machine_number() -> int:
+    """The number of this machine, which enters the list with its first row."""
+    from recon.benchmarks.provenance import machine
+
+    known, here = machines(), machine()
+    if here not in known:
+        known.append(here)
+        MACHINES.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    return known.index(here)
+
+
 def rows_of(kind: str) -> list[Row]:
     """The trials kept of a kind."""
     path = ROWS / f"{kind.replace(' ', '-')}.jsonl"
@@ -102,12 +120,28 @@ def covered(rows: list[Row], name: str) -> tuple[int, int, float]:
     return held, len(given), float(np.median(widths)) if widths else float("nan")
 
 
-def page(trials: dict[str, list[Row]]) -> str:
+def draw(trials: dict[str, list[Row]]) -> None:
+    """Draw the share of intervals that contain the truth."""
+    import dots
+
+    shares: dict[str, dict[str, float]] = {name.replace("_", " "): {} for name in PARAMETERS}
+    for kind, rows in trials.items():
+        for name in PARAMETERS:
+            held, given, _ = covered(rows, name)
+            if given:
+                shares[name.replace("_", " ")][kind] = 100 * held / given
+    panel = ("90 % intervals of simulated exposures", "intervals that contain the truth (%)", shares)
+    dots.save(PICTURE, [panel], columns=1, line=90.0)
+
+
+def page(trials: dict[str, list[Row]], known: list[dict[str, Any]]) -> str:
     """The page as Markdown."""
     from recon.benchmarks.provenance import measured_on
 
     lines = [
         "# Calibration: do the intervals cover?\n",
+        f"![Share of the 90 % intervals that contain the truth, by kind of exposures]({PICTURE.name})\n",
+        "*Shares of intervals that contain the truth; the dashed line marks 90 %. Kinds are in the order of the table.*\n",
         "Each cell shows how many of the reported 90 % intervals contain the truth, and their median half-width (relative; in "
         "electrons for the offset). For perfect intervals, nine of ten repetitions of 300 trials lie between 87 and 93 %, of "
         "100 trials between 85 and 95 %.\n",
@@ -135,7 +169,10 @@ def page(trials: dict[str, list[Row]]) -> str:
         "skewness misleads, these priors alone contained the truth in 83 to 86 %. The intervals of exposures without darks or "
         "a known ratio therefore also cover the result of photon transfer."
     )
-    origin = measured_on([{"cells": cells, "machines": []}])
+    numbers = {row.get("machine") for row in cells.values()}
+    used: list[Any] = [None] if None in numbers else []
+    used += [machine for number, machine in enumerate(known) if number in numbers]
+    origin = measured_on([{"cells": cells, "machines": used}])
     return "\n".join(lines) + f"\n\n{method}\n\n{origin}\n"
 
 
@@ -155,13 +192,16 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=300, help="of each kind")
     parser.add_argument("--only", default="", help="kinds whose name holds this")
     parser.add_argument("--minutes", type=float, default=600.0, help="stop after the trial done by then")
+    parser.add_argument("--page", action="store_true", help="write the page only")
     arguments = parser.parse_args()
     end = time.monotonic() + 60 * arguments.minutes
     for trials in range(STEP, arguments.trials + STEP, STEP):
         for kind in KINDS:
-            if arguments.only in kind:
+            if arguments.only in kind and not arguments.page:
                 measure(kind, min(trials, arguments.trials), lambda: time.monotonic() > end)
-    PAGE.write_text(page({kind: rows_of(kind) for kind in KINDS}), encoding="utf-8")
+    found = {kind: rows_of(kind) for kind in KINDS}
+    draw(found)
+    PAGE.write_text(page(found, machines()), encoding="utf-8")
     print(PAGE.read_text(encoding="utf-8"))
 
 

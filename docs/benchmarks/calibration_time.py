@@ -1,4 +1,4 @@
-"""Processor time of `noiseflow calibrate`: `python docs/benchmarks/calibration_time.py [--only WORD]`.
+"""Processor time of `noiseflow calibrate`: `python docs/benchmarks/calibration_time.py [--only WORD] [--page]`.
 
 Simulated exposures are written to files, and the command runs from there to model and report, on one thread. The page
 calibration_time.md is written from ``results/calibration_time.json``, where rows that are not measured again stay.
@@ -20,9 +20,10 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 # this folder holds a file of the package's name, which must not hide the package; the simulators are those of the tests
-sys.path = [path for path in sys.path if Path(path or ".").resolve() != HERE] + [str(HERE.parents[1])]
+sys.path = [path for path in sys.path if Path(path or ".").resolve() != HERE] + [str(HERE.parents[1]), str(HERE)]
 COMMAND = "python docs/benchmarks/calibration_time.py"
 RESULTS, PAGE = HERE / "results" / "calibration_time.json", HERE / "calibration_time.md"
+PICTURE = HERE / "calibration_time.png"
 CASES: dict[str, tuple[str, tuple[str, ...], float | None]] = {
     "pair 256": ("a pair of 256² pixels", ("--short", "--long"), 10.0),
     "pair 1024": ("a pair of 1024² pixels", ("--short", "--long"), None),
@@ -76,12 +77,24 @@ def gain_of(found: dict[str, Any]) -> float:
     return float(gain["median"] if isinstance(gain, dict) else gain)
 
 
+def draw(found: dict[str, Any]) -> None:
+    """Draw the processor time of each case and its goal."""
+    import dots
+
+    times = {name: row["seconds"] for name, row in found["cells"].items()}
+    goals = {name: goal for name in times if (goal := CASES[name][2])}
+    panel = ("noiseflow calibrate, one thread", "processor time (s)", {"measured": times, "goal": goals})
+    dots.save(PICTURE, [panel], columns=1)
+
+
 def page(found: dict[str, Any]) -> str:
     """The page as Markdown."""
     from recon.benchmarks.provenance import measured_on
 
     lines = [
         "# Calibration: processor time\n",
+        f"![Processor time of noiseflow calibrate by kind of exposures, and the goals]({PICTURE.name})\n",
+        "*Processor time of each kind of exposures, in the order of the table, and its goal where there is one.*\n",
         f"Written by `{COMMAND}`: `noiseflow calibrate` from files to model and report, on one thread, the start of Python "
         "included. Simulated detectors of gain 2 counts per electron, offset 100 counts and read noise 3 e⁻. Pixels enter the "
         "posterior as histograms at levels of the signal, of all frames of a burst together; noise models are fitted to 32 768 "
@@ -97,16 +110,20 @@ def page(found: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="cases whose name holds this")
+    parser.add_argument("--page", action="store_true", help="write the page only")
     arguments = parser.parse_args()
     from recon.benchmarks.provenance import machine
 
-    rows = json.loads(RESULTS.read_text(encoding="utf-8"))["cells"] if RESULTS.exists() else {}
-    for name in CASES:
-        if arguments.only in name:
-            rows[name] = measured(name)
-            print(name, rows[name], flush=True)
-    found = {"cells": {name: rows[name] for name in CASES if name in rows}, "machines": [machine()]}
-    RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {"cells": {}}
+    if not arguments.page:
+        rows = found["cells"]
+        for name in CASES:
+            if arguments.only in name:
+                rows[name] = measured(name)
+                print(name, rows[name], flush=True)
+        found = {"cells": {name: rows[name] for name in CASES if name in rows}, "machines": [machine()]}
+        RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    draw(found)
     PAGE.write_text(page(found), encoding="utf-8")
 
 

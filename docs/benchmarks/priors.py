@@ -23,6 +23,7 @@ from prior_candidates import CANDIDATES
 
 from noiseflow import io
 from noiseflow.commands.console import Output
+from recon.benchmarks.provenance import measured_on
 from recon.benchmarks.scenes import Results, Scene, make_scene
 from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import compare
@@ -106,10 +107,9 @@ def joint(scene: Scene, noise: str, name: str) -> Row:
     return fitted(scene, lambda: JointReconstructor(regulariser=CANDIDATES[name](scene)))
 
 
-def page(cells: dict[str, Row]) -> str:
+def page(content: dict[str, Any]) -> str:
     """The page as Markdown."""
-    runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
-    lines = [_HEAD, "", "Computed " + ", ".join(f"{date} at commit {commit}" for date, commit in runs) + ".", ""]
+    lines, cells = [_HEAD, ""], content["cells"]
     for part, words in (
         ("oracle", "True noise, best of four weights"),
         ("earlier", "The same, with the fit of commits 72700d1 and 2e37b89"),
@@ -136,7 +136,7 @@ def page(cells: dict[str, Row]) -> str:
         worse = [str(sum(gain < -_WORSE for gain in found)) for found in gains.values()]
         lines += [f"| worse by more than {_WORSE} dB | {' | '.join(worse)} |", ""]
         lines += _chosen(scenes) if part == "joint" else []
-    return "\n".join([*lines, _WHY, ""])
+    return "\n".join([*lines, _WHY, "", measured_on([content]), ""])
 
 
 def panel(cells: dict[str, Row]) -> dots.Panel:
@@ -196,7 +196,7 @@ def main() -> None:
     results, output = Results(options.out, "priors"), Output(json_mode=False)
     if options.part == "page":
         with io.atomic_path(HERE / "priors.md") as partial:
-            partial.write_text(page(results.cells), encoding="utf-8")
+            partial.write_text(page(results.content), encoding="utf-8")
         dots.save(HERE / "priors.png", [panel(results.cells)], columns=1)
         return
     compute = {"oracle": oracle, "joint": joint}[options.part]

@@ -3,6 +3,7 @@
 OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py                        all rows, some ten minutes
 OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py --only "Gaussian"      one model; the rows of the others are kept
 OMP_NUM_THREADS=2 python docs/benchmarks/torch_cost.py --quick                a few minutes
+python docs/benchmarks/torch_cost.py --page                                   the page only, from the stored results
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import dots
 import torch
 
 import noiseflow as nf
@@ -166,7 +168,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=MODELS)
     parser.add_argument("--quick", action="store_true", help="3·10⁵ pixels, float32 alone, single runs")
+    parser.add_argument("--page", action="store_true", help="write the page only")
     given = parser.parse_args()
+    if given.page:
+        write_page(json.loads(RESULTS.read_text(encoding="utf-8")))
+        return
     result: dict[str, Any] = {"cells": {}, "machines": [machine()], "quick": given.quick}
     count, repeats = (300_000, {"float32": 1}) if given.quick else (10**6, REPEATS)
     threads = torch.get_num_threads()
@@ -182,7 +188,27 @@ def main() -> None:
         result = kept | {"cells": dict(sorted(cells.items(), key=lambda cell: order[cell[0].rpartition(" | ")[0]]))}
     if not (given.only and given.quick):
         RESULTS.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        (FOLDER / "torch.md").write_text(page_of(result), encoding="utf-8")
+        write_page(result)
+
+
+def write_page(result: dict[str, Any]) -> None:
+    """Write the page and its picture."""
+    draw(result)
+    (FOLDER / "torch.md").write_text(page_of(result), encoding="utf-8")
+
+
+def draw(result: dict[str, Any]) -> None:
+    """Draw the float32 rows: seconds of repeated calls, and memory of the first."""
+    rows = {row.rpartition(" | ")[0]: cell for row, cell in result["cells"].items() if row.endswith(" | float32")}
+
+    def column(key: str) -> dict[str, dict[str, float]]:
+        return {task: {name: cell[task][key] for name, cell in rows.items() if cell[task]} for task in TASKS}
+
+    panels = [
+        ("Time, second call, float32", "seconds per 10⁶ pixels", column("again")),
+        ("Memory, first call, float32", "peak GB per 10⁶ pixels, above the inputs", column("gigabytes")),
+    ]
+    dots.save(FOLDER / "torch.png", panels, columns=2, logarithmic=True, one_legend=True)
 
 
 def line_of(row: str, cell: dict[str, Any]) -> str:
@@ -204,6 +230,10 @@ def page_of(result: dict[str, Any]) -> str:
 
 PAGE = """\
 # Speed and memory of likelihoods
+
+![Seconds and gigabytes per million pixels of twelve models: gradient, no gradient, draws](torch.png)
+
+*Time and memory of each model in float32; both axes are logarithmic, and further left is better.*
 
 How much time and memory does a likelihood take inside a training loop? The table shows seconds, and peak gigabytes above the
 inputs, per 10⁶ pixels, beside the normal distribution of torch and the neural spline flow of zuko.

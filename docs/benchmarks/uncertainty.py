@@ -27,6 +27,7 @@ from noiseflow.commands.console import Output
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from noiseflow.report.charts import new_figure, show_image
 from recon.benchmarks.needle import load as load_needle
+from recon.benchmarks.provenance import measured_on
 from recon.benchmarks.scenes import Results, make_scene
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
@@ -158,11 +159,12 @@ def draw() -> Figure:
     return figure
 
 
-def page(cells: dict[str, Row]) -> str:
+def page(content: dict[str, Any]) -> str:
     """The page as Markdown."""
+    cells: dict[str, Row] = content["cells"]
     rows = [row for key, row in cells.items() if key.startswith("coverage/")]
     inside = sum(_LOW <= row["occupied covered"] <= _HIGH for row in rows)
-    lines = [_HEAD, "", *_origin(cells), "## With the truth", ""]
+    lines = [_HEAD, "", "## With the truth", ""]
     lines += [f"The coverage is within 85 to 95 % in {inside} of {len(rows)} scenes.", _WHY, ""]
     lines += [
         "| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | wider by "
@@ -193,14 +195,7 @@ def page(cells: dict[str, Row]) -> str:
                 for name in ("learnt", "true", "Gaussian")
             ]
             lines.append(f"| {row['phantom']} | {row['noise']} | {' | '.join(shares)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _origin(cells: dict[str, Row]) -> list[str]:
-    """What made the rows."""
-    runs = sorted({(row["date"], row["commit"]) for row in cells.values()})
-    made = ", ".join(f"{date} at commit {commit}" for date, commit in runs)
-    return [f"Computed {made}, one thread.", ""]
+    return "\n".join([*lines, "", measured_on([content]), ""])
 
 
 def main() -> None:
@@ -237,7 +232,7 @@ def main() -> None:
     if options.part == "page":
         draw().savefig(HERE / "uncertainty.png", dpi=90)
         with io.atomic_path(HERE / "uncertainty.md") as partial:
-            partial.write_text(page(results.cells), encoding="utf-8")
+            partial.write_text(page(results.content), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,14 @@
-"""A series whose images were shifted on purpose: the shifts that `prepare` finds, and the slice before and after."""
+"""
+Alignment
+=========
+
+The images of this series were shifted on purpose: the shifts that ``prepare`` finds, and a slice before and after alignment.
+
+.. image:: /images/gallery/alignment.png
+   :alt: A slice before and after alignment, and the shifts made and found
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/alignment.png"
 
 import numpy as np
 from drawing import BLUE, ORANGE, main, new_figure, show
@@ -6,9 +16,11 @@ from drawing import BLUE, ORANGE, main, new_figure, show
 import recon
 from recon.simulate.phantoms import make_phantom
 
+# %%
+# Each image of the series is shifted by a random number of pixels along u. ``prepare`` measures the shifts.
+
 
 def draw():
-    """Shift, align and reconstruct."""
     random = np.random.default_rng(3)
     truth = make_phantom("particles", 48, generator=random)
     clean, _ = recon.clean_tilt_series(truth, np.arange(-60, 62, 3.0))

@@ -1,4 +1,15 @@
-"""One slice of a real needle by five methods, every second tilt left out: back-projection, SIRT, least squares, joint fit."""
+"""
+One slice by five methods
+=========================
+
+One slice of a real needle by five methods, with every second tilt left out: back-projection (two windows), SIRT, least
+squares, and the joint fit.
+
+.. image:: /images/gallery/classical_methods.png
+   :alt: Five slices of a real needle, each by another method, and one of its tilts
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/classical_methods.png"
 
 from dataclasses import replace
 
@@ -6,9 +17,11 @@ from drawing import DATA, main, new_figure, show
 
 import recon
 
+# %%
+# Eight slices of the needle are reconstructed from every second tilt. The last panel shows the tilt at 0°.
+
 
 def draw():
-    """Reconstruct eight slices and draw the middle one."""
     whole = recon.read_tilt_series(DATA / "tilt_needle" / "needle_aligned.mrc", mode="linear")
     few = replace(whole, images=whole.images[::2, 24:32], tilt_angles=whole.tilt_angles[::2])
     methods = {

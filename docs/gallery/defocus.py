@@ -1,4 +1,14 @@
-"""A converging beam blurs what lies out of focus: a slice with and without the blur in the model."""
+"""
+Defocus
+=======
+
+A converging beam blurs the parts that are out of focus: a slice with and without this blur in the model.
+
+.. image:: /images/gallery/defocus.png
+   :alt: The truth, a slice with the blur ignored, and a slice with the blur modelled
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/defocus.png"
 
 import numpy as np
 import torch
@@ -11,9 +21,12 @@ from recon.simulate.phantoms import make_phantom
 
 BLUR = 0.06  # pixels per voxel out of the plane of focus
 
+# %%
+# The series is simulated with blur that grows with the distance from the plane of focus, and reconstructed by least
+# squares twice.
+
 
 def draw():
-    """Blur by depth, add noise, and reconstruct twice."""
     truth = make_phantom("particles", 48, generator=np.random.default_rng(5)).astype(np.float32)
     angles = np.arange(-70, 70, 2.0)
     focused = recon.SliceProjector(tilt_angles=angles, depth=48, width=48)

@@ -12,6 +12,7 @@ from noiseflow.io import atomic_path
 from noiseflow.report import new_figure as new_figure
 
 DATA = Path(noiseflow.__file__).parent / "data"
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 BLUE, ORANGE, GREEN, PINK, SKY, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#777777"  # Okabe and Ito
 
 
@@ -37,13 +38,18 @@ def show(axis: Any, image: Any, title: str, *, bar: tuple[float, str], unit: str
 def save(figure: Any, path: Path) -> None:
     """Write the picture, white behind."""
     with atomic_path(path) as partial:
-        figure.savefig(partial, dpi=80, facecolor="white")
+        figure.savefig(partial, format=path.suffix[1:], dpi=80, facecolor="white")
 
 
-def main(draw: Callable[[], Any]) -> None:
-    """Draw, and write to the path on the command line or into this folder's `docs/images`."""
-    name = Path(sys.argv[0]).stem
-    default = Path(__file__).parents[1] / "images" / "gallery" / f"{name}.png"
+def main(draw: Callable[[], Any], picture: str = "") -> None:
+    """Draw, and write to the path on the command line or to `picture` in docs/images; show it in a notebook."""
+    if "ipykernel" in sys.modules:  # its command line is that of the kernel
+        from IPython.display import Image, display
+
+        save(draw(), Path("picture.png"))
+        display(Image("picture.png"))
+        return
+    default = Path(__file__).parents[1] / "images" / (picture or f"gallery/{Path(sys.argv[0]).stem}.png")
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else default
     save(draw(), path)
     print(f"wrote {path}")

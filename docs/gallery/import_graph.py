@@ -1,6 +1,6 @@
 """Draws the import graph of the three packages: one dot per file, one group per folder, one line per import.
 
-python docs/gallery/import_graph.py docs/images/imports_now.svg [COMMIT]
+python docs/gallery/import_graph.py [PICTURE.svg [COMMIT]]    # without arguments: docs/images/imports_now.svg
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
-from noiseflow.io import atomic_path
-from noiseflow.report import new_figure
+from drawing import BLUE, GREEN, ORANGE, main, new_figure
 
 ROOT = Path(__file__).parent.parent.parent
-PACKAGES = {"noiseflow": "#0072B2", "calibration": "#009E73", "recon": "#D55E00"}  # told apart by the colour-blind
+PACKAGES = {"noiseflow": BLUE, "calibration": GREEN, "recon": ORANGE}
 
 
 def sources(commit: str | None) -> dict[str, str]:
@@ -84,7 +84,7 @@ def places(modules: dict[str, str]) -> tuple[dict[str, tuple[float, float]], dic
     return at, rings
 
 
-def draw(path: Path, commit: str | None) -> None:
+def draw(commit: str | None = None) -> Any:
     """Draw the graph of the working tree, or of a commit."""
     modules = sources(commit)
     edges, (at, rings) = imports(modules), places(modules)
@@ -114,9 +114,8 @@ def draw(path: Path, commit: str | None) -> None:
         f"{len(circles)} files in circles (black)",
         fontsize=9,
     )
-    with atomic_path(path) as partial:
-        figure.savefig(partial, format=path.suffix[1:])
+    return figure
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)
+    main(lambda: draw(*sys.argv[2:3]), "imports_now.svg")

@@ -1,4 +1,14 @@
-"""What tilts that were not taken leave behind: a slice and its Fourier transform, for three tilt ranges."""
+"""
+The missing wedge
+=================
+
+The effect of tilts that were not recorded: a slice and its Fourier transform for three tilt ranges.
+
+.. image:: /images/gallery/missing_wedge.png
+   :alt: Slices and their Fourier transforms for three tilt ranges
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/missing_wedge.png"
 
 import numpy as np
 from drawing import main, new_figure, show
@@ -6,9 +16,11 @@ from drawing import main, new_figure, show
 import recon
 from recon.simulate.phantoms import make_phantom
 
+# %%
+# Clean projections of one phantom over ±90°, ±60° and ±40° are back-projected with a Hann window.
+
 
 def draw():
-    """Back-project clean images of ±90°, ±60° and ±40°."""
     truth = make_phantom("shells", 64, generator=np.random.default_rng(3))
     figure, axes = new_figure(3, 2, width=11, height=3.5)
     for column, limit in enumerate((90, 60, 40)):

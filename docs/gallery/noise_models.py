@@ -1,4 +1,18 @@
-"""Every noise model against one real camera: the density it learns at one signal, and the pixels it has to describe."""
+"""
+Every noise model on one camera
+===============================
+
+Nine noise models fitted to one real camera. Each panel shows the density that a model learns at one signal, and the
+pixels that it has to describe.
+
+.. image:: /images/gallery/noise_models.png
+   :alt: Densities of nine noise models at one signal, over the histogram of a real camera
+
+Titles give the negative log-likelihood of held-out pixels; lower is better. Differences below 0.001 nats per pixel are not
+significant here.
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/noise_models.png"
 
 import numpy as np
 import torch
@@ -20,9 +34,12 @@ MODELS = {
     "PhysicsFlow": noiseflow.PhysicsFlow,
 }
 
+# %%
+# The camera's short and long exposure are aligned. Each model is then fitted to the pairs of pixels, and its density
+# is drawn at the median signal.
+
 
 def draw():
-    """Fit each to a short and a long exposure, and draw its density at the median signal."""
     (pair,) = calibration.read_pairs([MIRO / "channel1_050ms.tif"], [MIRO / "channel1_long.tif"])
     aligned = calibration.align_pair(pair)
     signal, observation = (torch.from_numpy(each[aligned.mask]).float() for each in (aligned.signal, aligned.short))

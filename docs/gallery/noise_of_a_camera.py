@@ -1,13 +1,25 @@
-"""How shot noise, read noise and rounding look: samples and distribution functions of three detectors."""
+"""
+Shot noise, read noise, rounding
+================================
+
+Shot noise, read noise and rounding: samples and distribution functions of three detectors.
+
+.. image:: /images/gallery/noise_of_a_camera.png
+   :alt: Three detectors on one clean ramp, and their distribution functions
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/noise_of_a_camera.png"
 
 import torch
 from drawing import BLUE, ORANGE, main, new_figure, show
 
 from noiseflow import Digitised, Gaussian, PoissonGaussian
 
+# %%
+# All three detectors see the same clean ramp. The lower row shows their distribution functions at 1 and 4 electrons.
+
 
 def draw():
-    """Sample and draw."""
     camera = PoissonGaussian(gain=1.0, offset=0.0, read_noise=0.5)
     detectors = {
         "Gaussian": Gaussian(1.0),

@@ -1,7 +1,14 @@
-"""The picture of the README: a noisy tilt series, two reconstructions, error bars, and the noise that was learnt on the way.
-
-python docs/gallery/overview.py docs/images/overview.png
 """
+What the joint fit does
+=======================
+
+The picture of the README: a noisy tilt series, two reconstructions, the truth, error bars, and the learnt noise.
+
+.. image:: /images/overview.png
+   :alt: One noisy tilt, a slice by SIRT, by the joint fit, the truth, the error bar of each voxel, and the learnt noise
+"""
+
+# sphinx_gallery_thumbnail_path = "images/overview.png"
 
 import numpy as np
 import torch
@@ -11,9 +18,12 @@ import recon
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, tilt_range
 
+# %%
+# A bright-field series is simulated with clipped noise. SIRT and the joint fit reconstruct it; the joint fit also
+# returns error bars and the noise model that it learnt.
+
 
 def draw(size=192, num_samples=8):
-    """Simulate, reconstruct and draw."""
     acquisition = ACQUISITIONS["clipped"]
     truth = make_phantom("shells", size, generator=np.random.default_rng(3))
     clean, unit = recon.clean_tilt_series(truth, tilt_range("-59.5:57.5:1.5"), acquisition=acquisition)
@@ -53,4 +63,4 @@ def draw_noise(axis, clean, noisy, noise_model):
 
 
 if __name__ == "__main__":
-    main(draw)
+    main(draw, "overview.png")

@@ -1,4 +1,14 @@
-"""Is a noise model right? The probability integral transform is flat if it is, and shows how it is wrong if it is not."""
+"""
+Probability integral transform
+==============================
+
+The probability integral transform is flat if a noise model is right. Otherwise its shape shows the error.
+
+.. image:: /images/gallery/pit.png
+   :alt: Probability integral transforms of the true model, one that is too narrow, and one of constant width
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/pit.png"
 
 import torch
 from drawing import BLUE, main, new_figure
@@ -6,9 +16,11 @@ from drawing import BLUE, main, new_figure
 import noiseflow
 from noiseflow import PoissonGaussian
 
+# %%
+# A Poisson-Gaussian detector is simulated, and three models of it are evaluated on the same pixels.
+
 
 def draw():
-    """Judge three models of one simulated detector."""
     generator = torch.Generator().manual_seed(0)
     signal = torch.rand(40_000, generator=generator) * 40 + 5
     observation = PoissonGaussian(gain=2.0, offset=0.0, read_noise=1.5)(signal).sample(generator=generator)

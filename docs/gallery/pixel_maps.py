@@ -1,13 +1,26 @@
-"""A camera whose pixels differ: raw frames, the maps of gain and offset, and residuals with and without them."""
+"""
+Pixels that differ
+==================
+
+A camera whose pixels differ: raw frames, the maps of gain and offset, and the residuals with and without these maps.
+
+.. image:: /images/gallery/pixel_maps.png
+   :alt: A raw frame, maps of gain and offset, and histograms of the residuals with and without them
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/pixel_maps.png"
 
 import torch
 from drawing import BLUE, ORANGE, main, new_figure, show
 
 import noiseflow
 
+# %%
+# The simulated camera has its own gain and offset in each pixel. Two models of it predict one raw frame: with the
+# maps, and with one offset for all pixels.
+
 
 def draw():
-    """Sample a camera with maps, and compare two models of it."""
     generator = torch.Generator().manual_seed(0)
     columns = 1 + 0.08 * torch.randn(64, generator=generator)
     gain = (columns + 0.04 * torch.randn(64, 64, generator=generator)).clamp(min=0.5)

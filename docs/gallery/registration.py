@@ -1,4 +1,14 @@
-"""A short exposure, the long one of the same scene turned and shifted, and the difference after registration."""
+"""
+Registration
+============
+
+A short exposure, a long exposure of the same scene that was rotated and shifted, and their difference after registration.
+
+.. image:: /images/gallery/registration.png
+   :alt: A short exposure, a long exposure turned by 2°, and their difference after registration
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/registration.png"
 
 import numpy as np
 from drawing import DATA, main, new_figure, show
@@ -7,9 +17,11 @@ from skimage.transform import EuclideanTransform, warp
 import calibration
 import noiseflow
 
+# %%
+# The long exposure is rotated by 2° and shifted on purpose. ``align_pair`` finds both again.
+
 
 def draw():
-    """Move the long exposure on purpose, and find the motion again."""
     folder = DATA / "exposures_miro"
     short, long = (noiseflow.io.read_image(folder / f"channel1_{name}.tif").astype(float) for name in ("050ms", "long"))
     moved = warp(long, EuclideanTransform(rotation=np.deg2rad(2), translation=(9, -6)), mode="edge")

@@ -1,13 +1,26 @@
-"""Scan noise: one random offset for each row of an image, seen in the image and in its row means, and fitted."""
+"""
+Scan noise
+==========
+
+Scan noise is one random offset for each row of an image. The picture shows it in the image and in the row means, and the
+fitted offsets.
+
+.. image:: /images/gallery/scan_noise.png
+   :alt: An image with and one without row offsets, and the row means of both
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/scan_noise.png"
 
 import torch
 from drawing import BLUE, ORANGE, main, new_figure, show
 
 import noiseflow
 
+# %%
+# The simulated detector adds a random offset to each row. A second model is then fitted to the noisy image.
+
 
 def draw():
-    """Sample a detector with row offsets and fit it again."""
     generator = torch.Generator().manual_seed(0)
     clean = torch.linspace(0.2, 0.8, 96).expand(96, 96).contiguous()
     truth = noiseflow.ScanNoise(noiseflow.Gaussian(0.05), scale=0.04)

@@ -1,4 +1,14 @@
-"""What a reconstruction says of itself: the verdict on a sound series, and on two that were spoilt on purpose."""
+"""
+Verdicts
+========
+
+The verdicts on a good series and on two series that were spoilt on purpose.
+
+.. image:: /images/gallery/verdicts.png
+   :alt: Slices of a good series and of two spoilt ones, each with its verdict and the reasons
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/verdicts.png"
 
 import textwrap
 from dataclasses import replace
@@ -13,9 +23,12 @@ from recon.verdict.judge import judge
 
 COLOURS = {"good": GREEN, "doubtful": ORANGE, "bad": PINK}
 
+# %%
+# The series is reconstructed by least squares three times: as simulated, with images shifted at random, and with
+# halved tilt angles.
+
 
 def draw():
-    """Judge least-squares volumes of the sound and of the spoilt series."""
     acquisition = ACQUISITIONS["gaussian"]
     truth = make_phantom("shells", 48, generator=np.random.default_rng(3))
     clean, _ = recon.clean_tilt_series(truth, np.arange(-60, 61, 3.0), acquisition=acquisition)

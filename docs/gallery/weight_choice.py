@@ -1,4 +1,15 @@
-"""How the weight of the regulariser is chosen: the likelihood of held-out pixels, and the error that nobody can see."""
+"""
+Choice of the weight
+====================
+
+The choice of the weight of the regulariser: the likelihood of held-out pixels, which you can compute, and the error against
+the truth, which you cannot.
+
+.. image:: /images/gallery/weight_choice.png
+   :alt: Held-out likelihood and error against the truth for several weights
+"""
+
+# sphinx_gallery_thumbnail_path = "images/gallery/weight_choice.png"
 
 import numpy as np
 from drawing import BLUE, ORANGE, main, new_figure
@@ -7,9 +18,12 @@ import recon
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS
 
+# %%
+# The joint fit chooses the weight from the held-out likelihood. The volume is then reconstructed at five fixed
+# weights around it, and each result is compared with the truth.
+
 
 def draw():
-    """Let the joint fit choose, and compare with the error at fixed weights."""
     acquisition = ACQUISITIONS["skewed"]
     truth = make_phantom("shells", 40, generator=np.random.default_rng(3))
     clean, unit = recon.clean_tilt_series(truth, np.arange(-60, 60, 3.0), acquisition=acquisition)

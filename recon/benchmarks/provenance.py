@@ -35,7 +35,7 @@ def _commit() -> str:
 
 
 def measured_on(contents: Iterable[dict[str, Any]]) -> str:
-    """Markdown: the commits, dates and machines of the cells of some results."""
+    """Markdown: the commits, dates and machines of the cells of some results; a machine that is None was not recorded."""
     contents = list(contents)
     cells = [cell for content in contents for cell in content["cells"].values()]
     origins = Counter((_origin(cell), cell.get("date", "")) for cell in cells)
@@ -43,7 +43,12 @@ def measured_on(contents: Iterable[dict[str, Any]]) -> str:
         f"- {origin}" + (f", {day}" if day else "") + f" ({count} row{'s' if count > 1 else ''})"
         for (origin, day), count in sorted(origins.items(), key=lambda item: item[0][::-1])
     ]
-    for machine_ in (machine_ for content in contents for machine_ in content["machines"]):
+    machines = [machine_ for content in contents for machine_ in content["machines"]]
+    alone = not any(machines)
+    for machine_ in machines:
+        if machine_ is None:
+            lines.append("- machine not recorded" if alone else "- machine of some rows not recorded")
+            continue
         versions = ", ".join(f"{name} {version}" for name, version in machine_["versions"].items())
         cores = f"{machine_['cores']} cores, {machine_['threads']} torch threads"
         lines.append(f"- {machine_['processor']}, {cores}; Python {machine_['python']}, {versions}")

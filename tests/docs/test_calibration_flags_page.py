@@ -21,7 +21,9 @@ def test_page_is_written_from_its_json() -> None:
 def test_page_of_coverage_is_written_from_its_trials() -> None:
     script = runpy.run_path(str(BENCHMARKS / "calibration_coverage.py"))
     trials = {kind: script["rows_of"](kind) for kind in script["KINDS"]}
-    assert (BENCHMARKS / "calibration_coverage.md").read_text(encoding="utf-8") == script["page"](trials)
+    assert (BENCHMARKS / "calibration_coverage.md").read_text(encoding="utf-8") == script["page"](
+        trials, script["machines"]()
+    )
     assert all(len({row["seed"] for row in rows}) == len(rows) for rows in trials.values())
 
 

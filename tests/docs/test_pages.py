@@ -15,6 +15,9 @@ PAGES = {
     "scale_estimates.md": ("scale.json", "scale_page.py", "estimates"),
     "calibration.md": ("calibration.json", "calibration_page.py", "page"),
     "noise_models.md": ("noise_models.json", "noise_page.py", "page"),
+    "priors.md": ("priors.json", "priors.py", "page"),
+    "selection.md": ("selection.json", "selection.py", "page"),
+    "uncertainty.md": ("uncertainty.json", "uncertainty.py", "page"),
 }
 
 

@@ -30,3 +30,13 @@ def test_a_changed_file_anywhere_in_the_checkout_marks_the_commit(tmp_path: Path
     assert len(clean) == 7
     changed.write_text("a = 2\n", encoding="utf-8")
     assert told(tmp_path) == clean + "+"
+
+
+def test_a_machine_that_was_not_recorded_is_said_to_be_so() -> None:
+    cells = {"first": {"commit": "0ecef51", "date": "2026-11-23"}}
+    assert provenance.measured_on([{"cells": cells, "machines": [None]}]).splitlines()[2:] == [
+        "- commit 0ecef51, 2026-11-23 (1 row)",
+        "- machine not recorded",
+    ]
+    mixed = provenance.measured_on([{"cells": cells, "machines": [None, provenance.machine()]}])
+    assert "- machine of some rows not recorded\n- " in mixed
