@@ -13,7 +13,7 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import BIAS, Grade, Reason, Verdict, verdict_of
+from calibration.verdict import BIAS, Grade, Reason, Verdict, frames_correlated, verdict_of
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -103,6 +103,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
             "bad",
             f"the noise repeats itself every {correlation.period:.3g} pixels: resampled or compressed. Give raw frames.",
         )
+    found += frames_correlated(figures.lag)
     if figures.chi_squared > LARGEST_CHI_SQUARED:
         text = f"variance against signal is no straight line (χ² per degree of freedom {figures.chi_squared:.1f})"
         add("bent line", "doubtful", text + ": light that flickers, or a converter that is not linear.")

@@ -193,14 +193,7 @@ def _correlation(
 
 def _independence(pairs: Sequence[AlignedPair]) -> list[Reason]:
     found = []
-    lag = correlation_in_time(pairs)
-    if abs(lag) > BIAS / 2:  # it takes twice itself off the variance
-        text = f"the noise of successive frames correlates by {lag:+.3f}: image lag, a filter over time, or a changing scene; "
-        text += f"the gain is off by about {abs(2 * lag):.0%}"
-        grade: Grade = "bad" if abs(lag) > 5 * BIAS / 2 else "doubtful"
-        found.append(
-            Reason("frames correlated", grade, text + ". Take frames apart in time, without averaging in the camera.")
-        )
+    found += frames_correlated(correlation_in_time(pairs))
     share = max(map(contained_share, pairs))
     if share > BIAS:
         text = f"{share:.1%} of the long exposure's signal is the short exposure itself: the long one is a mean or sum of frames "
@@ -209,15 +202,33 @@ def _independence(pairs: Sequence[AlignedPair]) -> list[Reason]:
     return found
 
 
+def frames_correlated(lag: float) -> list[Reason]:
+    """What a correlation of successive frames does to the gain."""
+    if abs(lag) <= BIAS / 2:  # it takes twice itself off the variance
+        return []
+    text = (
+        f"the noise of successive frames correlates by {lag:+.3f}: image lag, a filter over time, or a changing scene; "
+    )
+    text += f"the gain is off by about {abs(2 * lag):.0%}"
+    grade: Grade = "bad" if abs(lag) > 5 * BIAS / 2 else "doubtful"
+    end = ". Take frames apart in time, without averaging in the camera."
+    return [Reason("frames correlated", grade, text + end)]
+
+
 def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
     """Whether the first frame, or its long exposure, went through lossy compression."""
     first = pairs[0]
-    looked_at: tuple[tuple[Image, str, Grade], ...] = ((first.short, "frame", "bad"), (first.long, "long exposure", "doubtful"))
+    looked_at: tuple[tuple[Image, str, Grade], ...] = (
+        (first.short, "frame", "bad"),
+        (first.long, "long exposure", "doubtful"),
+    )
     for frame, name, grade in looked_at:
         kind = "in blocks of 8 × 8 pixels (JPEG)" if block_compressed(frame) else ""
         kind = kind or ("by wavelets (JPEG 2000)" if wavelet_compressed(frame) else "")
         if kind and (name == "frame" or first.frames == 1):
-            text = f"the {name} was compressed {kind} or the like, which removes noise and adds its own. Give raw frames."
+            text = (
+                f"the {name} was compressed {kind} or the like, which removes noise and adds its own. Give raw frames."
+            )
             return [Reason("compressed", grade, text)]
     return []
 
@@ -265,8 +276,14 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
         text = f"pixels brighter than {repairs.join:.5g} counts ({repairs.joined:.1%}) use fewer of the converter's codes: two "
         text += "converters joined into one frame (high dynamic range), or companded values. "
         few = repairs.joined <= MOST_JOINED
-        text += "They were treated as clipped: figures and noise models are those of the darker pixels" if few else "No gain fits both"
-        found.append(Reason("joined converters", "doubtful" if few else "bad", text + ". Record with one converter setting."))
+        text += (
+            "They were treated as clipped: figures and noise models are those of the darker pixels"
+            if few
+            else "No gain fits both"
+        )
+        found.append(
+            Reason("joined converters", "doubtful" if few else "bad", text + ". Record with one converter setting.")
+        )
     gain = figures.gain
     half = (gain.q95 - gain.q05) / (2 * gain.median)
     if half > WIDEST_GAIN:

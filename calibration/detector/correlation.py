@@ -87,8 +87,9 @@ class Correlation:
 
     @property
     def found(self) -> bool:
-        """Whether any pixels are correlated by more than `CLEAR` standard errors."""
-        return bool(np.any(np.abs(self.value) > CLEAR * self.error))
+        """Whether pixels at any distance, or the nearest neighbours together, are correlated by more than `CLEAR` standard
+        errors."""
+        return bool(np.any(_clear(self.value, self.error)))
 
     def at(self, dy: int, dx: int) -> float:
         """Correlation at one distance."""
@@ -132,10 +133,17 @@ def _overlap(distance: float) -> float:
     return far if distance >= 1 else far - 4 / 6 * (1 - distance) ** 3
 
 
+def _clear(value: Image, error: Image) -> Mask:
+    """(K,) the lags that stand out; both nearest neighbours where only their sum does, as after a faint blur."""
+    nearest = np.array([lag in ((0, 1), (1, 0)) for lag in LAGS])
+    together = abs(float(value[nearest].sum())) > CLEAR * float(np.linalg.norm(error[nearest]))
+    return np.asarray((np.abs(value) > CLEAR * error) | (nearest & together))
+
+
 def _near_clear(value: Image, error: Image) -> Mask:
     """The lags that count towards the density at frequency 0: those that stand out, and their inner neighbours."""
     lags = np.abs(np.array(LAGS))
-    clear = lags[np.abs(value) > CLEAR * error]
+    clear = lags[_clear(value, error)]
     return (
         np.asarray([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
         if clear.size

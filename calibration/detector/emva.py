@@ -12,6 +12,7 @@ from calibration.detector.correlation import Correlation, correlation_of_residua
 from calibration.detector.moments import Level, level_of
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.posterior import Interval
+from calibration.detector.independence import correlation_of_flats
 from calibration.detector.residual import CUT, Residual
 from calibration.exposures.frames import Burst, Image
 from noiseflow.described import described
@@ -59,6 +60,7 @@ class CameraFigures:
         dark: of the dark frames; None without.
         correlation: between neighbouring pixels' temporal noise.
         chi_squared: of the photon-transfer line per degree of freedom.
+        lag: correlation of the noise of successive frames; 0: none was found.
     """
 
     gain: Interval
@@ -77,6 +79,7 @@ class CameraFigures:
     dark: Level | None
     correlation: Correlation
     chi_squared: float
+    lag: float = 0.0
 
     @property
     def linear(self) -> list[Level]:
@@ -160,6 +163,7 @@ def measure_camera(
         dark=dark,
         correlation=correlation,
         chi_squared=chi_squared,
+        lag=correlation_of_flats(unsaturated),
     )
 
 

@@ -8,15 +8,15 @@ import numpy as np
 from scipy import ndimage
 
 from calibration.detector.residual import residual_of
-from calibration.exposures.frames import Image
+from calibration.exposures.frames import Burst, Image
 from calibration.exposures.scaling import BLOCK, finest_band
 from calibration.registration.aligned import AlignedPair
 
 CLEAR = 5.0
 """Standard errors beyond which frames share noise: a test or two of a calibration reach them by chance once in 10⁶."""
 
-LEAST_FRAMES = 4
-"""Of a burst, from which on some frames follow one another and as many do not."""
+LEAST_FRAMES = 3
+"""Of a burst, from which on some frames follow one another and others do not."""
 
 MOST_FRAMES = 24
 """Frames that are compared: 23 that follow one another tell a correlation of 1 % in 256 pixels each to five standard errors."""
@@ -40,21 +40,42 @@ def correlation_in_time(pairs: Sequence[AlignedPair]) -> float:
     Image lag, recursive filters and running means make frames follow one another. Their differences then have less than the
     variance of two frames: by twice the correlation, if what is kept of one frame is taken from the next.
     """
-    if len(pairs) < LEAST_FRAMES or pairs[0].frames == 1:
+    if pairs[0].frames == 1:
         return 0.0
     chosen = pairs[:MOST_FRAMES]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
-    if not mask.any():
-        return 0.0
     z = np.stack([residual_of(pair).z[mask] for pair in chosen])
-    products = (
-        (1 - 1 / len(pairs)) * (z @ z.T) / z.shape[1]
+    return _of_successive(
+        [np.sqrt(1 - 1 / len(pairs)) * z]
     )  # residuals from the mean of the others scatter more by that
-    first, second = np.triu_indices(len(chosen), 1)
-    near = second - first == 1
-    excess = float(products[first, second][near].mean() - products[first, second][~near].mean())
-    error = float(np.sqrt((1 / near.sum() + 1 / (~near).sum()) / z.shape[1]))
-    return excess if abs(excess) > CLEAR * error else 0.0
+
+
+def correlation_of_flats(bursts: Sequence[Burst]) -> float:
+    """The same of frames without a scene, all levels together; 0 also where every level has two frames."""
+    standardised = []
+    for burst in bursts:
+        frames = burst.frames[:MOST_FRAMES].reshape(-1, burst.frames[0].size)
+        residual = frames - frames.mean(axis=1, keepdims=True)
+        residual = residual - residual.mean(axis=0)
+        deviation = float(residual.std()) * np.sqrt(len(frames) / (len(frames) - 1))
+        standardised.append(np.clip(residual / max(deviation, np.finfo(float).tiny), -CLEAR, CLEAR))
+    return _of_successive(standardised)
+
+
+def _of_successive(bursts: Sequence[Image]) -> float:
+    """Mean product of successive frames less that of frames further apart, of (frame, pixel) residuals of unit variance."""
+    excess = information = 0.0
+    for z in bursts:
+        if len(z) < LEAST_FRAMES or not z.shape[1]:
+            continue
+        products = z @ z.T / z.shape[1]
+        first, second = np.triu_indices(len(z), 1)
+        near = second - first == 1
+        weight = z.shape[1] / (1 / near.sum() + 1 / (~near).sum())
+        excess += weight * float(products[first, second][near].mean() - products[first, second][~near].mean())
+        information += weight
+    found = excess / information if information else 0.0
+    return found if abs(found) * np.sqrt(information) > CLEAR else 0.0
 
 
 def contained_share(pair: AlignedPair) -> float:

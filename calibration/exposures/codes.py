@@ -51,7 +51,9 @@ def coarser_above(frame: Image) -> float | None:
     return float(code[0] + WINDOW * filled[join + 1]) if ratio[join] < COARSER else None
 
 
-def below_joins(exposures: Sequence[ExposurePair] | Burst) -> tuple[Sequence[ExposurePair] | Burst, tuple[float, float]]:
+def below_joins(
+    exposures: Sequence[ExposurePair] | Burst,
+) -> tuple[Sequence[ExposurePair] | Burst, tuple[float, float]]:
     """Exposures clipped where their codes grow coarser, so that one converter made all that is left; if these are few.
 
     Returns:
@@ -67,5 +69,7 @@ def below_joins(exposures: Sequence[ExposurePair] | Burst) -> tuple[Sequence[Exp
     if isinstance(exposures, Burst):
         clipped = replace(exposures, frames=np.minimum(exposures.frames, joins[0]))
     else:
-        clipped = [replace(pair, short=np.minimum(pair.short, join)) for pair, join in zip(exposures, joins, strict=True)]
+        clipped = [
+            replace(pair, short=np.minimum(pair.short, join)) for pair, join in zip(exposures, joins, strict=True)
+        ]
     return clipped, (min(joins), share)

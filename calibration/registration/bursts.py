@@ -84,7 +84,9 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     frames = burst.frames
     hot, dead = defects(frames)
     trusted = ~(hot | dead | np.any([saturated(frame) for frame in frames], axis=0))
-    if trusted.any():  # a choice by single readings would cut their noise; their mean tells nothing of their differences
+    if (
+        trusted.any()
+    ):  # a choice by single readings would cut their noise; their mean tells nothing of their differences
         trusted &= clear_of_rails(frames[0], frames.mean(0), trusted, upper_only=True)
     if trusted.sum() < MINIMUM_PIXELS:
         raise ValueError(
