@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.detector.correlation import Correlation, correlation_of_residuals
+from calibration.detector.independence import correlation_of_flats
 from calibration.detector.moments import Level, level_of
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.posterior import Interval
-from calibration.detector.independence import correlation_of_flats
 from calibration.detector.residual import CUT, Residual
 from calibration.exposures.frames import Burst, Image
 from noiseflow.described import described
