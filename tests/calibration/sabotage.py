@@ -152,6 +152,52 @@ def _real_jpeg(quality: int) -> Callable[[np.random.Generator, sim.Image], tuple
     return spoil
 
 
+def _burst(
+    seed: int, number: int, frame: Callable[[np.random.Generator, sim.Image], sim.Image], **case: object
+) -> Case:
+    """A burst of `number` equal exposures of 128² pixels."""
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator, 128)
+    return replace(Case(np.stack([frame(generator, scene) for _ in range(number)])), **case)  # type: ignore[arg-type]
+
+
+def counting_photons(generator: np.random.Generator, scene: sim.Image) -> sim.Image:
+    """A camera that tells single electrons apart, at a dim scene."""
+    return exposed(generator, scene / 16, gain=8.0, read_noise=0.27)
+
+
+def joined(level: float) -> Callable[[np.random.Generator, sim.Image], sim.Image]:
+    """Two converters, of 2 and 0.1 counts per electron and 1.5 and 30 e⁻ of read noise, joined at a brightness."""
+
+    def read(generator: np.random.Generator, scene: sim.Image) -> sim.Image:
+        electrons = generator.poisson(scene)
+        fine, coarse = (electrons + noise * generator.standard_normal(scene.shape) for noise in (1.5, 30.0))
+        bright = np.round(0.1 * coarse) / 0.1
+        return np.asarray(np.round(100 + 2 * np.where(100 + 2 * fine < level, fine, bright)))
+
+    return read
+
+
+def jpeg2000(image: sim.Image, per_mille: int) -> sim.Image:
+    """16-bit frames that went through JPEG 2000 files of a share of their size."""
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, per_mille]
+    _, data = cv2.imencode(".jp2", np.round(image).clip(0).astype(np.uint16), options)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), float)
+
+
+def _lagging(seed: int) -> Case:
+    """A burst of which each frame keeps 5 % of the one before."""
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator)
+    kept, frames = generator.poisson(scene).astype(float), []
+    for _ in range(8):
+        kept = 0.95 * generator.poisson(scene) + 0.05 * kept
+        frames.append(np.round(100 + 2 * (kept + 3 * generator.standard_normal(scene.shape))))
+    return Case(np.stack(frames))
+
+
 CASES: dict[str, Maker] = {
     "clean": lambda s: replace(pair(s, clean), clean=True),
     "clean, ratio known": lambda s: replace(pair(s, clean, exposure_ratio=RATIO), clean=True),
@@ -232,6 +278,29 @@ CASES: dict[str, Maker] = {
     "two lowest bits missing": lambda s: pair(s, both(lambda image: 4 * np.floor(image / 4))),
     "lines of the short scan off by 1.5 pixels": lambda s: pair(s, _flyback),
     "exposures swapped": lambda s: pair(s, lambda g, x: clean(g, x)[::-1]),  # type: ignore[arg-type,return-value]
+    "single electrons resolved": lambda s: replace(
+        pair(s, lambda g, x: (counting_photons(g, x), counting_photons(g, RATIO * x))), gain=8.0, clean=True
+    ),
+    "burst of 8, single electrons resolved": lambda s: _burst(s, 8, counting_photons, gain=8.0, clean=True),
+    "burst of 10, 4 electrons": lambda s: _burst(s, 10, lambda g, x: exposed(g, x / 20), clean=True),
+    "burst of 8, noise as fine as the codes": lambda s: _burst(
+        s, 8, lambda g, x: exposed(g, 8 * x, gain=0.05, offset=10.0), gain=0.05, clean=True
+    ),
+    "burst of 6, brightest tenth saturated": lambda s: _burst(
+        s, 6, lambda g, x: exposed(g, x, top=np.round(100 + 2 * np.percentile(x, 90))), clean=True
+    ),
+    "burst of 8, image lag of 5 %": _lagging,
+    "burst of 8, filtered by 0.3 pixels": lambda s: _burst(
+        s, 8, lambda g, x: np.round(_blur(0.3)(exposed(g, x, rounded=False)))
+    ),
+    "two converters joined at 800 counts": lambda s: pair(
+        s, lambda g, x: (joined(800.0)(g, x), joined(800.0)(g, RATIO * x))
+    ),
+    "two converters joined at 300 counts": lambda s: pair(
+        s, lambda g, x: (joined(300.0)(g, x), joined(300.0)(g, RATIO * x))
+    ),
+    "JPEG 2000, a third of the size": lambda s: pair(s, both(lambda image: jpeg2000(image, 300))),
+    "JPEG 2000, a tenth of the size": lambda s: pair(s, both(lambda image: jpeg2000(image, 100))),
     "gamma-encoded": lambda s: pair(s, both(lambda image: 255 * (image.clip(0) / 4000) ** 0.45)),
 }
 

@@ -8,14 +8,15 @@ import pytest
 from calibration.detector.correlation import correlation_of_residuals
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.residual import Residual
-from calibration.exposures.compression import block_compressed
+from calibration.exposures.codes import coarser_above
+from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.pipeline import measure_exposures
 from calibration.registration.aligned import align_pair
 from calibration.registration.bursts import align_burst
 
 from . import simulators as sim
-from .sabotage import CASES, corner_full
+from .sabotage import CASES, corner_full, joined, jpeg2000
 
 
 def measured(case):
@@ -192,3 +193,83 @@ def test_compression_of_the_long_exposure_alone_is_flagged():
     stored = cv2.imdecode(cv2.imencode(".jpg", long, [cv2.IMWRITE_JPEG_QUALITY, 80])[1], cv2.IMREAD_GRAYSCALE)
     reasons = measure_exposures([ExposurePair(sim.exposed(generator, scene), stored)]).verdict.reasons
     assert ["the long exposure was" in one.text for one in reasons if one.name == "compressed"] == [True]
+
+
+def test_single_electrons_tell_the_gain_to_a_thousandth():
+    found = measured(CASES["single electrons resolved"](32))
+    assert found.verdict.reasons == ()
+    assert found.detector.electrons
+    found = found.figures
+    assert found.gain.median == pytest.approx(8.0, rel=2e-3)
+    assert found.offset.median == pytest.approx(100.0, abs=0.2)
+    assert found.read_noise.median == pytest.approx(0.27, rel=0.05)
+
+
+def test_a_burst_of_single_electrons_is_good():  # it has only residuals, which blur them
+    found = measured(CASES["burst of 8, single electrons resolved"](31))
+    assert (found.verdict.reasons, found.detector.electrons) == ((), False)
+
+
+def test_the_peaks_of_ordinary_noise_are_not_single_electrons():
+    assert not measured(CASES["clean, low dose"](33)).detector.electrons
+
+
+@pytest.mark.parametrize(
+    ("name", "gain"), [("burst of 10, 4 electrons", 2.0), ("burst of 8, noise as fine as the codes", 0.05)]
+)
+def test_skewed_or_coarse_noise_is_neither_correlated_nor_uneven(name, gain):
+    found = measured(CASES[name](34))
+    assert {one.name for one in found.verdict.reasons} <= {"gain uncertain"}
+    assert found.figures.gain.median == pytest.approx(gain, rel=0.06)
+
+
+def test_a_burst_loses_no_noise_beside_saturated_pixels():
+    errors = [
+        measured(CASES["burst of 6, brightest tenth saturated"](seed)).figures.gain.median / 2 - 1 for seed in (35, 36)
+    ]
+    assert abs(np.mean(errors)) < 0.02  # it was 0.035 where pixels were chosen by their own noise
+
+
+def test_converters_joined_in_one_frame_are_found_and_the_darker_pixels_measured():
+    found = measured(CASES["two converters joined at 800 counts"](37))
+    assert "joined converters" in [one.name for one in found.verdict.reasons]
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.06)
+    most = measured(CASES["two converters joined at 300 counts"](37))
+    assert [one.grade for one in most.verdict.reasons if one.name == "joined converters"] == ["bad"]
+
+
+def test_codes_are_coarser_only_where_they_are():
+    generator = np.random.default_rng(38)
+    scene = sim.random_scene(generator)
+    for case in (
+        sim.exposed(generator, scene),
+        16 * sim.exposed(generator, scene),
+        sim.exposed(generator, scene, top=300.0),
+    ):
+        assert coarser_above(case) is None
+    assert coarser_above(np.round(joined(500.0)(generator, scene))) == pytest.approx(500.0, abs=40)
+
+
+@pytest.mark.parametrize("per_mille", [400, 300, 200])
+def test_lossy_wavelet_compression_is_found_and_lossless_is_none(per_mille):
+    generator = np.random.default_rng(per_mille)
+    frame = sim.exposed(generator, sim.random_scene(generator))
+    assert wavelet_compressed(jpeg2000(frame, per_mille))
+    assert not wavelet_compressed(jpeg2000(frame, 1000))
+
+
+def test_no_other_frame_passes_for_wavelet_compressed():
+    for name in (
+        "clean",
+        "JPEG, quality 75",
+        "both median-filtered 3 × 3",
+        "two lowest bits missing",
+        "both as square roots",
+    ):
+        assert not wavelet_compressed(CASES[name](39).short), name
+
+
+def test_a_faint_blur_shows_in_all_neighbours_together():
+    found = measured(CASES["burst of 8, filtered by 0.3 pixels"](40))
+    assert [one.name for one in found.verdict.reasons] == ["correlated pixels"]
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.02)

@@ -235,3 +235,13 @@ def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
     found = calibrate_camera([frames(level) for level in (100.0, 400.0, 1200.0)], [frames(0.0)])
     assert "clipped darkness" in [one.name for one in found.verdict.reasons]
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.03)
+
+
+def test_image_lag_shows_in_flats_of_three_frames():
+    flats, darks, _, _ = camera(8, number=3)
+    assert judge_camera(measure_camera(flats, darks)).grade == "good"
+    lagging = [
+        Burst(np.round(flat.frames - 0.06 * (flat.frames - np.roll(flat.frames, 1, axis=0))), calibration=True) for flat in flats
+    ]
+    reasons = [one.name for one in judge_camera(measure_camera(lagging, darks)).reasons]
+    assert "frames correlated" in reasons
