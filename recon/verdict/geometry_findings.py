@@ -82,7 +82,7 @@ def _angles(gain: Gain) -> list[Finding]:
 def _objects(gain: Gain) -> list[Finding]:
     if gain.share < _OBJECTS or gain.score < _OBJECTS_SCORE:
         return []
-    words = f"two parts of the series contradict each other ({gain.what}): separate volumes explain them better by {gain.share:.0%}"
+    words = f"two parts of the series contradict each other ({gain.what}): each alone is explained better, by {gain.share:.0%}"
     return [
         Finding(
             "specimen",
