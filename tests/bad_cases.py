@@ -164,7 +164,7 @@ sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | would be 
 sample {good}/clean.mrc {good}/model.safetensors -o {out}/n.mrc | check the order
 sample {good}/model.safetensors {good}/model.safetensors -o {out}/n.mrc | is not an image but a noise model
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.safetensors | name the output
-evaluate {good}/model.safetensors --signal {good}/model.safetensors --observation {good}/clean.mrc | is not an image but a noise model
+evaluate {good}/model.safetensors --signal {good}/model.safetensors --observation {good}/clean.mrc | is not an image
 evaluate {bad}/pickle.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | not a noise-model file
 evaluate {good}/model.safetensors --signal {bad}/absurd.mrc --observation {good}/clean.mrc | header claims
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/missing.mrc | does not exist

@@ -87,9 +87,9 @@ def stop(name: str, good: Path, out: Path, moment: float, times: int = 1) -> int
     assert "Traceback" not in printed
     if process.exitcode == 130:
         last = (printed.strip().splitlines() or [""])[-1]
-        assert re.match(r"noiseflow: .*(to start again|same command to resume|resume with: noiseflow .* --resume)$", last), (
-            printed
-        )
+        assert re.match(
+            r"noiseflow: .*(to start again|same command to resume|resume with: noiseflow .* --resume)$", last
+        ), printed
     require_whole(out)
     return int(process.exitcode)
 

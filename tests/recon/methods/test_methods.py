@@ -118,7 +118,9 @@ def test_unknown_methods_and_settings_without_use_are_refused(scene):
 )
 def test_what_a_method_has_no_use_for_is_refused(scene, method, settings):
     name = next(iter(settings)).removeprefix("num_")
-    with pytest.raises(ValueError, match=rf"--{name}: method {method} does not support it; use (?!.*\b{method}[,\n]).*"):
+    with pytest.raises(
+        ValueError, match=rf"--{name}: method {method} does not support it; use (?!.*\b{method}[,\n]).*"
+    ):
         reconstruct(scene[2], method=method, **settings)
 
 
