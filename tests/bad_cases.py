@@ -63,7 +63,7 @@ sample {good}/model.safetensors {bad}/absurd.h5 -o {out}/n.mrc | header claims
 sample {good}/model.safetensors {bad}/void.h5 -o {out}/n.mrc | no image
 sample {good}/model.safetensors {bad}/twins.h5 -o {out}/n.mrc | FILE::NAME
 sample {good}/model.safetensors {bad}/twins.h5::/c -o {out}/n.mrc | holds no '/c'
-sample {good}/model.safetensors {good}/clean.mrc::/c -o {out}/n.mrc | leave ::/c out
+sample {good}/model.safetensors {good}/clean.mrc::/c -o {out}/n.mrc | remove ::/c
 sample {good}/model.safetensors {bad}/void.zarr -o {out}/n.mrc | void.zarr
 sample {good}/model.safetensors {bad}/folder -o {out}/n.mrc | without images
 sample {good}/model.safetensors {bad}/uneven -o {out}/n.mrc | same size
@@ -160,7 +160,7 @@ compare {good}/tilts.mrc {good}/clean.mrc | shape
 compare {bad}/nan.npy {good}/tilts.mrc | NaN
 compare {good}/tilts.mrc {bad}/flat.npy | flat
 compare {good}/tilts.mrc {bad}/cut.mrc | header claims
-sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | would be lost
+sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | also an input
 sample {good}/clean.mrc {good}/model.safetensors -o {out}/n.mrc | check the order
 sample {good}/model.safetensors {good}/model.safetensors -o {out}/n.mrc | is not an image but a noise model
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.safetensors | name the output
@@ -174,7 +174,7 @@ calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | n
 simulate {good} | --overwrite
 simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file
-reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | would be lost
+reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | also an input
 reconstruct {good}/tilts.rawtlt -o {out}/v.mrc | is not an image but a file of tilt angles
 reconstruct {good}/tilts.mrc --angles {good}/tilts.mrc -o {out}/v.mrc | is not a text file
 reconstruct {good}/model.safetensors -o {out}/v.mrc | is not an image but a noise model

@@ -65,7 +65,7 @@ def test_impossible_series_gives_one_line_and_no_volume(images, tmp_path, refuse
         (
             lambda i, a: (np.concatenate([i, np.full_like(i[:1], np.nan)]), np.append(a, 70)),
             ["--mask-nan"],
-            "left out: 70",
+            "excluded: 70",
         ),
     ],
 )

@@ -90,7 +90,7 @@ def test_a_method_of_another_package_is_one_file_and_one_entry_point(scene, tmp_
     monkeypatch.syspath_prepend(tmp_path)
     assert "mine" in method_names()
     assert reconstruct(scene[2], method="mine", seed=7).choices == {"seed": 7}
-    with pytest.raises(ValueError, match="method mine has no use for it"):
+    with pytest.raises(ValueError, match="method mine does not support it"):
         reconstruct(scene[2], method="mine", defocus=0.1)
     find_method.cache_clear()
 

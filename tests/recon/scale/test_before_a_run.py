@@ -107,4 +107,4 @@ def test_workers_cannot_join_a_volume_that_was_begun_in_one_piece(series, tmp_pa
 def test_workers_of_a_method_without_blocks_are_refused(tilts, tmp_path, refused, option):
     said = refused("reconstruct", tilts, "-o", tmp_path / "v.mrc", "--method", "wbp-denoised", *option)
     assert f"{option[0]}: method wbp-denoised" in said
-    assert "wbp, or leave out" in said
+    assert "wbp, or remove" in said

@@ -124,7 +124,7 @@ def test_error_bars_of_a_flipped_series_are_those_of_its_reconstruction(scene, f
 
 def test_error_bars_that_cannot_be_made_are_refused(scene):
     grid = VolumeGrid.of(scene)
-    with pytest.raises(ValueError, match="wbp has no use for it"):
+    with pytest.raises(ValueError, match="wbp does not support it"):
         reconstruct(scene, grid, method="wbp", uncertainty=4)
     with pytest.raises(ValueError, match="at least 2"):
         reconstruct(scene, grid, uncertainty=1)
