@@ -1,6 +1,6 @@
-"""Conditional noise models for microscopy: p(observation | signal), fitted, sampled and judged.
+"""Conditional noise models for microscopy: fit, sample and evaluate p(observation | signal).
 
-Names load on first use, so importing the package costs nothing and ``noiseflow -h`` answers without torch.
+Names are imported on first use, so that importing the package is fast and ``noiseflow -h`` does not load torch.
 """
 
 import lazy_loader as _lazy

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-# Python looks in the working directory first, where a user's folder `recon` would hide ours
+# Python searches the working directory first; a user's folder named `recon` would hide this package's
 if not sys.flags.safe_path and Path(sys.path[0]).resolve() != Path(__file__).resolve().parents[1]:
     del sys.path[0]
 

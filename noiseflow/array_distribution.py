@@ -1,4 +1,4 @@
-"""Distributions of arrays of signals: arrays in, arrays of the same library out; blocks of Dask arrays stay lazy."""
+"""Noise distributions for arrays of any library. Results have the type of the input; Dask arrays stay lazy."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ Wrap = Callable[[Any], Any]
 
 
 def distribution_of_array(noise_model: nn.Module, signal: Any, *, needs_image: bool) -> ArrayDistribution:
-    """The distribution of an array of signals, of any library, under a noise model.
+    """Return the distribution that a noise model gives for an array of signals.
 
     Args:
-        noise_model: called with tensors.
-        signal: numbers with ``__array__`` or ``__dlpack__``, any shape, detector units.
-        needs_image: whether the model looks beyond single pixels, so that blocks must hold whole images.
+        noise_model: the noise model; it is called with tensors.
+        signal: array with ``__array__`` or ``__dlpack__``, any shape, detector units.
+        needs_image: whether the model depends on neighbouring pixels, so that every block must hold whole images.
 
     Raises:
-        ValueError: blocks that cut images.
+        ValueError: the model needs images and the blocks of a Dask array cut them.
     """
     if not is_lazy(signal):
         return ArrayDistribution(noise_model, signal)
     blocks = getattr(signal, "data", signal).numblocks
     if needs_image and max(blocks[-2:], default=1) > 1:
         raise ValueError(
-            "this model looks beyond single pixels and the blocks cut the images; .rechunk() the last two axes"
+            "this model needs whole images, but the blocks cut them; call .rechunk() so that each block spans the last two axes"
         )
     return LazyDistribution(noise_model, signal)
 
 
 class ArrayDistribution:
-    """The distribution of the observations of an array of signals; arrays in, arrays out.
+    """The distribution of the observations, given an array of signals. Methods take and return arrays.
 
-    The methods are those of `NoiseDistribution`, without gradients. An xarray keeps its coordinates, a pandas object its index,
-    a masked array its mask.
+    The methods are those of `NoiseDistribution`, without gradients. xarray objects keep their coordinates, pandas objects
+    their index, and masked arrays their mask.
     """
 
     def __init__(self, noise_model: nn.Module, signal: Any) -> None:
@@ -67,7 +67,9 @@ class ArrayDistribution:
             narrow = (
                 tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
             )
-            bare.append(tensor if narrow else tensor.to(self._like.dtype))  # narrow numbers know which limit they were
+            bare.append(
+                tensor if narrow else tensor.to(self._like.dtype)
+            )  # in a narrow type, values still equal the limit
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():
             found = getattr(self.tensors, name)
@@ -80,7 +82,7 @@ class ArrayDistribution:
         return self._wrap(found)
 
     def log_prob(self, value: Any) -> Any:
-        """Log-density in nats per detector unit; of a digitised model, log-mass."""
+        """Log-density in nats per detector unit; log-probability of the value for a digitised model."""
         return self._ask("log_prob", value)
 
     def log_interval_prob(self, low: Any, high: Any) -> Any:
@@ -96,27 +98,27 @@ class ArrayDistribution:
         return self._ask("cdf_below", value)
 
     def icdf(self, value: Any) -> Any:
-        """The quantile: smallest observation whose CDF reaches `value`."""
+        """Quantile: the smallest observation whose CDF reaches `value`."""
         return self._ask("icdf", value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Any:
-        """Draw observations, ``(*sample_shape, *signal.shape)``; of a Dask array, they depend on its blocks too."""
+        """Draw observations, ``(*sample_shape, *signal.shape)``. For a Dask array, the draws also depend on its blocks."""
         drawn = self.tensors.sample(torch.Size(sample_shape), generator=generator).cpu().numpy()
         return self._given_back(np.asarray(drawn), self._mask)
 
     @property
     def mean(self) -> Any:
-        """Mean of each pixel's observations."""
+        """Mean of the observations of each pixel."""
         return self._ask("mean")
 
     @property
     def variance(self) -> Any:
-        """Variance of each pixel's observations."""
+        """Variance of the observations of each pixel."""
         return self._ask("variance")
 
 
 class LazyDistribution(ArrayDistribution):
-    """The distribution of a Dask array of signals: every method returns a Dask array, computed block by block when asked."""
+    """The distribution of a Dask array of signals. Every method returns a lazy Dask array, computed block by block."""
 
     def __init__(self, noise_model: nn.Module, signal: Any) -> None:
         self._model = noise_model
@@ -147,8 +149,8 @@ class LazyDistribution(ArrayDistribution):
 
     @property
     def tensors(self) -> Any:
-        """Nothing before the blocks are computed."""
-        raise AttributeError("a lazy distribution holds no tensors; .compute() what its methods return")
+        """Not available, because the blocks are not computed yet."""
+        raise AttributeError("a lazy distribution holds no tensors; call .compute() on the results of its methods")
 
 
 def _ask_block(model: nn.Module, name: str, signal: NDArray[Any], *values: NDArray[Any]) -> NDArray[Any]:
@@ -166,7 +168,7 @@ def _sample_block(
 
 
 def _taken_apart(data: Any) -> tuple[Wrap, Any, NDArray[np.bool_] | None]:
-    """What gives results the form of an array again, its bare numbers, and its mask or None."""
+    """Return a function that restores the type of `data`, its plain values, and its mask or None."""
     library = library_of(data)
     if library == "xarray":
         return partial(_like_xarray, data), data.data, None

@@ -1,4 +1,4 @@
-"""NumPy arrays and torch tensors alike: functions compute with tensors and return what they were given."""
+"""Conversion between arrays and tensors: functions compute with tensors and return the type that they were given."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Given = TypeVar("Given", Tensor, NDArray[Any])
 
 
 class Kind(Protocol):
-    """What has a number type and a device, as tensors do."""
+    """An object with a data type and a device, such as a tensor."""
 
     @property
     def dtype(self) -> torch.dtype: ...
@@ -22,42 +22,42 @@ class Kind(Protocol):
 
 
 _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
-_CPU = 1  # of the DLPack standard
+_CPU = 1  # device code of the DLPack standard
 
 
 def is_array(data: Any) -> bool:
-    """Whether this is a number or an array of any library (``__array__`` or ``__dlpack__``), and not a tensor."""
+    """Whether `data` is a number or an array of any library (``__array__`` or ``__dlpack__``), but not a tensor."""
     if isinstance(data, Tensor):
         return False
     return isinstance(data, (bool, int, float)) or hasattr(data, "__array__") or hasattr(data, "__dlpack__")
 
 
 def is_lazy(data: Any) -> bool:
-    """Whether this is a Dask array, or an xarray of one, whose blocks are still to be computed."""
+    """Whether `data` is a Dask array, or an xarray object backed by one."""
     return not isinstance(data, Tensor) and library_of(getattr(data, "data", data)) == "dask"
 
 
 def library_of(data: Any) -> str:
-    """The package that an object's class comes from."""
+    """The top-level package that defines an object's class."""
     return type(data).__module__.split(".")[0]
 
 
 def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
-    """A tensor of a tensor, a number, or an array of any library; memory is shared where it can be.
+    """Convert a number, an array of any library, or a tensor to a tensor. Memory is shared where possible.
 
     Args:
-        data: real numbers or booleans, any shape; a tensor is returned as it is.
-        like: take the number type and device of this tensor or projector over, for arrays alone.
+        data: real numbers or booleans, any shape; a tensor is returned unchanged.
+        like: convert arrays to the data type and device of this tensor or projector; tensors are not converted.
 
     Raises:
-        ValueError: the array's numbers are not real, or some are masked.
+        ValueError: the array is not of real numbers, or some values are masked.
     """
     if isinstance(data, Tensor):
         return data
     if np.ma.is_masked(data):
         raise ValueError(
-            "some values of this array are masked; leave them out (mask=~array.mask, where there is such an argument) or "
-            "fill them, with array.filled(value)"
+            "some values of this array are masked; exclude them (mask=~array.mask, if the function has that argument) or "
+            "fill them with array.filled(value)"
         )
     capsule = hasattr(data, "__dlpack_device__")
     if capsule and (data.__dlpack_device__()[0] != _CPU or not hasattr(data, "__array__")):
@@ -69,25 +69,25 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
 
 def _from_numpy(array: NDArray[Any]) -> Tensor:
     if array.dtype.kind not in "buif":
-        raise ValueError(f"an array of {array.dtype} has no real numbers; convert it first, with .astype(float)")
+        raise ValueError(f"an array of type {array.dtype} is not real-valued; convert it first with .astype(float)")
     kind = _WIDER.get(array.dtype.str[1:], np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("="))
     return torch.from_numpy(np.require(array, kind, ["C", "W"]))
 
 
 def strided(array: NDArray[Any], most: int) -> NDArray[Any]:
-    """Every n-th element along each axis, at most so many along each: enough to see limits of grey in a large array."""
+    """Every n-th element along each axis, at most `most` per axis: enough to choose the grey levels of a large array."""
     return array[tuple(slice(None, None, -(-size // most)) for size in array.shape)]
 
 
 def unmasked(*arrays: Any) -> tuple[list[Any], Tensor | None]:
-    """The arrays without their masks, and which values no masked array masks, (N,) boolean; None where none is masked."""
+    """The arrays without masks, and a boolean (N,) of the values that are valid in all arrays; None if none is masked."""
     masks = [np.ma.getmaskarray(each).reshape(-1) for each in arrays if np.ma.is_masked(each)]
     bare = [np.ma.getdata(each) if isinstance(each, np.ma.MaskedArray) else each for each in arrays]
     return bare, torch.from_numpy(~np.logical_or.reduce(masks)) if masks else None
 
 
 def floating(data: Any) -> Tensor:
-    """As `as_tensor`; an array of integers, booleans or half precision becomes the default floating type."""
+    """As `as_tensor`, but integers, booleans and half precision are converted to the default floating-point type."""
     if isinstance(data, Tensor):
         return data
     tensor = as_tensor(data)
@@ -96,7 +96,7 @@ def floating(data: Any) -> Tensor:
 
 
 def alike(result: Tensor | NDArray[Any], given: Given) -> Given:
-    """The result as an array where an array was given, as a tensor on its device else."""
+    """Return the result as an array if `given` is an array, otherwise as a tensor on the device of `given`."""
     if isinstance(given, Tensor):
         return result if isinstance(result, Tensor) else torch.from_numpy(result).to(given.device)
     return result.detach().cpu().numpy() if isinstance(result, Tensor) else result

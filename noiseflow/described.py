@@ -1,4 +1,4 @@
-"""One line for every object: arrays by shape and type, figures with their units, lists by length."""
+"""One-line representations of objects: arrays by shape and type, numbers with units, lists by length."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _FEW = 4
 
 
 def printable(text: str) -> str:
-    """Text that moves no cursor and colours nothing: every control and invisible character but the line end becomes ``?``."""
+    """Replace control and invisible characters by ``?``, except line ends, so that text is safe to print on a terminal."""
     return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
 
 
 def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:
-    """Give a dataclass a repr of one line.
+    """Class decorator that gives a dataclass a one-line repr.
 
     Args:
-        **units: of its fields, by name.
+        **units: units of the fields, by name.
     """
 
     def decorate(kind: type[Kind]) -> type[Kind]:
@@ -38,7 +38,7 @@ def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:
 
 
 def in_short(value: Any) -> str:
-    """A value in a few words."""
+    """A short description of a value."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return size_of(value)
     if isinstance(value, float):
@@ -53,7 +53,7 @@ def in_short(value: Any) -> str:
 
 
 def size_of(array: Any) -> str:
-    """Shape and number type of an array or tensor: ``64 x 64 float32``."""
+    """Shape and data type of an array or tensor, such as ``64 x 64 float32``."""
     kind = str(array.dtype).removeprefix("torch.")
     if not array.shape:
         return f"{array.item():.5g}"

@@ -1,4 +1,4 @@
-"""Freed memory kept for the next array of its size, while something long runs."""
+"""Reuse of freed memory for large arrays during long computations."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from contextlib import contextmanager
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4  # malloc.h
 _NEVER, _NONE, _MOST = -1, 0, 65536
-_LARGE = 32 * 2**20  # bytes; the most that glibc itself lets its threshold grow to
+_LARGE = 32 * 2**20  # bytes; the largest threshold that glibc sets by itself
 _depth = 0
 
 
 @contextmanager
 def kept_memory() -> Iterator[None]:
-    """Let glibc reuse large arrays that have been freed; elsewhere, do nothing.
+    """Let glibc reuse the memory of large freed arrays within the block; no effect on other systems.
 
-    By default it maps every array above 32 MiB anew, and hands it back at once. Then each operation on such an array begins with
-    the system clearing its pages one by one, which takes longer than most operations. What was kept is handed back at the end.
+    By default glibc maps every array above 32 MiB separately and releases it at once. The system then clears the pages of each
+    new array, which takes longer than most operations. The memory is released at the end of the block.
     """
     global _depth
     if _depth == 0 and (libc := _glibc()):
@@ -36,7 +36,7 @@ def kept_memory() -> Iterator[None]:
 
 
 def hand_back() -> None:
-    """Give the system what is kept so far, within `kept_memory`: what follows wants arrays of other sizes."""
+    """Release the memory held by `kept_memory`, before a computation with arrays of other sizes."""
     if libc := _glibc():
         libc.malloc_trim(0)
 

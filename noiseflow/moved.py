@@ -1,4 +1,4 @@
-"""Old import paths of modules that have moved: each still works for one version, with a `DeprecationWarning`."""
+"""Old import paths of moved modules: they work for one more version, with a `DeprecationWarning`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 
 class _OldModule(ModuleType):
-    """A module under its old name, which looks everything up in the new one."""
+    """A module under its old name, which forwards all attributes to the new one."""
 
     def __init__(self, name: str, new: str) -> None:
         super().__init__(name)
@@ -28,7 +28,7 @@ class _OldModule(ModuleType):
         return dir(import_module(self.__dict__["_new"]))
 
     def __call__(self, *args: Any, **options: Any) -> Any:
-        """The function of the module's own name: importing ``noiseflow.fit`` must not hide ``noiseflow.fit()``."""
+        """Call the function of the same name, so that importing ``noiseflow.fit`` does not hide ``noiseflow.fit()``."""
         return getattr(self, self.__name__.rsplit(".", 1)[1])(*args, **options)
 
 
@@ -45,9 +45,9 @@ class _Finder(MetaPathFinder, Loader):
         return _OldModule(spec.name, new)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Nothing to run: the new module is imported on first use."""
+        """Do nothing; the new module is imported on first use."""
 
 
 def keep_old_paths(package: str, moved: Mapping[str, str]) -> None:
-    """Let ``import package.old`` find ``package.new`` for every pair of `moved`, old → new, both without the package."""
+    """Make ``import package.old`` find ``package.new`` for every pair old → new of `moved`, given without the package."""
     sys.meta_path.append(_Finder({f"{package}.{old}": f"{package}.{new}" for old, new in moved.items()}))

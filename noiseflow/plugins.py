@@ -1,4 +1,4 @@
-"""Plug-ins of other packages, by entry point; one that is broken costs nobody else anything."""
+"""Plug-ins of other packages, by entry point. A broken plug-in does not affect others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _OWN = "noiseflow"
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group by name, without loading them; those of noiseflow itself come first."""
+    """The entry points of a group by name, not loaded; those of noiseflow itself come first."""
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=group):
         if point.name not in found or package_of(point) == _OWN:
@@ -31,10 +31,10 @@ def package_of(point: EntryPoint) -> str:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """What an entry point names.
+    """Load the object that an entry point names.
 
     Raises:
-        ImportError: it cannot be loaded, whatever the reason; the message names package and reason.
+        ImportError: it cannot be loaded; the message states the package and the reason.
     """
     try:
         return point.load()
@@ -42,12 +42,12 @@ def load_plugin(point: EntryPoint) -> Any:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ImportError(
             f"'{point.name}' of the package {package_of(point)} cannot be loaded ({reason[:300]}); "
-            "mend, update or uninstall that package"
+            "fix, update or uninstall that package"
         ) from error
 
 
 def load_plugins(group: str) -> dict[str, Any]:
-    """All of a group by name; a warning names each that cannot be loaded."""
+    """Load all plug-ins of a group, by name; warn about each that cannot be loaded."""
     loaded = {}
     for name, point in plugins(group).items():
         try:

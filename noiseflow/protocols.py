@@ -1,4 +1,4 @@
-"""The two plugs of the library: what a noise model is, and what a signal model is. No logic lives here."""
+"""The two interfaces of the library: noise models and signal models."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class NoiseModel(Protocol):
-    """A conditional density p(observation | signal); an ``nn.Module``.
+    """Interface of a noise model: a conditional density p(observation | signal); an ``nn.Module``.
 
-    `NoiseModelBase` is its full contract, with a default for everything but the call.
+    `NoiseModelBase` defines the complete interface, with defaults for everything but the call.
 
     Example:
         >>> import noiseflow
@@ -23,7 +23,7 @@ class NoiseModel(Protocol):
     """
 
     def __call__(self, signal: Tensor) -> NoiseDistribution:
-        """The distribution of the observations of pixels with the given signals.
+        """Return the distribution of the observations, given the signals of the pixels.
 
         Args:
             signal: clean signals, any shape, detector units.
@@ -36,10 +36,10 @@ class NoiseModel(Protocol):
 
 @runtime_checkable
 class SignalModel(Protocol):
-    """Anything differentiable that predicts the signal of given pixels; an ``nn.Module``.
+    """Interface of a signal model: any differentiable ``nn.Module`` that predicts the signal of given pixels.
 
-    Two methods are optional: ``signal()`` returns all pixels at once, flat, where that is cheaper than asking for them by
-    index; ``penalty()`` returns a scalar added to the mean negative log-likelihood (a regulariser, already weighted).
+    Two methods are optional. ``signal()`` returns all pixels as a flat tensor, if that is cheaper than prediction by index.
+    ``penalty()`` returns a scalar that is added to the mean negative log-likelihood (a weighted regulariser).
 
     Example:
         >>> import noiseflow, torch
@@ -64,6 +64,6 @@ class SignalModel(Protocol):
             pixels: (B,) flat pixel indices into the observation.
 
         Returns:
-            (B,) signals, differentiable in the model's parameters.
+            (B,) signals, differentiable with respect to the model's parameters.
         """
         ...

@@ -1,6 +1,6 @@
-"""Noise as a data-augmentation transform: `AddNoise`, in the manner of torchvision's transforms, version 2.
+"""Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2.
 
-Up to version 0.1 this was the module of increasing maps that flows are made of: see ``noiseflow.distributions.transforms``.
+Up to version 0.1, this module held the monotone maps of flows, now in ``noiseflow.distributions.transforms``.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from noiseflow.models.around import as_noise_model
 
 
 class AddNoise(nn.Module):
-    """Put the noise of a model on clean images, as one step of a data pipeline.
+    """Add the noise of a model to clean images, as a step of a data pipeline.
 
-    Called with images, or with any nesting of tuples, lists and dictionaries that hold some; the same nesting comes back. Where
-    there are ``torchvision.tv_tensors.Image`` or ``Video`` in it, those are made noisy, and else the first tensor or array;
-    masks, boxes, labels and everything else pass unchanged.
+    The input is an image, or nested tuples, lists and dictionaries with images; the output has the same structure. If the input
+    contains ``torchvision.tv_tensors.Image`` or ``Video``, noise is added to these, otherwise to the first tensor or array.
+    Masks, boxes, labels and everything else are returned unchanged.
 
-    Draws come from torch's global generator, which a `DataLoader` seeds anew for each worker and epoch. With `seed` they are
-    reproducible: one stream in the main process, and one for every worker and epoch, from `seed` and the worker's own seed
-    (``torch.manual_seed`` or the loader's ``generator`` settles that).
+    Random numbers come from torch's global generator, which a `DataLoader` seeds for each worker and epoch. With `seed` they are
+    reproducible: there is one stream in the main process and one for every worker and epoch, derived from `seed` and the seed of
+    the worker (set by ``torch.manual_seed`` or the loader's ``generator``).
 
     Args:
-        model: the noise model; images are in its detector units. It can be pickled, for workers that are spawned.
-        seed: of the transform's own streams of random numbers; None for torch's global generator.
-        keep_clean: return pairs (noisy, clean) in place of noisy images, for supervised training.
+        model: the noise model; images are in its detector units. It must be picklable if workers are spawned.
+        seed: seed of the transform's own random streams; None for torch's global generator.
+        keep_clean: return pairs (noisy, clean) instead of noisy images, for supervised training.
     """
 
     def __init__(self, model: nn.Module, *, seed: int | None = None, keep_clean: bool = False) -> None:
@@ -42,14 +42,14 @@ class AddNoise(nn.Module):
         self._stream: tuple[int, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the stream: every process has its own."""
+        """State without the random stream, because every process has its own."""
         return self.__dict__ | {"_generator": None, "_stream": None}
 
     def forward(self, *inputs: Any) -> Any:
-        """Noisy images in the same nesting.
+        """Return the input with noisy images, in the same structure.
 
         Args:
-            *inputs: images, any shape, detector units; integers become floating.
+            *inputs: images, any shape, detector units; integers are converted to floating point.
         """
         given = inputs if len(inputs) > 1 else inputs[0]
         leaves = list(_leaves(given))
@@ -58,7 +58,7 @@ class AddNoise(nn.Module):
         chosen = marked or plain[:1]
         if not chosen:
             raise ValueError(
-                "AddNoise found no image in its input; give a tensor, an array, or a nesting that holds one"
+                "AddNoise found no image in its input; give a tensor, an array, or a nested structure with one"
             )
         return _mapped(given, lambda leaf: self._noisy(leaf) if any(leaf is each for each in chosen) else leaf)
 
@@ -108,7 +108,7 @@ def _mapped(given: Any, function: Callable[[Any], Any]) -> Any:
 
 
 def _is_marked_image(leaf: Any) -> bool:
-    """Whether this is a torchvision image or video; torchvision is not needed to know."""
+    """Whether this is a torchvision image or video; does not require torchvision."""
     return isinstance(leaf, Tensor) and any(
         kind.__module__.startswith("torchvision.tv_tensors") and kind.__name__ in ("Image", "Video")
         for kind in type(leaf).__mro__
@@ -123,7 +123,7 @@ def _wrapped_like(noisy: Tensor, image: Tensor) -> Tensor:
 
 
 def __getattr__(name: str) -> Any:
-    """Names of the module that had this one's path before, for one version."""
+    """Names that this module had in version 0.1, kept for one version."""
     from noiseflow.distributions import transforms as increasing_maps
 
     if name.startswith("_") or not hasattr(increasing_maps, name):

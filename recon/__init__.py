@@ -1,6 +1,6 @@
-"""Clean volumes from noisy single-axis tilt series: projector, fields, joint fit, classical methods, metrics, phantoms.
+"""Reconstruction of volumes from noisy single-axis tilt series: projector, fields, joint fit, classical methods, metrics.
 
-Names load on first use, so importing the package costs nothing.
+Names are imported on first use, so that importing the package is fast.
 """
 
 import lazy_loader as _lazy

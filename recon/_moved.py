@@ -1,4 +1,4 @@
-"""Modules of this package before they were sorted into folders: old name → new. Kept for one version."""
+"""Old module names of this package → their new names, kept for one version."""
 
 MOVED = {
     "alignment": "series.alignment",

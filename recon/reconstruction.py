@@ -1,4 +1,4 @@
-"""What every method of reconstruction gives."""
+"""The result of a reconstruction."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
 @described(projections="detector units")
 @dataclass(frozen=True)
 class Reconstruction:
-    """A volume, and what was learnt with it.
+    """The result of a reconstruction.
 
     Attributes:
-        volume: the clean volume.
-        projections: (tilt, y, u) the clean images that the volume predicts, detector units.
-        method: the method that made it.
-        noise_model: the noise model it was fitted with; None where the method has none.
-        fit_result: held-out likelihood and its history; None where nothing was fitted.
-        signal_model: field, projector and image formation, as fitted, in `orientation`; None where the method has none.
-        weight_choice: the weights tried and their held-out likelihoods, where the weight was chosen.
-        choices: what was chosen or estimated, by name, for a table.
-        likelihood: the noise model under which the volume was fitted, where `noise_model` only describes what the fit left.
-        uncertainty: error bars of the volume, where they were asked for.
-        slices_at_once: slices of a block, at most; None where the volume was reconstructed whole.
-        orientation: flips of the series before the fit; all other attributes are of the series as it was given.
+        volume: the reconstructed volume.
+        projections: (tilt, y, u) noise-free images predicted by the volume, detector units.
+        method: name of the method.
+        noise_model: the noise model; None if the method has none.
+        fit_result: held-out likelihood and its history; None if nothing was fitted.
+        signal_model: fitted field, projector and image formation, in `orientation`; None if the method has none.
+        weight_choice: the tried weights and their held-out likelihoods, if the weight was chosen automatically.
+        choices: chosen and estimated values by name, for a table.
+        likelihood: the noise model of the fit, if `noise_model` was fitted only to the residuals.
+        uncertainty: error bars of the volume, if requested.
+        slices_at_once: largest number of slices of a block; None if the volume was reconstructed whole.
+        orientation: flips of the series before the fit; all other attributes refer to the given series.
 
     Example:
         >>> import numpy as np, recon
@@ -65,7 +65,7 @@ class Reconstruction:
     orientation: Orientation = field(default_factory=Orientation)
 
     def turned(self, orientation: Orientation) -> Reconstruction:
-        """The same for the series flipped back, whose tilts stand in reverse where their angles were negated."""
+        """The result for the series with the orientation reverted; tilts are reversed if their angles were negated."""
         if orientation == Orientation():
             return self
         bars = self.uncertainty
@@ -81,27 +81,27 @@ class Reconstruction:
 
     @property
     def weight(self) -> float:
-        """Weight of the regulariser; NaN where there is none."""
+        """Weight of the regulariser; NaN if there is none."""
         return math.nan if self.signal_model is None else float(self.signal_model.weight)
 
     @property
     def caution(self) -> str | None:
-        """What readers of the error bars must know, where the series is quiet."""
+        """A warning about the error bars if the noise of the series is small, otherwise None."""
         if self.uncertainty is None or self.likelihood is None:
             return None
         return (
-            "error bars of a quiet series cannot be relied on: the fit was least squares with one width for all pixels, "
-            "which is too wide where the sample is dark, and no error bar covers misalignment"
+            "error bars are not reliable for series with little noise: the fit was least squares with one width for all "
+            "pixels, which is too wide where the sample is dark, and error bars do not include misalignment"
         )
 
     @property
     def weights_tried(self) -> dict[float, float]:
-        """Weight of the regulariser → held-out negative log-likelihood, nats per pixel; empty where it was not chosen."""
+        """Tried weights → held-out negative log-likelihood, nats per pixel; empty if the weight was not chosen."""
         return {} if self.weight_choice is None else self.weight_choice.tried
 
     @property
     def response(self) -> dict[str, list[float]]:
-        """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty where nothing was fitted."""
+        """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty if nothing was fitted."""
         found = {} if self.signal_model is None else self.signal_model.response()
         return {name: values[::-1] for name, values in found.items()} if self.orientation.negated else found
 

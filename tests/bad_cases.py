@@ -12,8 +12,8 @@ sample {bad}/pickle.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-mo
 sample {bad}/torch.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-model file
 sample {bad}/other.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noiseflow noise model
 sample {bad}/future.safetensors {good}/clean.mrc -o {out}/n.mrc | update noiseflow
-sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown kind
-sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown kind
+sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
+sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
 sample {bad}/arguments.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/list.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/deep.safetensors {good}/clean.mrc -o {out}/n.mrc | deep.safetensors
@@ -29,8 +29,8 @@ sample {good}/model.safetensors {bad}/empty.tif -o {out}/n.mrc | is empty
 sample {good}/model.safetensors {bad}/empty.npy -o {out}/n.mrc | is empty
 sample {good}/model.safetensors {bad}/cut.mrc -o {out}/n.mrc | header claims
 sample {good}/model.safetensors {bad}/stub.mrc -o {out}/n.mrc | 1024 bytes
-sample {good}/model.safetensors {bad}/text.mrc -o {out}/n.mrc | no MRC file
-sample {good}/model.safetensors {bad}/garbage.mrc -o {out}/n.mrc | no MRC file
+sample {good}/model.safetensors {bad}/text.mrc -o {out}/n.mrc | not an MRC file
+sample {good}/model.safetensors {bad}/garbage.mrc -o {out}/n.mrc | not an MRC file
 sample {good}/model.safetensors {bad}/absurd.mrc -o {out}/n.mrc | claims 10000 x 10000 x 10000
 sample {good}/model.safetensors {bad}/negative.mrc -o {out}/n.mrc | header claims
 sample {good}/model.safetensors {bad}/zero.mrc -o {out}/n.mrc | header claims
@@ -63,18 +63,18 @@ sample {good}/model.safetensors {bad}/absurd.h5 -o {out}/n.mrc | header claims
 sample {good}/model.safetensors {bad}/void.h5 -o {out}/n.mrc | no image
 sample {good}/model.safetensors {bad}/twins.h5 -o {out}/n.mrc | FILE::NAME
 sample {good}/model.safetensors {bad}/twins.h5::/c -o {out}/n.mrc | holds no '/c'
-sample {good}/model.safetensors {good}/clean.mrc::/c -o {out}/n.mrc | leave ::/c out
+sample {good}/model.safetensors {good}/clean.mrc::/c -o {out}/n.mrc | remove ::/c
 sample {good}/model.safetensors {bad}/void.zarr -o {out}/n.mrc | void.zarr
 sample {good}/model.safetensors {bad}/folder -o {out}/n.mrc | without images
-sample {good}/model.safetensors {bad}/uneven -o {out}/n.mrc | one size
+sample {good}/model.safetensors {bad}/uneven -o {out}/n.mrc | same size
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.jpeg | name the output
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/none/n.mrc | create the folder
 sample {good}/model.safetensors {good}/clean.mrc -o {bad}/folder | name the output
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device cuda | --device cpu
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device toaster | choose auto
-evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | equal sizes
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | equal shapes
 evaluate {good}/model.safetensors --signal {good}/clean.mrc {good}/clean.mrc --observation {good}/clean.mrc | one of each
-evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | the same pixels
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | the same pixel values
 evaluate {good}/model.safetensors --signal {bad}/nan2d.npy --observation {good}/clean.mrc | NaN
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/cut.tif | cannot be read
 evaluate {bad}/cut.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | damaged
@@ -123,8 +123,8 @@ reconstruct {bad}/nan.npy -o {out}/v.mrc | NaN
 reconstruct {bad}/inf.npy -o {out}/v.mrc | infinite
 reconstruct {bad}/flat.npy -o {out}/v.mrc | flat
 reconstruct {good}/tilts.mrc --angles {bad}/missing.tlt -o {out}/v.mrc | does not exist
-reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is no file
-reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is no text
+reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is not a file
+reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is not a text file
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:system | it failed on an image
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:name | it failed on an image
 reconstruct {good}/tilts.mrc --angles {bad}/empty.tlt -o {out}/v.mrc | no angles
@@ -136,7 +136,7 @@ reconstruct {good}/tilts.mrc --angles {bad}/unknown.tlt -o {out}/v.mrc | within 
 reconstruct {good}/tilts.mrc --angles {bad}/huge.tlt -o {out}/v.mrc | within ±720
 reconstruct {good}/tilts.mrc --angles {bad}/far.tlt -o {out}/v.mrc | within ±720
 reconstruct {good}/tilts.mrc --angles {bad}/script.tlt -o {out}/v.mrc | is not an angle
-reconstruct {good}/one-tilt.npy -o {out}/v.mrc | images are flat
+reconstruct {good}/one-tilt.npy -o {out}/v.mrc | images are constant
 reconstruct {good}/tilts.mrc --angles {bad}/same.tlt -o {out}/v.mrc | different angles
 reconstruct {good}/tilts.mrc --angles {bad}/no.mdoc -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/folder -o {out}/v.mrc | folder
@@ -160,11 +160,11 @@ compare {good}/tilts.mrc {good}/clean.mrc | shape
 compare {bad}/nan.npy {good}/tilts.mrc | NaN
 compare {good}/tilts.mrc {bad}/flat.npy | flat
 compare {good}/tilts.mrc {bad}/cut.mrc | header claims
-sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | would be lost
+sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | also an input
 sample {good}/clean.mrc {good}/model.safetensors -o {out}/n.mrc | check the order
-sample {good}/model.safetensors {good}/model.safetensors -o {out}/n.mrc | is no image but a noise model
+sample {good}/model.safetensors {good}/model.safetensors -o {out}/n.mrc | is not an image but a noise model
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.safetensors | name the output
-evaluate {good}/model.safetensors --signal {good}/model.safetensors --observation {good}/clean.mrc | is no image but a noise model
+evaluate {good}/model.safetensors --signal {good}/model.safetensors --observation {good}/clean.mrc | is not an image
 evaluate {bad}/pickle.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | not a noise-model file
 evaluate {good}/model.safetensors --signal {bad}/absurd.mrc --observation {good}/clean.mrc | header claims
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/missing.mrc | does not exist
@@ -174,10 +174,10 @@ calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | n
 simulate {good} | --overwrite
 simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file
-reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | would be lost
-reconstruct {good}/tilts.rawtlt -o {out}/v.mrc | is no image but a file of tilt angles
-reconstruct {good}/tilts.mrc --angles {good}/tilts.mrc -o {out}/v.mrc | is no text
-reconstruct {good}/model.safetensors -o {out}/v.mrc | is no image but a noise model
+reconstruct {good}/tilts.mrc -o {good}/tilts.mrc | also an input
+reconstruct {good}/tilts.rawtlt -o {out}/v.mrc | is not an image but a file of tilt angles
+reconstruct {good}/tilts.mrc --angles {good}/tilts.mrc -o {out}/v.mrc | is not a text file
+reconstruct {good}/model.safetensors -o {out}/v.mrc | is not an image but a noise model
 reconstruct {good}/tilts.mrc --preset magic -o {out}/v.mrc | kniesel2022
 reconstruct {good}/tilts.mrc --window magic -o {out}/v.mrc | hann
 reconstruct {good}/tilts.mrc --denoiser magic --method wbp-denoised -o {out}/v.mrc | nlm
@@ -187,14 +187,14 @@ reconstruct {good}/tilts.mrc --mask {bad}/nan.npy -o {out}/v.mrc | NaN
 reconstruct {good}/tilts.mrc --reference {good}/clean.mrc -o {out}/v.mrc | clean.mrc
 reconstruct {good}/tilts.mrc --reference {bad}/cut.mrc -o {out}/v.mrc | header claims
 reconstruct {good}/tilts.mrc --method joint-supervised -o {out}/v.mrc | --noise-model
-reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors -o {out}/v.mrc | learns no noise model
+reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors -o {out}/v.mrc | does not fit a noise model
 reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name the output
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 1
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt --mode haadf | linear
 compare {good}/tilts.mrc {good}/tilts.mrc --report {bad}/empty.mrc | is a file
-compare {good}/model.safetensors {good}/tilts.mrc | is no image but a noise model
+compare {good}/model.safetensors {good}/tilts.mrc | is not an image but a noise model
 compare {bad}/absurd.mrc {good}/tilts.mrc | header claims
 compare {good}/tilts.mrc {bad}/text.dm3 | cannot be read
 benchmark nothing --out {out}/b | choose from
@@ -207,9 +207,9 @@ benchmark --phantom unicorn --quick --out {out}/b | unicorn
 sample {good}/model.safetensors {good}/clean.mrc -o /proc/n.mrc | not writable
 reconstruct {good}/tilts.mrc -o /proc/v.mrc | not writable
 simulate /proc/s | not writable
-sample {bad}/pipe {good}/clean.mrc -o {out}/n.mrc | is no file
-evaluate {bad}/pipe --signal {good}/clean.mrc --observation {good}/small.mrc | is no file
-reconstruct {good}/tilts.mrc --noise-model {bad}/pipe -o {out}/v.mrc | is no file
+sample {bad}/pipe {good}/clean.mrc -o {out}/n.mrc | is not a regular file
+evaluate {bad}/pipe --signal {good}/clean.mrc --observation {good}/small.mrc | is not a regular file
+reconstruct {good}/tilts.mrc --noise-model {bad}/pipe -o {out}/v.mrc | is not a regular file
 reconstruct {good}/tilts.mrc --method wbp --report {out}/v.mrc -o {out}/v.mrc | another folder
 reconstruct {good}/tilts.mrc --method wbp --report {out}/v.mrc/page -o {out}/v.mrc | another folder
 reconstruct {good}/tilts.mrc --method wbp --tilt-axis 1e300 -o {out}/v.mrc | within ±360
@@ -219,13 +219,13 @@ measure {bad}/nan.npy | NaN
 measure {good}/tilts.mrc --line 0,0,0:99,0,0 | leaves the volume
 measure {good}/tilts.mrc --region 0:2 | --region
 measure {good}/clean.mrc | three axes
-batch {bad}/binary.tlt -o {out} | is no CSV table
-batch {good}/tilts.mrc -o {out} | is no CSV table
+batch {bad}/binary.tlt -o {out} | is not a CSV table
+batch {good}/tilts.mrc -o {out} | is not a CSV table
 batch {bad}/folder -o {out} | no stack with tilt angles
 batch {good} -o {bad}/empty.mrc | is a file
 batch {good} -o {out} --options "--method 'wbp" | --options
-batch {good} -o {out} --options '-o {out}/x.mrc' | among the options
-batch {good} -o {out} --options '--output={out}/x.mrc' | among the options
+batch {good} -o {out} --options '-o {out}/x.mrc' | in the options
+batch {good} -o {out} --options '--output={out}/x.mrc' | in the options
 demo --out /proc/demo | not writable
 demo --out {bad}/empty.mrc | is a file
 demo --out {bad}/empty.mrc/below | empty.mrc

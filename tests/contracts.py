@@ -231,7 +231,7 @@ def check_bad_values(model: nn.Module, signals: Tensor) -> None:
     below = distribution.cdf(bad)
     assert bool(torch.isnan(below[0]) & (below[1] == 1) & (below[2] == 0))
     assert bool(torch.isnan(distribution.icdf(bad[:1].expand(3))).all())
-    with pytest.raises(ValueError, match=r"1\.5 is no probability"):
+    with pytest.raises(ValueError, match=r"1\.5 is not a probability"):
         distribution.icdf(torch.full_like(signals, 1.5))
     for nothing in (math.nan, math.inf):
         signal = signals.clone()

@@ -71,7 +71,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
         ("_ROUNDINGS = 8", "numbers", "slack for rounding errors, of which one or two occur"),
         ("_MOST_LEVELS = 2**16", "numbers", SPEED),
-        ("< 1e-3  # a level itself", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        ("< 1e-3  # rounding errors", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         (
             "(steps - nearest).abs() < 1e-3",
             "(steps - nearest).abs() < 0.001",

@@ -102,7 +102,7 @@ class Soak:
             raise AssertionError(f"still running after {_LONGEST} s") from None
         printed = printed or ""
         self._require(process.returncode in codes, f"exit code {process.returncode}: {printed[-300:]}")
-        self._require("Traceback" not in printed and "fault of noiseflow" not in printed, printed[-300:])
+        self._require("Traceback" not in printed and "bug in noiseflow" not in printed, printed[-300:])
         return printed
 
     def _clean_run(self, name: str, out: Path) -> None:

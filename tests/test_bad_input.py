@@ -70,7 +70,7 @@ def test_one_line_and_nothing_left(line: str, fragment: str, files: dict[str, Pa
     before = snapshot(tmp_path, *files.values())
     message = refused(*words(line, files, tmp_path))
     assert fragment in message
-    assert "fault of noiseflow" not in message
+    assert "bug in noiseflow" not in message
     assert len(message) < 500
     assert snapshot(tmp_path, *files.values()) == before
 

@@ -69,9 +69,7 @@ def test_a_result_that_nobody_could_read_is_told(command: tuple[list[str], Path]
     words, output = command
     done = shell([*words, "--json"], ">/dev/full")
     assert done.returncode == 1
-    assert done.stderr.endswith(
-        "noiseflow: what was printed is lost (no space left on device); all files are written\n"
-    )
+    assert done.stderr.endswith("noiseflow: console output was lost (no space left on device); all files are written\n")
     assert output.exists()
 
 

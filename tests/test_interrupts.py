@@ -87,9 +87,9 @@ def stop(name: str, good: Path, out: Path, moment: float, times: int = 1) -> int
     assert "Traceback" not in printed
     if process.exitcode == 130:
         last = (printed.strip().splitlines() or [""])[-1]
-        assert re.match(r"noiseflow: .*(starts again|goes on from there|go on with: noiseflow .* --resume)$", last), (
-            printed
-        )
+        assert re.match(
+            r"noiseflow: .*(to start again|same command to resume|resume with: noiseflow .* --resume)$", last
+        ), printed
     require_whole(out)
     return int(process.exitcode)
 
@@ -230,4 +230,4 @@ def test_a_second_ctrl_c_while_signals_are_handed_back_says_how_to_go_on(
     finally:
         signal.signal(signal.SIGINT, before)
     assert end.value.code == 130
-    assert re.search("go on with: noiseflow reconstruct|starts again", capsys.readouterr().err)
+    assert re.search("resume with: noiseflow reconstruct|to start again", capsys.readouterr().err)

@@ -120,7 +120,7 @@ def test_foreign_files_among_the_states_stay(tmp_path: Path) -> None:
     (dead / ".tmpAbCdEf").touch()
     save_file({"weights": np.ones(3)}, tmp_path / "mine.safetensors")
     save_file({"weights": np.ones(3)}, tmp_path / "current.safetensors")
-    with pytest.raises(FileExistsError, match="not written by noiseflow"):
+    with pytest.raises(FileExistsError, match="not a reconstruction state"):
         write_state(tmp_path / "current.safetensors", {"a": 1})
     discard_states(tmp_path)
     left = {file.name for file in tmp_path.iterdir()}
@@ -147,7 +147,7 @@ def test_files_of_others_in_the_folder_of_a_checkpoint_stay(files: Path, tmp_pat
 def test_a_noise_model_that_bears_the_name_of_a_state_is_not_replaced(tmp_path: Path) -> None:
     path = noiseflow.save(noiseflow.Gaussian(), tmp_path / "current.safetensors")
     before = path.read_bytes()
-    with pytest.raises(FileExistsError, match="as a state"):
+    with pytest.raises(FileExistsError, match="not a reconstruction state"):
         write_state(path, {"a": 1})
     assert path.read_bytes() == before
 
@@ -160,9 +160,9 @@ def test_no_series_of_a_batch_is_replaced_by_the_volume_of_another(files: Path, 
     before = (tmp_path / "b" / "tilts.mrc").read_bytes()
     words = ["batch", table, "-o", tmp_path / "out", "--options", "--method wbp"]
     for more in ([], ["--overwrite"]):
-        assert "would be lost" in refused(*words, *more)
+        assert "is an input of" in refused(*words, *more)
     assert (tmp_path / "b" / "tilts.mrc").read_bytes() == before
-    assert "is an input too" in refused("batch", table, "-o", tmp_path / "out", "--table", table, "--overwrite")
+    assert "is also an input" in refused("batch", table, "-o", tmp_path / "out", "--table", table, "--overwrite")
     assert table.read_text().startswith("tilts,out")
 
 
@@ -173,7 +173,7 @@ def test_no_image_of_a_folder_that_is_the_input_is_replaced(files: Path, tmp_pat
         io.write(tmp_path / f"{number:02d}.tif", image)
     shutil.copy(files / "new" / "tilts.rawtlt", tmp_path)
     for more in ([], ["--overwrite"]):
-        assert "is an input too" in refused(
+        assert "is also an input" in refused(
             "reconstruct", tmp_path, "-o", tmp_path / "03.tif", "--method", "wbp", *more
         )
     assert np.array_equal(io.read(tmp_path / "03.tif").data, stack[3])
@@ -288,11 +288,11 @@ def test_a_full_disk_stops_with_one_line_and_the_run_goes_on_when_there_is_room(
     process.join(120)
     told = (tmp_path / "log").read_text().strip().splitlines()[-1]
     assert process.exitcode == 1, told
-    assert "fault of noiseflow" not in told
-    assert "raise it (ulimit -f)" in told
+    assert "bug in noiseflow" not in told
+    assert "raise the limit (ulimit -f)" in told
     assert told.endswith("--resume")
     assert saved(out)
-    finish(shlex.split(told.partition("go on with: noiseflow ")[2]), tmp_path / "log")
+    finish(shlex.split(told.partition("resume with: noiseflow ")[2]), tmp_path / "log")
     np.testing.assert_allclose(np.load(out), np.load(expected), rtol=0, atol=1e-5 * np.abs(np.load(expected)).max())
     assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "whole.npy", "log"}
 
@@ -354,7 +354,7 @@ def test_a_batch_that_is_stopped_tells_how_far_it_came(files: Path, tmp_path: Pa
     process.join(120)
     assert process.exitcode == 130
     told = (tmp_path / "log").read_text().strip().splitlines()[-1]
-    assert told.endswith("0 of 1 series are done; --resume goes on with the others")
+    assert told.endswith("0 of 1 series are done; continue with --resume")
 
 
 def test_an_output_folder_that_is_deleted_is_told(files: Path, tmp_path: Path) -> None:
@@ -370,7 +370,7 @@ def test_an_output_folder_that_is_deleted_is_told(files: Path, tmp_path: Path) -
     assert process.exitcode == 1, told
     last = told.strip().splitlines()[-1]
     assert last.startswith("noiseflow: ")
-    assert "does not exist any more" in last
+    assert "no longer exists" in last
     assert "--resume" not in last
     assert "Traceback" not in told
 

@@ -274,7 +274,7 @@ def test_error_bars_stand_beside_the_volume_and_name_what_no_tilt_saw(open_page,
     page = open_page()
     picture = page.get_by_alt_text("standard deviation and bias from 2 samples")
     assert picture.evaluate("image => image.complete && image.naturalWidth") > 800
-    assert "No tilt between 60° and 120° was recorded (33 % of half a turn)" in page.locator("main").inner_text()
+    assert "No tilt between 60° and 120° was recorded (33 % of 180°)" in page.locator("main").inner_text()
     _, outcome = scene
     figure = error_bar_figure(outcome.volume, outcome.uncertainty, "attenuation per voxel")
     *panels, bar = (axis for axis in figure.axes if axis.get_ylabel() != "")

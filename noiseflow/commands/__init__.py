@@ -1,4 +1,4 @@
-"""The program `noiseflow` and the commands that need no other package."""
+"""The command-line program `noiseflow`, and the commands that need only this package."""
 
 import lazy_loader as _lazy
 

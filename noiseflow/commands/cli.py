@@ -1,6 +1,6 @@
-"""The program `noiseflow`: finds its commands by entry point, and turns user mistakes into one clear line.
+"""The command-line program `noiseflow`: finds its commands by entry point and reports user errors in one line.
 
-Nothing here imports torch, so that ``noiseflow -h`` answers at once.
+This module does not import torch, so that ``noiseflow -h`` is fast.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 
 def build_app() -> typer.Typer:
-    """The command-line application with every installed command."""
+    """Build the command-line application with all installed commands."""
     app = typer.Typer(
         name="noiseflow",
         cls=_Group,
@@ -55,17 +55,19 @@ def build_app() -> typer.Typer:
 
 
 def _require_command(command: Any) -> None:
-    """Refuse what no command can be made of, before it spoils the help of all.
+    """Check that a plug-in is a valid command, so that a broken one does not break the help of the others.
 
     Raises:
-        TypeError: it is no function, or its parameters are none of a command.
+        TypeError: it is not a function, or its parameters are not valid for a command.
     """
     alone = typer.Typer()
     try:
         alone.command()(command)
         typer.main.get_command(alone)
     except Exception as error:
-        raise TypeError(f"this plug-in is no command ({error}); mend, update or uninstall its package") from error
+        raise TypeError(
+            f"this plug-in is not a valid command ({error}); fix, update or uninstall its package"
+        ) from error
 
 
 def _broken(problem: str) -> Callable[[typer.Context], None]:
@@ -77,7 +79,7 @@ def _broken(problem: str) -> Callable[[typer.Context], None]:
 
 
 class _Group(TyperGroup):
-    """The program itself: Ctrl-C ends whatever it runs with one line and exit code 130."""
+    """The top-level command group: Ctrl-C ends any command with one line and exit code 130."""
 
     def get_params(self, ctx: Any) -> Any:
         return _flags_without_type(super().get_params(ctx))
@@ -102,15 +104,15 @@ class _Group(TyperGroup):
 
 
 def _spell_out(error: Exception) -> None:
-    """What was typed is part of a usage error, which moves no cursor."""
+    """Escape control characters in the user's input that a usage error quotes."""
     if isinstance(message := getattr(error, "message", None), str):
         error.message = printable(message)  # type: ignore[attr-defined]
 
 
 class _ListCommand(TyperCommand):
-    """A command that remembers how it was called, and whose list options take several values.
+    """A command that records how it was called, and whose list options accept several values.
 
-    ``--short a b c`` stands for ``--short a --short b --short c``.
+    ``--short a b c`` means ``--short a --short b --short c``.
     """
 
     def get_params(self, ctx: Any) -> Any:
@@ -138,7 +140,7 @@ class _ListCommand(TyperCommand):
 
 
 def _flags_without_type(parameters: list[Any]) -> list[Any]:
-    """The help shows a flag as what is typed, ``--resume``: without a type, which would look like a value to give."""
+    """Hide the type of flags in the help, because it would look like a value that the user must give."""
     for parameter in parameters:
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
@@ -163,7 +165,7 @@ def _options(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the program and exit: 0 done, 1 could not do it (one line says why and the fix), 2 usage, 130 interrupted."""
+    """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
     with steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
@@ -173,10 +175,10 @@ def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) ->
     debug = "--debug" in arguments
     if not debug:
         warnings.showwarning = _show_warning
-        logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already tells
+        logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already reports
     try:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, interrupts)  # a batch system's stop leaves nothing half done
+            signal.signal(signal.SIGTERM, interrupts)  # a batch system's stop signal must not leave partial outputs
             if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
                 signal.signal(signal.SIGINT, interrupts)
             _keep_ctrl_c()
@@ -205,10 +207,10 @@ def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) ->
 
 
 class _Interrupts:
-    """Raises `KeyboardInterrupt`, and remembers it: compiled libraries make errors of other kinds of it on its way.
+    """Signal handler that raises `KeyboardInterrupt` and records it, as compiled libraries may raise another error instead.
 
     Args:
-        until_exit: the process ends with the command: once the work is `done`, an interrupt changes nothing any more.
+        until_exit: whether the process ends with the command; if so, interrupts are ignored once the work is `done`.
     """
 
     came = done = False
@@ -217,7 +219,7 @@ class _Interrupts:
         self.until_exit = until_exit
 
     def ignore(self) -> None:
-        """From here on, also where Python takes handlers away as it shuts down."""
+        """Ignore further interrupts, also while Python removes handlers at shutdown."""
         if self.until_exit and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -229,7 +231,7 @@ class _Interrupts:
 
 
 def _keep_ctrl_c() -> None:
-    """Let an interrupt that came while an object was cleared away, where Python drops it, come again a moment later."""
+    """Raise an interrupt again if it arrived in an object's destructor, where Python discards exceptions."""
     others, main_thread = sys.unraisablehook, threading.main_thread().ident
     if others.__module__ == __name__ or not hasattr(signal, "pthread_kill") or main_thread is None:
         return
@@ -248,14 +250,10 @@ def _in_one_line(error: Exception) -> str:
     if isinstance(error, (ValueError, ImportError)):
         return text or type(error).__name__
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
-        return (
-            f"out of memory ({text[:200] or 'no more could be had'}); take a smaller or binned input, or fewer voxels"
-        )
+        return f"out of memory ({text[:200] or 'allocation failed'}); use a smaller or binned input, or fewer voxels"
     if isinstance(error, OSError):
         return printable("; ".join([_system_error(error), *_notes(error)]))
-    return (
-        f"unexpected {type(error).__name__}: {text[:300]}; this is a fault of noiseflow: please report it with --debug"
-    )
+    return f"unexpected {type(error).__name__}: {text[:300]}; this is a bug in noiseflow: please report it with --debug"
 
 
 def _notes(error: Exception) -> list[str]:
@@ -269,10 +267,10 @@ def _system_error(error: OSError) -> str:
     fix = {
         errno.ENOSPC: "free some space, or write to another disk",
         errno.EDQUOT: "free some space, or write to another disk",
-        errno.EFBIG: "the limit on file sizes is reached: write to another disk, or raise it (ulimit -f)",
+        errno.EFBIG: "the file-size limit is reached: write to another disk, or raise the limit (ulimit -f)",
         errno.EACCES: "check the permissions, or choose another path",
         errno.EPERM: "check the permissions, or choose another path",
-        errno.EROFS: "choose a folder that can be written to",
+        errno.EROFS: "choose a writable folder",
         errno.ENOENT: "check the path",
         errno.ENAMETOOLONG: "choose a shorter name",
     }.get(error.errno, "check the path and the disk")

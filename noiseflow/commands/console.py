@@ -1,4 +1,4 @@
-"""What every command shares: options, progress, and one way to speak to people and to programs. Imports no torch."""
+"""Shared parts of all commands: options, progress, and output for people and programs. Does not import torch."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ OverwriteOption = Annotated[
 ]
 
 Progress = Callable[[int, str], None]
-"""``progress(done, note)``: steps done so far, and a few words such as the current likelihood."""
+"""``progress(done, note)``: number of completed steps, and a short note such as the current likelihood."""
 StepReport = Callable[[str, int, int, str], None]
-"""``report(title, done, total, note)``: the same for several pieces of work one after the other."""
-START_AGAIN = "nothing was left behind; the same command starts again"
-"""What is reported of stopped work that keeps no state."""
+"""``report(title, done, total, note)``: the same for several tasks in sequence."""
+START_AGAIN = "no partial results were kept; run the same command to start again"
+"""Message for interrupted work that keeps no state."""
 _LOG_SECONDS = 10.0
 
 
 def end_stopped(text: str) -> NoReturn:
-    """End a program that was stopped, with one line and exit code 130; Ctrl-C again has no effect any more."""
+    """Exit with one line and code 130 after an interrupt; further interrupts are ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     from noiseflow.io.partials import clear_unfinished
 
     clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
-    sys.exit(130)  # not typer.Exit, which a command that runs others would not notice
+    sys.exit(130)  # not typer.Exit, which a command that runs other commands would not see
 
 
 class Output:
-    """Tells people in lines and tables, or programs in one JSON object.
+    """Output as lines and tables for people, or as one JSON object for programs.
 
     Args:
-        json_mode: print only the JSON object on stdout; the lines go to stderr.
+        json_mode: print only the JSON object on stdout; lines go to stderr.
     """
 
     def __init__(self, json_mode: bool) -> None:
         self.json_mode = json_mode
 
     def line(self, text: str) -> None:
-        """One line for people."""
+        """Print one line."""
         print(printable(text), file=sys.stderr if self.json_mode else sys.stdout, flush=True)
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """A table aligned for a terminal; the first column is left-aligned, the others right."""
+        """Print an aligned table; the first column is left-aligned, the others right-aligned."""
         cells = [list(header), *[list(row) for row in rows]]
         widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
         for row in cells:
@@ -68,7 +68,7 @@ class Output:
             self.line("  ".join([first, *rest]).rstrip())
 
     def result(self, values: dict[str, Any]) -> None:
-        """The command's result, printed only in JSON mode; non-finite numbers become null."""
+        """Print the command's result in JSON mode; non-finite numbers become null."""
         if self.json_mode:
             print(json.dumps(_plain(values), allow_nan=False), flush=True)
 
@@ -90,7 +90,7 @@ _SHOWN: ContextVar[bool] = ContextVar("shown", default=False)
 
 @contextlib.contextmanager
 def progress_shown() -> Iterator[None]:
-    """Within the block, progress is shown in JSON mode too: of a command that another one runs for its result."""
+    """Show progress in JSON mode too, for commands that another command runs for their JSON result."""
     token = _SHOWN.set(True)
     try:
         yield
@@ -100,14 +100,14 @@ def progress_shown() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
-    """Progress of one piece of work of so many steps; see `step_report`."""
+    """Progress of one task of `total` steps; see `step_report`."""
     with step_report(json_mode=json_mode) as report:
         yield lambda done, note: report(title, done, total, note)
 
 
 @contextlib.contextmanager
 def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
-    """Progress with rate and time left: a bar on a terminal, a line now and then in a log, nothing in JSON mode."""
+    """Progress with rate and remaining time: a bar on a terminal, occasional lines in a log, nothing in JSON mode."""
     if json_mode and not _SHOWN.get():
         yield lambda title, done, total, note: None
     elif not sys.stderr.isatty():
@@ -117,7 +117,7 @@ def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
 
 
 class _Rate:
-    """Steps per second of the work at hand; a new title, or a count that falls, starts a new measurement."""
+    """Steps per second of the current task; a new title or a smaller count starts a new measurement."""
 
     title, first, last, started = "", 0, 0, 0.0
 
@@ -171,16 +171,14 @@ def choose_device(name: str) -> Any:
     """The torch device of ``auto``, ``cpu`` or ``cuda``.
 
     Raises:
-        ValueError: another name, or CUDA asked for where there is none.
+        ValueError: the name is unknown, or CUDA is not available.
     """
     import torch
 
     if name not in ("auto", "cpu", "cuda"):
         raise ValueError(f"--device {name}: choose auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError(
-            "--device cuda: torch sees no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
-        )
+        raise ValueError("--device cuda: torch finds no CUDA GPU; use --device cpu, or install a CUDA build of torch")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -190,7 +188,7 @@ class Invocation:
 
     Attributes:
         words: the command's name and its arguments as typed.
-        options: parameter → its value, and whether the user gave it.
+        options: parameter name → its value, and whether the user set it.
     """
 
     words: tuple[str, ...]
@@ -198,7 +196,7 @@ class Invocation:
 
     @property
     def command_line(self) -> str:
-        """The command as one would type it again."""
+        """The command line that repeats this call."""
         return shlex.join(["noiseflow", *self.words])
 
 
@@ -206,13 +204,13 @@ _INVOCATION: ContextVar[Invocation | None] = ContextVar("invocation", default=No
 
 
 def invocation() -> Invocation | None:
-    """How the running command was called; None where no command runs."""
+    """The invocation of the running command; None if no command is running."""
     return _INVOCATION.get()
 
 
 @contextlib.contextmanager
 def invoked(call: Invocation) -> Iterator[None]:
-    """Within the block, `invocation` returns this call."""
+    """Make `invocation` return this call within the block."""
     token = _INVOCATION.set(call)
     try:
         yield

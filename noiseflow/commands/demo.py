@@ -1,4 +1,4 @@
-"""The command `noiseflow demo`: the other commands in sequence on small shipped files, ending with one report."""
+"""The command `noiseflow demo`: runs the other commands on small example files and writes one report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def demo(
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate, sample and reconstruct on real data that ships with the library; ends with a report."""
+    """Calibrate, sample and reconstruct on the example data of the library, and write one report."""
     from noiseflow.io import check_folder
     from noiseflow.report import Report
 
@@ -34,10 +34,10 @@ def demo(
     started = time.perf_counter()
     check_folder(out, holds=_FILES, overwrite=overwrite)
     out.mkdir(parents=True, exist_ok=True)
-    report = Report("noiseflow demo", "The commands shown made everything below; run them on your own files.")
+    report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
-        "Three uses on real data: calibrate a detector from a short and a long exposure, sample its noise, and reconstruct "
-        "volumes from noisy tilt series."
+        "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
+        "reconstruct volumes from noisy tilt series."
     )
     run = _Runner(output, report, str(seed), overwrite=overwrite)
     with as_file(files("noiseflow") / "data") as data:
@@ -69,7 +69,7 @@ def demo(
 
 
 class _Runner:
-    """Runs a command of this program, shows it, and takes its report into the page."""
+    """Runs a command of this program, prints it, and adds its report to the page."""
 
     def __init__(self, output: Output, report: Any, seed: str, *, overwrite: bool) -> None:
         self.output, self.report, self.seed, self.overwrite = output, report, seed, overwrite
@@ -96,7 +96,7 @@ class _Runner:
 
 
 def _write_clean(long: Path, target: Path, registration: dict[str, Any]) -> None:
-    """The long exposure at the short exposure's scale: a nearly clean image in the detector's units."""
+    """Write the long exposure at the scale of the short one: a nearly noise-free image in detector units."""
     import numpy as np
 
     from noiseflow import io

@@ -1,4 +1,4 @@
-"""The command `noiseflow doctor`: what is installed, what is missing, and whether it works on this machine."""
+"""The command `noiseflow doctor`: reports what is installed, what is missing, and whether it works on this machine."""
 
 from __future__ import annotations
 
@@ -57,20 +57,24 @@ def doctor(json: JsonOption = False) -> None:
 
 
 def run_self_tests() -> dict[str, dict[str, Any]]:
-    """Every self-test of the installed packages (entry points ``noiseflow.self_tests``): its problem, or None, and time."""
+    """Run the self-tests of all installed packages (entry points ``noiseflow.self_tests``).
+
+    Returns:
+        For each test, its problem (None if it passed) and its duration, s.
+    """
     results = {}
     for name, point in sorted(plugins("noiseflow.self_tests").items()):
         started = time.perf_counter()
         try:
             problem = load_plugin(point)()
-        except Exception as error:  # whatever breaks is what the user wants to know
+        except Exception as error:  # every failure is reported to the user
             problem = f"{type(error).__name__}: {error}"
         results[name] = {"problem": problem, "seconds": time.perf_counter() - started}
     return results
 
 
 def check_noise_models() -> str | None:
-    """Fit a signal-dependent Gaussian to noise of known strength and sample it; returns the problem, or None."""
+    """Fit a signal-dependent Gaussian to noise of known strength and sample it. Return the problem, or None."""
     import torch
 
     import noiseflow
@@ -86,7 +90,7 @@ def check_noise_models() -> str | None:
 
 
 def _folders(packages: list[str]) -> dict[str, str]:
-    """Package → where its modules would be loaded from."""
+    """Package → folder that its modules are loaded from."""
     modules = {name: modules_of(name) for name in packages} | {name: [name] for name in OWN}
     found = {name: {str(folder_of(module) or "nowhere") for module in each} for name, each in modules.items()}
     return {name: ", ".join(sorted(folders)) or "nowhere" for name, folders in found.items()}
@@ -108,14 +112,14 @@ def _packages() -> dict[str, str | None]:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Extra -> its packages that are missing."""
+    """Extra → its missing packages."""
     return {
         extra: [name for name in names if _version(name) is None] for extra, names in _requirements().items() if extra
     }
 
 
 def _requirements() -> dict[str, list[str]]:
-    """Extra ("" for the core) -> names of the packages it needs on this machine."""
+    """Extra ("" for the core) → names of the packages that it needs on this machine."""
     from packaging.requirements import Requirement
 
     found: dict[str, list[str]] = {}

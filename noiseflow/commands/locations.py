@@ -1,4 +1,4 @@
-"""Where packages are loaded from, and which are shadowed by a folder or file of the same name."""
+"""Locations of packages, and detection of packages shadowed by a folder or file of the same name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ OWN = ("noiseflow", "calibration", "recon")
 
 
 def folder_of(module: str) -> Path | None:
-    """The folder that an import of a top-level module would be served from; None where there is none."""
+    """The folder that a top-level module would be imported from; None if it is not found."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
@@ -23,16 +23,16 @@ def folder_of(module: str) -> Path | None:
 
 
 def modules_of(package: str) -> list[str]:
-    """The public top-level modules that an installed package brings."""
+    """The public top-level modules of an installed package."""
     found = packages_distributions().items()
     return sorted(module for module, names in found if package in names and not module.startswith("_"))
 
 
 def shadows(packages: list[str]) -> list[str]:
-    """One line for each module that is loaded from elsewhere than its package was installed.
+    """One message for each module that is not loaded from its installed package.
 
     Args:
-        packages: names of installed packages to check besides noiseflow itself, whose parts must lie side by side.
+        packages: names of installed packages to check in addition to noiseflow, whose packages must be in one folder.
     """
     home = Path(__file__).parents[2]
     wrong = [(module, home) for module in OWN if _elsewhere(module, home)]
@@ -43,7 +43,7 @@ def shadows(packages: list[str]) -> list[str]:
             continue
         wrong += [(module, root) for module in modules_of(package) if _elsewhere(module, root)]
     return [
-        f"{module} is loaded from {folder_of(module)}, not from {root}; rename what lies there, or work in another folder"
+        f"{module} is loaded from {folder_of(module)}, not from {root}; rename that file or folder, or work in another folder"
         for module, root in wrong
     ]
 

@@ -1,4 +1,4 @@
-"""What `noiseflow sample` does to arrays: pieces that fit memory, number types, and what a user had better know."""
+"""Array handling of `noiseflow sample`: pieces that fit in memory, data types, and warnings."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ if TYPE_CHECKING:
 
 DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
 _PIECE = 2**20  # pixels sampled at once
-_FEW = 0.01  # of the pixels, which noise alone may take outside
+_FEW = 0.01  # share of the pixels that may lie outside the range because of noise alone
 
 
 def check_dtype(dtype: str) -> None:
-    """Refuse a number type that is not among `DTYPES`.
+    """Check that a data type is one of `DTYPES`.
 
     Raises:
-        ValueError: it is not.
+        ValueError: it is not one of them.
     """
     if dtype not in DTYPES:
         raise ValueError(f"--dtype {dtype} is unknown; choose {', '.join(DTYPES)}")
 
 
 def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
-    """The pixels in parts of at most a million; whole images where the model looks beyond single pixels.
+    """Split the pixels into parts of about a million; whole images if the model needs images.
 
     Raises:
-        ValueError: an image is needed and there is none.
+        ValueError: the model needs images and the signal has fewer than two axes.
     """
     if not noise_model.needs_image:
         return list(torch.split(signal.reshape(-1), _PIECE))
     if signal.ndim < 2:
         raise ValueError(
-            f"{type(noise_model).__name__} takes images, and the clean file has {signal.ndim} axis; give (y, x)"
+            f"{type(noise_model).__name__} needs images, and the clean file has {signal.ndim} axis; give axes (y, x)"
         )
     images = signal.reshape(-1, *signal.shape[-2:])
     return list(torch.split(images, max(1, _PIECE // images[0].numel())))
 
 
 def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress: Progress) -> Tensor:
-    """Noisy pixels of all parts, one after the other."""
+    """Draw noisy pixels for all parts and concatenate them."""
     generator, drawn = torch.Generator(noise_model.device).manual_seed(seed), []
     for part in parts:
         drawn.append(noise_model(part.to(noise_model.device)).sample(generator=generator).cpu())
@@ -55,7 +55,7 @@ def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress
 
 
 def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
-    """The numbers of a file and its voxel size; from one ``.npy`` file to another there may be any number of axes.
+    """Read the values of a file and its voxel size. Any number of axes is allowed from one ``.npy`` file to another.
 
     Raises:
         ValueError: as `noiseflow.io.read`.
@@ -65,7 +65,7 @@ def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
     if path.suffix.lower() == output.suffix.lower() == ".npy" and path.is_file():
         try:
             data = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OSError, EOFError):  # a damaged file, of which io.read says what is wrong
+        except (ValueError, OSError, EOFError):  # a damaged file; io.read reports what is wrong
             data = None
         if data is not None and data.ndim > 3 and data.dtype.kind in "buif":
             return data, None
@@ -74,11 +74,13 @@ def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
 
 
 def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_model: NoiseModelBase) -> NDArray[Any]:
-    """The noisy values in the number type asked for; `auto` keeps the clean file's or, where the model rounds to whole numbers,
-    takes the first of uint16, int16 and int32 that holds them.
+    """Convert the noisy values to the requested data type.
+
+    `auto` keeps the integer type of the clean file if it holds the values. Otherwise it takes the first of uint16, int16
+    and int32 that holds them if the model rounds to whole numbers, and float32 if it does not.
 
     Raises:
-        ValueError: integers that some values are not, or that cannot hold them.
+        ValueError: an integer type was requested and some values are not whole or out of its range.
     """
     if dtype in ("float32", "float64"):
         return noisy.astype(dtype)
@@ -98,7 +100,7 @@ def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_m
 
 
 def notes(noise_model: NoiseModelBase, data: NDArray[Any]) -> list[str]:
-    """What a user had better know of clean pixels that the model does not cover."""
+    """Warnings about clean pixels outside the range of the model."""
     found = []
     if noise_model.fitted_range is not None:
         low, high = noise_model.fitted_range
@@ -106,13 +108,13 @@ def notes(noise_model: NoiseModelBase, data: NDArray[Any]) -> list[str]:
         if outside > _FEW:
             found.append(
                 f"{outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
-                "they get the noise of the nearest end"
+                "their noise is that at the nearest end of this range"
             )
     for limit, beyond in ((noise_model.low, data < noise_model.low), (noise_model.high, data > noise_model.high)):
         share = float(beyond.mean())
         if share > _FEW:
             found.append(
-                f"{share:.0%} of the clean pixels lie beyond the clipping limit {limit:g} of the model, where its images are "
+                f"{share:.0%} of the clean pixels lie beyond the clipping limit {limit:g} of the model, where its output is "
                 f"constant; is the clean image in {noise_model.measured_in}?"
             )
     return found

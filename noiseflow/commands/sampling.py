@@ -79,14 +79,14 @@ def evaluate(
         bool,
         typer.Option(
             "--baselines",
-            help="Fit Gaussian and Poisson models to one half of the pixels, and judge all models on the other.",
+            help="Fit Gaussian and Poisson models to one half of the pixels, and evaluate all models on the other half.",
         ),
     ] = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
 ) -> None:
-    """Judge a noise model on pairs of clean and noisy images: likelihood and divergences, each beside its floor."""
+    """Evaluate a noise model on pairs of clean and noisy images: likelihood and divergences, each with its noise floor."""
     import numpy as np
     import torch
 
@@ -100,7 +100,7 @@ def evaluate(
     pairs = _read_pairs(signal, observation)
     clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
     if baselines:
-        # NumPy's stream, not torch's: noise that `sample` drew with the same seed must not decide which pixels judge
+        # NumPy's generator, not torch's: the split must not depend on noise that `sample` drew with the same seed
         half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
         with step_report(json_mode=json) as report:
@@ -164,10 +164,12 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
             io.require_finite(data, path)
         if clean.shape != noisy.shape:
             raise ValueError(
-                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal sizes"
+                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal shapes"
             )
         if np.array_equal(clean, noisy):
-            raise ValueError(f"{paths[0]} and {paths[1]} hold the same pixels; give the noisy image as --observation")
+            raise ValueError(
+                f"{paths[0]} and {paths[1]} contain the same pixel values; give the noisy image as --observation"
+            )
         pairs.append((_tensor(clean), _tensor(noisy)))
     return pairs
 

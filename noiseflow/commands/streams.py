@@ -1,4 +1,4 @@
-"""Console output that cannot fail: a closed terminal, a reader that has gone or a narrow encoding never decides what is saved."""
+"""Console output that never raises: a closed terminal or pipe, or a limited encoding, must not affect the saved files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 
 class SteadyStream:
-    """A text stream whose writes never raise; what can no longer be shown is dropped.
+    """A text stream whose writes never raise. Text that cannot be written is dropped.
 
     Args:
-        stream: where text goes; None where there is none.
+        stream: the underlying stream, or None.
 
     Attributes:
-        error: why text was dropped, or None.
+        error: the error that caused text to be dropped, or None.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -28,7 +28,7 @@ class SteadyStream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write text; letters that the encoding does not have are escaped."""
+        """Write text; characters that the encoding lacks are escaped."""
         if self.error is None:
             try:
                 self._write(text)
@@ -37,7 +37,7 @@ class SteadyStream:
         return len(text)
 
     def flush(self) -> None:
-        """Pass on what is buffered."""
+        """Flush the underlying stream."""
         if self.error is None:
             try:
                 self._stream.flush()
@@ -52,7 +52,7 @@ class SteadyStream:
 
     def _drop(self, error: Exception) -> None:
         self.error = error
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # Python flushes once more at its end
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # Python flushes once more at exit
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
@@ -60,7 +60,7 @@ class SteadyStream:
 
 @contextlib.contextmanager
 def steady_streams() -> Iterator[SteadyStream]:
-    """Within the block, ``sys.stdout`` and ``sys.stderr`` never raise; yields the former."""
+    """Replace ``sys.stdout`` and ``sys.stderr`` within the block by streams that never raise; yield the former."""
     _open_standard_files()
     before = sys.stdout, sys.stderr
     out, err = (SteadyStream(stream) for stream in before)
@@ -74,7 +74,7 @@ def steady_streams() -> Iterator[SteadyStream]:
 
 
 def was_lost(stream: SteadyStream) -> str | None:
-    """Why output was lost that somebody waits for, or None; a reader that closed its pipe wanted no more."""
+    """Message about lost output, or None. A closed pipe is not reported, because its reader wanted no more."""
     error = stream.error
     if (
         error is None
@@ -83,11 +83,11 @@ def was_lost(stream: SteadyStream) -> str | None:
     ):
         return None
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return f"what was printed is lost ({reason.lower()}); all files are written"
+    return f"console output was lost ({reason.lower()}); all files are written"
 
 
 def _open_standard_files() -> None:
-    """Open closed standard files to nowhere: the next output file would take their number, and be printed into."""
+    """Open closed standard streams to the null device; otherwise the next output file would get their descriptor."""
     for number in range(3):
         try:
             os.fstat(number)

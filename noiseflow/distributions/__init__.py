@@ -1,4 +1,4 @@
-"""What noise models return, and the maps and laws these are built from."""
+"""Noise distributions that noise models return, and the transforms and densities they are built from."""
 
 import lazy_loader as _lazy
 

@@ -1,7 +1,7 @@
-"""How every noise distribution takes its arguments and gives its answers, whatever the subclass that computes them.
+"""Handling of arguments and results shared by all noise distributions.
 
-Number types, NaN and infinity, probabilities outside [0, 1] and shapes that do not fit are dealt with once, here. Large inputs
-are evaluated piece by piece, and where a gradient is asked for each piece is evaluated again in the backward pass.
+This module handles data types, NaN and infinity, probabilities outside [0, 1] and shapes that do not broadcast. Large inputs
+are evaluated in pieces; if a gradient is needed, each piece is evaluated again in the backward pass.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from noiseflow.distributions import automatic
 from noiseflow.distributions.pixels import broadcast_shapes, is_traced
 
 MOST = 2**18
-"""Pixels evaluated at once; a hundred float64 arrays of so many, as a flow's graph has, take 200 MB."""
+"""Pixels evaluated at once. The graph of a flow has about a hundred float64 arrays of this size, 200 MB."""
 
 Method = Callable[..., Tensor]
 
 
 def answering(cls: type) -> None:
-    """Let the methods that a class defines itself take and answer as described above."""
+    """Wrap the methods that a class defines so that they handle arguments and results as described above."""
     for name, wrap in _WRAPPERS.items():
         method = cls.__dict__.get(name)
         if callable(method) and not getattr(method, "__isabstractmethod__", False):
@@ -45,7 +45,7 @@ def _cast(getter: Callable[[Any], Tensor]) -> Callable[[Any], Tensor]:
 
 
 def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], torch.dtype]:
-    """Values as floating tensors of the working type or wider, and the type of the answer."""
+    """Values as floating-point tensors of the working type or wider, and the type of the result."""
     tensors = [
         v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=self.working_dtype, device=self.device) for v in values
     ]
@@ -123,7 +123,7 @@ def _quantile(method: Method, name: str) -> Method:
             outside = (tensor < 0) | (tensor > 1)
             if bool(outside.any()):
                 worst = float(tensor[outside].flatten()[0])
-                raise ValueError(f"icdf: {worst:g} is no probability; give values from 0 to 1")
+                raise ValueError(f"icdf: {worst:g} is not a probability; give values from 0 to 1")
         found = method(self, torch.where(inside, tensor, torch.full_like(tensor, 0.5)))
         low, high = (end.to(found) for end in self.limits)
         nothing = torch.full_like(found, math.nan)
@@ -163,7 +163,7 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
-    """From a table where there is an accurate one, else computed; what is light is computed faster than a table is made."""
+    """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
     if value.numel() >= automatic.LARGE and self.source is not None and not self.light:
         found = automatic.automatic_log_prob(self.source[0], self.source[1], value)
         if found is not None:
@@ -172,7 +172,7 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
 
 
 def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
-    """The method's answer for values (..., *batch), in pieces of bounded memory where there are many."""
+    """The method's result for values (..., *batch), in pieces of bounded memory if there are many."""
     shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
     if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]) or not self.splits:
         return method(self, *values)
@@ -183,9 +183,9 @@ def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
 
 
 def _again(method: Method, part: Any, *values: Tensor) -> Tensor:
-    """The answer for one piece; its graph is not kept but made again in the backward pass."""
+    """The result for one piece; its graph is not stored but rebuilt in the backward pass."""
 
-    def fresh(*some: Tensor) -> Tensor:  # what a distribution computes once and keeps belongs to one pass
+    def fresh(*some: Tensor) -> Tensor:  # values cached by a distribution belong to one pass
         return method(part.mapped(lambda tensor, rest: tensor, part.batch_shape), *some)
 
     if not torch.is_grad_enabled():

@@ -1,8 +1,8 @@
-"""Likelihoods and samples of large inputs from tables that the library keeps, where no gradient is asked for.
+"""Likelihoods and samples of large inputs from cached tables, used when no gradient is required.
 
-A table is found by the contents of the model's parameters (`fingerprint`), its number type and device, so that it cannot be
-stale however they were changed. It grows where signals leave it. Each pixel's error is bounded: nodes whose neighbourhood is too
-curved for linear interpolation are NaN, and pixels beside them, or beyond the table's edges, are evaluated exactly.
+The key of a table is a hash of the model's parameters (`fingerprint`), the data type and the device, so that it is never stale.
+A table is extended when signals leave its range. The error of each pixel is bounded: nodes where the function is too curved for
+linear interpolation are NaN, and pixels beside them or outside the table are evaluated exactly.
 """
 
 from __future__ import annotations
@@ -22,23 +22,26 @@ from noiseflow.distributions.tables import Table, Values
 from noiseflow.distributions.tabulated import RootScale
 
 LARGE = 2**18
-"""Inputs of at least so many pixels are tabulated where no gradient is asked for."""
+"""Smallest number of pixels for which a table is used, if no gradient is required."""
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096))
 TOLERANCE = 1e-3
-"""Largest interpolation error: nats of a log-likelihood, standard deviations of a sample."""
+"""Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
-_LATENT_LIMIT = 6.5  # standard normal: one draw in 10¹⁰ lies beyond, and is computed exactly
-_TAIL = 1e-6  # probability beyond the columns, each side, under the model
-_SAMPLE = 2**14  # pixels that judge a table before all are looked up
-_FEW, _MANY = 0.02, 0.3  # shares of pixels left to exact evaluation: good enough to stop refining, too many for a table
-_KEPT = 4  # tables of each model: number types, and likelihood and quantiles
+_LATENT_LIMIT = 6.5  # one standard normal draw in 10¹⁰ lies beyond and is computed exactly
+_TAIL = 1e-6  # probability outside the columns on each side, under the model
+_SAMPLE = 2**14  # pixels on which a table is checked before all are looked up
+_FEW, _MANY = (
+    0.02,
+    0.3,
+)  # shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
+_KEPT = 4  # tables kept per model, for different data types, likelihood and quantiles
 
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
 
 
 def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
-    """Whether a table may take the place of the exact likelihood: many pixels, no gradient asked for, the model allows it."""
+    """Whether a table may replace the exact likelihood: many pixels, no gradient required, and the model allows it."""
     if observation.numel() < LARGE or signal.shape != observation.shape or is_traced(observation):
         return False
     differentiable = torch.is_grad_enabled() and (
@@ -48,12 +51,12 @@ def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> boo
 
 
 def may_tabulate(noise_model: nn.Module) -> bool:
-    """Whether all parts of the model allow tables, and none looks beyond single pixels."""
+    """Whether all parts of the model allow tables and none needs images."""
     return all(getattr(module, "tabulate", True) for module in noise_model.modules()) and not needs_image(noise_model)
 
 
 def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
-    """`log_prob` from a table where the input is large enough and a table is accurate; else None."""
+    """`log_prob` from a table if the input is large enough and a table is accurate, otherwise None."""
     return log_prob(noise_model, signal, observation) if is_large(noise_model, signal, observation) else None
 
 
@@ -61,12 +64,12 @@ def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tens
 def log_prob(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE
 ) -> Tensor | None:
-    """Log-likelihood of many pixels to `tolerance` nats each, shaped like `observation`; None where no table is accurate.
+    """Log-likelihood of each pixel, accurate to `tolerance`, shaped like `observation`; None if no table is accurate.
 
     Args:
-        noise_model: the model.
+        noise_model: the noise model.
         signal, observation: equal shapes, detector units.
-        tolerance: bound of each pixel's interpolation error, nats.
+        tolerance: bound of the interpolation error of each pixel, nats.
     """
     kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
     s, o = signal.reshape(-1).to(kind), observation.reshape(-1).to(kind)
@@ -106,14 +109,14 @@ def log_prob(
 
 
 def _slack(noise_model: nn.Module, dtype: torch.dtype) -> float:
-    """How near to a clipping limit an observation is on it; see `DigitisedDistribution`."""
+    """Distance from a clipping limit within which an observation counts as clipped; see `DigitisedDistribution`."""
     limits = [abs(getattr(noise_model, name, 0.0)) for name in ("low", "high")]
     largest = max((limit for limit in limits if math.isfinite(limit)), default=0.0)
     return max(1e-3 * float(getattr(noise_model, "step", 0.0)), 8 * torch.finfo(dtype).eps * largest)
 
 
 def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit: float, found: Tensor) -> None:
-    """There the likelihood is a function of the signal alone."""
+    """Fill in the likelihood of clipped pixels, which depends on the signal alone."""
     if not (math.isfinite(limit) and on.numel()):
         return
     beside = table.beside(limit, lambda at: noise_model(at).log_prob(torch.full_like(at, limit)))
@@ -121,14 +124,14 @@ def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit
 
 
 def _without_limits(noise_model: nn.Module) -> tuple[nn.Module, float, float]:
-    """The model without clipping, whose likelihood is smooth, and the limits."""
+    """The model without clipping, whose likelihood is smooth, and its clipping limits."""
     low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
     free = noise_model.without_rails() if hasattr(noise_model, "without_rails") else noise_model  # type: ignore[operator]
     return free, low, high
 
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
-    """Range of residuals on the scale between far quantiles of the model."""
+    """Range of the residuals, on the scale, between extreme quantiles of the model."""
     signals = torch.linspace(scale.low, scale.high, 65, dtype=torch.float64).to(like)
     distribution = free(signals)
     tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
@@ -140,10 +143,10 @@ def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, 
 def sample(
     noise_model: nn.Module, signal: Tensor, generator: torch.Generator | None, *, tolerance: float = TOLERANCE
 ) -> Tensor | None:
-    """Draw one observation per pixel by a table of quantiles over (signal, normal latent); None where none is accurate.
+    """Draw one observation per pixel from a table of quantiles over (signal, normal latent); None if no table is accurate.
 
     Args:
-        noise_model: its distribution has ``from_latent``.
+        noise_model: noise model whose distribution has ``from_latent``.
         signal: any shape.
         generator: source of the random numbers.
         tolerance: bound of the interpolation error of each draw, in standard deviations of the noise.
@@ -186,7 +189,7 @@ def _table_of(
     place: Callable[[RootScale, Tensor], Tensor],
     unit: Values | None = None,
 ) -> Table | None:
-    """The kept table, grown to the signals, or a new one; None where none leaves few enough pixels to exact evaluation."""
+    """The cached table, extended to the signals, or a new one; None if too many pixels would need exact evaluation."""
     low, high = (float(bound) for bound in torch.aminmax(signal))
     if not math.isfinite(low + high):
         return None

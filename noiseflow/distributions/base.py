@@ -1,4 +1,4 @@
-"""The bases of all noise distributions, under one name."""
+"""Base classes of all noise distributions."""
 
 from noiseflow.distributions import divergence as divergence  # registers kl_divergence
 from noiseflow.distributions.latent import LatentDistribution as LatentDistribution

@@ -1,4 +1,4 @@
-"""Counts of a detector that is blind for a while after each event."""
+"""Distribution of the counts of a detector with dead time."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from noiseflow.distributions.textbook import PoissonDistribution
 
 
 class DeadTimeDistribution(PoissonDistribution):
-    """Counts in one exposure of a non-paralysable counter that was running before (a stationary renewal process).
+    """Counts in one exposure of a non-paralysable counter in its stationary state (a stationary renewal process).
 
-    With events at the rate λ and a dead time τ, the k-th count after one at time 0 comes at kτ plus a gamma variable of shape k;
+    With event rate λ and dead time τ, the k-th count after one at time 0 occurs at kτ plus a gamma variable of shape k;
     P(counts > k) = m·(M_k − M_{k+1}) with the mean m = λ/(1 + λτ) and M_k = E max(1 − time of k counts, 0)
-    (D. R. Cox, Renewal Theory, 1962, section 4.4). Beyond the mean M_k is used, below it E max(time − 1, 0), which differs by a
-    straight line in k, so that no digits cancel in either tail.
+    (D. R. Cox, Renewal Theory, 1962, section 4.4). Above the mean M_k is used; below it E max(time − 1, 0), which differs by a
+    linear function of k. This avoids cancellation in both tails.
 
     Args:
-        signal: expected counts, any shape; below 1/dead_time, which no rate exceeds.
-        dead_time: share of the exposure, a number from 0 to 1.
+        signal: expected counts, any shape; less than 1/dead_time, the upper bound at any event rate.
+        dead_time: dead time as a share of the exposure, from 0 to 1.
     """
 
     discrete: ClassVar[bool] = True
@@ -35,11 +35,11 @@ class DeadTimeDistribution(PoissonDistribution):
 
     @property
     def rate(self) -> Tensor:
-        """Expected counts, of which at most 1/dead_time fit into an exposure."""
+        """Expected counts, at most 1/dead_time."""
         return torch.minimum(self.signal.clamp(min=0), (1 - 1e-6) / self.dead_time.clamp(min=1e-12))
 
     def _excess(self, count: Tensor, *, early: bool) -> Tensor:
-        """E max(1 − t, 0) of the time t of `count` counts, or E max(t − 1, 0) where not `early`; float64."""
+        """E max(1 − t, 0), where t is the time of `count` counts, or E max(t − 1, 0) if not `early`; float64."""
         mean, dead_time = self.rate.double(), self.dead_time.double()
         events = mean / (1 - mean * dead_time)  # per exposure
         left = 1 - count * dead_time
@@ -75,7 +75,7 @@ class DeadTimeDistribution(PoissonDistribution):
         return torch.where(torch.isnan(mean), mean, log_mass).to(self.signal.dtype)
 
     def _none(self, mean: Tensor) -> Tensor:
-        """P(no count): alive at the start, or alive again after the rest of a dead time, and no event from there."""
+        """P(no count): no event after the start, or after the remainder of a dead time that began before it."""
         dead_time = self.dead_time.double()
         events = mean / (1 - mean * dead_time)
         return (1 - mean * dead_time) * torch.exp(-events * (1 - dead_time))
@@ -91,7 +91,7 @@ class DeadTimeDistribution(PoissonDistribution):
         return torch.where(torch.isnan(mean), mean, mass).to(self.signal.dtype)
 
     def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
-        """Counts event by event, in float64: a first wait from the stationary state, then dead time and wait in turn."""
+        """Simulate counts event by event in float64: a first wait from the stationary state, then dead time and wait in turn."""
         mean = self.rate.detach().double().expand(shape)
         dead_time = self.dead_time.detach().double()
         events = mean / (1 - mean * dead_time)
@@ -109,7 +109,7 @@ class DeadTimeDistribution(PoissonDistribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        """Whole numbers from 0."""
+        """Non-negative integers."""
         return Levels(1.0, 0.0, 0.0, math.inf)
 
     @property

@@ -15,13 +15,13 @@ from noiseflow.distributions.levels import Levels
 from noiseflow.distributions.numerical import as_noise_distribution
 from noiseflow.distributions.pixels import is_traced
 
-_SHARE_OF_STEP = 64  # a cell's edge may be rounded by so small a part of the step: 0.03 nats at the very most
-_ROUNDINGS = 8  # of the limit: an observation so near to it is on it
+_SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
+_ROUNDINGS = 8  # rounding errors of the limit within which an observation counts as clipped
 _MOST_LEVELS = 2**16
 
 
 class Converter(Protocol):
-    """What rounds to steps and clips at two limits, detector units."""
+    """An analogue-to-digital converter: rounds to steps and clips at two limits, detector units."""
 
     step: float
     low: float
@@ -29,15 +29,16 @@ class Converter(Protocol):
 
 
 class DigitisedDistribution(NoiseDistribution):
-    """A rounded and clipped distribution. ``log_prob`` is a log-mass on the clipping limits and, with a step, on every level.
+    """A rounded and clipped distribution.
 
-    With ``step = 0`` observations between the limits keep their log-density. A value between two levels gets the mass of a cell
-    centred on it; one beyond a limit by more than half a step is impossible: −inf.
+    ``log_prob`` is a log-probability at the clipping limits and, if the step is positive, at every level. With ``step = 0``,
+    observations between the limits have a log-density. A value between two levels gets the probability of a cell centred on it.
+    A value beyond a limit by more than half a step is impossible (−inf).
 
     Args:
-        detector: its step and clipping limits; the module itself where large inputs may be tabulated.
-        base: distribution before the converter; any torch distribution of one number per pixel.
-        signal: the signal, for the tables of large inputs; None for no tables.
+        detector: the step and the clipping limits; a module if large inputs may be tabulated.
+        base: distribution before the converter: any torch distribution of one number per pixel.
+        signal: the signal, for tables of large inputs; None to use no tables.
     """
 
     per_pixel = ("_signal",)
@@ -51,7 +52,7 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels may be evaluated apart."""
+        """Whether pixels can be evaluated independently."""
         return self.base.independent
 
     @property
@@ -59,7 +60,7 @@ class DigitisedDistribution(NoiseDistribution):
         return self.base.light
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
-        """An observation in a wider number type: one that is a limit in its own type is the limit in the wider one too."""
+        """Convert an observation to a wider data type; a value equal to a limit in its own type stays equal to it."""
         wider = value.to(dtype)
         if wider.dtype == value.dtype:
             return wider
@@ -78,12 +79,12 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
-        """Whether every observation has a mass."""
+        """Whether every observation has a probability rather than a density."""
         return self.step > 0 or self.base.discrete
 
     @property
     def has_rsample(self) -> bool:  # type: ignore[override]
-        """Whether draws have a derivative: those that are clipped alone."""
+        """Whether draws are differentiable: only if they are clipped and not rounded."""
         return self.step == 0 and self.base.has_rsample
 
     def rescaled(self, scale: Tensor, shift: Tensor) -> DigitisedDistribution:
@@ -97,11 +98,11 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def edges(self) -> tuple[float, float]:
-        """The undigitised values below which all is on the low limit, and above which all is on the high one."""
+        """The values before digitisation below which all are clipped to the low limit, and above which to the high one."""
         if self.step == 0:
             return self.low, self.high
         steps = (self.high - self._origin) / self.step
-        # where the high limit lies between two levels, only what rounds to the level above it is clipped
+        # if the high limit lies between two levels, only values that round to the level above it are clipped
         last = math.ceil(steps - 1e-3) - 1 if math.isfinite(steps) else steps
         return self.low + self.step / 2, self._origin + (last + 0.5) * self.step
 
@@ -112,7 +113,7 @@ class DigitisedDistribution(NoiseDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         value = self._fine(value)
         on_low, on_high, possible = self._places(value)
-        inside = value.clamp(self.low, self.high)  # what lies beyond a limit is not used, and must not spoil a gradient
+        inside = value.clamp(self.low, self.high)  # values beyond a limit are not used and must not affect the gradient
         found = self._masses(inside, on_low, on_high) if self.step > 0 else self._clipped(inside, on_low, on_high)
         return torch.where(possible, found, torch.full_like(found, -math.inf))
 
@@ -129,7 +130,7 @@ class DigitisedDistribution(NoiseDistribution):
             low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
             high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)
             return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
-        # the mass of a limit depends on the signal alone, so it has the batch's shape, which may be smaller than the values'
+        # the probability of a limit depends on the signal alone: it has the batch shape, not that of the values
         infinity = torch.full(self.batch_shape, math.inf, dtype=inside.dtype, device=inside.device)
         if math.isfinite(self.low):
             mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low))
@@ -140,14 +141,14 @@ class DigitisedDistribution(NoiseDistribution):
         return result
 
     def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether values are on the low limit, on the high one, and possible at all."""
+        """Whether values are at the low limit, at the high limit, and possible at all."""
         rounding = _ROUNDINGS * torch.finfo(value.dtype).eps
         slack = [max(self.step / 2, rounding * abs(limit)) for limit in (self.low, self.high)]
         possible = (value >= self.low - slack[0]) & (value <= self.high + slack[1])
         return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= self._top, possible
 
     def _fine(self, value: Tensor) -> Tensor:
-        """Values in double precision where single precision would move the edges of their cells."""
+        """Values in double precision if single precision would shift the edges of their cells."""
         if self.step == 0 or value.dtype == torch.float64:
             return value
         if not is_traced(value):
@@ -168,7 +169,7 @@ class DigitisedDistribution(NoiseDistribution):
         return self.base.cdf_below(torch.where(value > self.high, torch.full_like(edge, math.inf), edge))
 
     def _edge(self, value: Tensor) -> Tensor:
-        """The undigitised value below which everything is digitised to at most `value`."""
+        """The value before digitisation below which every value is digitised to at most `value`."""
         finite = torch.isfinite(value)
         safe = self._fine(torch.where(finite, value, torch.zeros_like(value)))
         edge = self._level(safe, torch.floor) + self.step / 2 if self.step > 0 else safe
@@ -178,18 +179,18 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def _top(self) -> float:
-        """What is on the high limit, though it may have been rounded in another number type."""
+        """The smallest value that counts as the high limit, allowing for rounding in another data type."""
         return self.high - 1e-3 * self.step if math.isfinite(self.high) else self.high
 
     def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
         steps = (value - self._origin) / self.step
         nearest = torch.round(steps)
-        on_level = (steps - nearest).abs() < 1e-3  # a level itself must not leave itself by rounding error
+        on_level = (steps - nearest).abs() < 1e-3  # rounding errors must not move a level to its neighbour
         level: Tensor = torch.where(on_level, nearest, rounding(steps))
         return level * self.step + self._origin
 
     def digitise(self, value: Tensor) -> Tensor:
-        """Round and clip undigitised values."""
+        """Round and clip values."""
         rounded = self._level(value, torch.round) if self.step > 0 else value
         return rounded.clamp(self.low, self.high)
 
@@ -207,7 +208,7 @@ class DigitisedDistribution(NoiseDistribution):
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
-        """The clipping limits, or those of the distribution before the converter where they are nearer."""
+        """The clipping limits, or the limits of the base distribution if they are narrower."""
         low, high = self.base.limits
         return self.digitise(low), self.digitise(high)
 
@@ -227,7 +228,7 @@ class DigitisedDistribution(NoiseDistribution):
         count = int(((last - first) / self.step).max().ceil()) + 1 if first.numel() else 1
         if count > _MOST_LEVELS:
             raise ValueError(
-                f"some pixels have {count} likely levels, more than {_MOST_LEVELS} that are added up; use a coarser step"
+                f"some pixels have {count} likely levels, more than the maximum of {_MOST_LEVELS}; use a coarser step"
             )
         steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
         nodes = torch.minimum(first + steps * self.step, last)

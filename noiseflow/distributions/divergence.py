@@ -11,16 +11,16 @@ from noiseflow.distributions.numerical import as_noise_distribution
 
 
 def _of_two(p: NoiseDistribution, q: NoiseDistribution) -> Tensor:
-    """E_p[log p − log q], nats, by the quadrature of `p`."""
+    """E_p[log p − log q], nats, by the quadrature rule of `p`."""
     if p.discrete != q.discrete:
         raise NotImplementedError(
-            f"{type(p).__name__} and {type(q).__name__}: one has masses and the other a density; wrap the latter in Digitised "
-            "with the rounding of the former"
+            f"{type(p).__name__} and {type(q).__name__}: one is discrete and the other continuous; wrap the "
+            "continuous one in Digitised with the rounding step of the discrete one"
         )
 
     def difference(observation: Tensor) -> Tensor:
         log_prob = p.log_prob(observation)
-        # what p never shows does not count, whatever q says of it
+        # observations that are impossible under p contribute nothing
         return torch.where(torch.isneginf(log_prob), torch.zeros_like(log_prob), log_prob - q.log_prob(observation))
 
     return p.cast(p.expectation(difference))

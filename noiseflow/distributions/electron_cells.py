@@ -1,12 +1,13 @@
-"""The mass of narrow cells under shot plus read noise, and its derivatives, in one pass over a dozen electrons.
+"""Probability of narrow cells under shot plus read noise, and its derivatives, in one pass over a dozen electrons.
 
-A cell of a converter is about as wide as the read noise or narrower. Its mass is the integral of the density by Gauss–Legendre's
-rule, and the density is a sum over the electrons k near the mode of their posterior. One loop over k serves all nodes. The
+A cell of a converter is about as wide as the read noise or narrower. Its probability is the integral of the density by the
+Gauss–Legendre rule, and the density is a sum over the electrons k near the mode of their posterior. One loop over k serves all
+nodes. The
 derivatives follow in closed form from the same sums: with p the density, M the mass between a and b, E the posterior mean,
 
     ∂M/∂a = −p(a),  ∂M/∂b = p(b),  ∂log M/∂rate = E[k]/rate − 1,  ∂M/∂read_noise = read_noise·(p′(b) − p′(a)),
 
-the last because a normal density obeys the heat equation.
+the last because a normal density satisfies the heat equation.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from noiseflow.distributions.electron_contour import positive_rate
 from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-WIDEST = 4.0  # read noises: beyond, exponents of the outer nodes would grow to e¹⁷ and the nodes to many
+WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷
 STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
 LEAST_READ_NOISE, MOST_READ_NOISE = (
     0.05,
@@ -32,13 +33,13 @@ LEAST_READ_NOISE, MOST_READ_NOISE = (
 
 @functools.cache
 def _nodes(count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Gauss–Legendre's nodes on [−1, 1], then both ends; the weights of the former, sum 1."""
+    """Gauss–Legendre nodes on [−1, 1] followed by both ends, and the weights of the former, with sum 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (*nodes.tolist(), -1.0, 1.0), tuple((weights / 2).tolist())
 
 
 def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """The likeliest electrons given that the residual is at the middle of a cell; 0 for unbounded cells."""
+    """The most probable number of electrons if the residual is at the middle of a cell; 0 for unbounded cells."""
     middle = ((low + high) / 2).detach()
     return lattice_mode(
         torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
@@ -55,12 +56,12 @@ def is_narrow(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise:
 def cell_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """log P(low < residual ≤ high) of narrow cells, and its derivatives with respect to all four arguments where asked for.
+    """log P(low < residual ≤ high) of narrow cells, and its derivatives with respect to all four arguments if requested.
 
     Args:
         low, high: (n,) observation − rate, electrons, float64.
         rate: (n,) expected electrons, float64.
-        mode: (n,) that of `posterior_mode`.
+        mode: (n,) electrons, from `posterior_mode`.
         read_noise: scalar, electrons, float64.
     """
     variance, sigma = read_noise**2, float(read_noise)
@@ -87,7 +88,7 @@ def cell_and_slopes(
     excess = (weight * scale[:inner] * first[:inner]).sum(0) / mass
     positive, safe = positive_rate(rate)
     of_rate = (mode - rate + excess) / safe
-    if not bool(positive.all()):  # the limit at no rate: what a first electron would add
+    if not bool(positive.all()):  # the limit at rate 0: the contribution of a first electron
         ahead = torch.exp(((2 * (gap + offset[:inner]) - 1) / (2 * variance)).clamp(max=60))
         of_rate = torch.where(positive, of_rate, (weight * scale[:inner] * ahead).sum(0) / mass - 1)
     of_noise = read_noise * (steepness[1] - steepness[0])
@@ -97,11 +98,11 @@ def cell_and_slopes(
 def _sums(
     gap: Tensor, offset: Tensor, mode: Tensor, rate: Tensor, variance: Tensor, reach: int, *, first: bool
 ) -> tuple[Tensor, Tensor]:
-    """Σ of the terms of all k, over that of the mode, and Σ of (k − mode) times them: (m, n) each.
+    """Sum over k of the terms relative to that of the mode, and sum of (k − mode) times the terms, (m, n) each.
 
     Args:
-        gap: (n,) distances of the cells' middles from the mode.
-        offset: (m, n) of the nodes from the middle.
+        gap: (n,) distance of each cell's middle from the mode.
+        offset: (m, n) distance of the nodes from the middle.
     """
     positive, safe = positive_rate(rate)
     inside = positive & (mode > 0)
@@ -131,7 +132,7 @@ def _nested(ratio: Tensor, factors: list[Tensor]) -> Tensor:
 
 
 def _nested_with_moment(ratio: Tensor, factors: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """That sum, and the sum of its terms times their numbers."""
+    """The sum of `_nested`, and the sum of its terms times their indices."""
     total, moment = torch.ones_like(ratio), torch.zeros_like(ratio)
     for factor in reversed(factors):
         moment.add_(total).mul_(ratio).mul_(factor)

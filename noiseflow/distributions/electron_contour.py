@@ -1,11 +1,11 @@
-"""The law of electrons plus read noise by its moment generating function: one short integral at any rate.
+"""The distribution of electrons plus read noise from its moment generating function: one short integral at any rate.
 
-The inversion integral of the moment generating function exp(K(s)), K(s) = rate·(eˢ − 1) + read_noise²·s²/2,
-along the vertical line through its saddle point. There its integrand is a bell without oscillation, which the trapezoidal rule
-integrates to rounding with a dozen nodes or two (the integral that Lugannani & Rice 1980, doi:10.2307/1426607, expand). Tail
-probabilities have a further factor 1/s; the line then keeps its distance from the pole at 0.
+The density is the inversion integral of the moment generating function exp(K(s)), K(s) = rate·(eˢ − 1) + read_noise²·s²/2,
+along the vertical line through its saddle point. There the integrand is bell-shaped and does not oscillate, so the trapezoidal
+rule integrates it to rounding error with 12 to 24 nodes (Lugannani & Rice 1980, doi:10.2307/1426607, expand the same integral).
+Tail probabilities have a further factor 1/s; the line then avoids the pole at 0.
 
-It serves wherever the law is smooth on the scale of an electron, and for the Poisson masses of large rates.
+It is used where the distribution is smooth on the scale of one electron, and for Poisson probabilities at large rates.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def positive_rate(rate: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def tilted_rate(rate: Tensor, exponent: Tensor) -> Tensor:
-    """rate·exp(exponent), where the product is representable though its factors need not be."""
+    """rate·exp(exponent), computed so that only the product must be representable."""
     positive, safe = positive_rate(rate)
     large = torch.exp(torch.log(safe) + torch.where(positive, exponent, torch.zeros_like(exponent)))
     return torch.where(positive, large, rate * torch.exp(exponent.clamp(max=60)))
 
 
 def poisson_normal_mode(observation: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
-    """The m that solves m + variance·log(m/rate) = observation: Wright's omega function, by Newton's method."""
+    """The solution m of m + variance·log(m/rate) = observation: the Wright omega function, by Newton's method."""
     positive, safe = positive_rate(rate)
     level = torch.log(safe) - torch.log(variance) + observation / variance
     level = torch.where(positive, level, torch.full_like(level, -1e3))
@@ -49,7 +49,7 @@ def poisson_normal_mode(observation: Tensor, rate: Tensor, variance: Tensor) -> 
 
 @torch.no_grad()
 def saddle_point(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """The s where the tilted law has its mean at the observation."""
+    """The s at which the mean of the exponentially tilted distribution is the observation."""
     variance = read_noise**2
     mode = poisson_normal_mode(rate + residual, rate, variance)
     _, safe = positive_rate(rate)
@@ -73,7 +73,7 @@ def log_contour_integral(
 
 
 class _Path:
-    """exp(K(s) − s·observation) along Re s = line: its logarithm at the real axis, and the rest at the nodes above it."""
+    """exp(K(s) − s·observation) along Re s = line: its logarithm on the real axis, and its ratio to that at the nodes."""
 
     def __init__(self, residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor) -> None:
         self._variance = variance = read_noise**2
@@ -88,12 +88,12 @@ class _Path:
             self._count = int((reach / self.spacing).max()) + 1 if reach.numel() else 0
 
     def nodes(self) -> Iterator[Tensor]:
-        """Im s of each node, of all pixels."""
+        """Im s of each node, for all pixels."""
         for node in range(1, self._count + 1):
             yield node * self.spacing
 
     def value(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Real and imaginary part, over the value at the real axis."""
+        """Real and imaginary part, relative to the value on the real axis."""
         size = torch.exp(-2 * self._tilted * torch.sin(t / 2) ** 2 - self._variance * t**2 / 2)
         phase = self._tilted * (torch.sin(t) - t) + t * self._drift
         return size * torch.cos(phase), size * torch.sin(phase)
@@ -113,7 +113,7 @@ def contour_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Te
 
 
 def is_smooth_cell(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """Where the integrals over a cell are a short contour's, boolean: neither wider than the noise nor far too steep."""
+    """Where a short contour integrates a cell accurately, boolean: cells not wider than the noise and not too steep."""
     steepness = saddle_point((low + high) / 2, rate, read_noise).abs()
     return (high - low).detach() <= torch.minimum(torch.sqrt(rate + read_noise**2), 4 / steepness).detach()
 
@@ -121,10 +121,10 @@ def is_smooth_cell(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
 def contour_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """`contour_log_interval`, and its derivatives with respect to all four arguments where asked for, at the same nodes.
+    """`contour_log_interval`, and its derivatives with respect to all four arguments if requested, at the same nodes.
 
-    With s = line + it and q = 2·sinh(s·half)/s the factor of a cell's mass, that of the density at the cell's upper and lower
-    end is exp(∓s·half), of the derivative by the rate q·(eˢ − 1), and by the read noise q·read_noise·s².
+    Let s = line + it. The factor of a cell's probability is q = 2·sinh(s·half)/s, that of the density at the cell's upper and
+    lower end exp(∓s·half), that of the derivative with respect to the rate q·(eˢ − 1), and to the read noise q·read_noise·s².
     """
     if not slopes:
         return contour_log_interval(low, high, rate, read_noise), ()
@@ -164,7 +164,7 @@ def _cell_at_zero(line: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def contour_log_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
-    """Without read noise the bell still ends before Im s = π where the rate is large; the pole becomes that of a comb."""
+    """log P(k beyond an integer) without read noise: at large rates the integrand still vanishes before Im s = π."""
     side = torch.where(upper, 1.0, -1.0).to(rate)
     least = 2 / torch.sqrt(torch.maximum(rate, edge)).detach()
     line = side * torch.maximum(side * torch.log(edge / rate).detach(), least)

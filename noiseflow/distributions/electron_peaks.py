@@ -1,7 +1,8 @@
-"""The mass of any cell under shot plus read noise where peaks of single electrons stand apart, and its derivatives.
+"""Probability of cells under shot plus read noise, with derivatives, where single-electron peaks are resolved.
 
-A sum over the few electrons k near the mode of their posterior: each gives its cell of a normal distribution, by the
-complementary error function. It serves the cells that are too wide or too steep for the rule of `electron_cells`.
+The probability is a sum over the few electrons k near the mode of their posterior. Each term is the probability of the cell under
+a normal distribution, computed with the complementary error function. This is used for cells that are too wide or too steep for
+the quadrature of `electron_cells`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from torch import Tensor
 from noiseflow.distributions.electron_contour import positive_rate
 from noiseflow.distributions.electron_terms import REACH, log_poisson
 
-WIDEST = 3.0  # electrons: the sum then has two dozen terms at the most
-_FARTHEST = 30.0  # read noises from the nearest electron: beyond, masses near e⁻⁴⁵⁰ would underflow
+WIDEST = 3.0  # electrons: the sum then has at most two dozen terms
+_FARTHEST = (
+    30.0  # distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
+)
 _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
 
 
@@ -28,7 +31,7 @@ def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noi
 def peaks_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """As `electron_cells.cell_and_slopes`, of cells that `is_near_peak` accepts."""
+    """As `electron_cells.cell_and_slopes`, for cells that `is_near_peak` accepts."""
     sigma = float(read_noise)
     half = (high - low) / 2
     gap = (low + high) / 2 - (mode - rate)
@@ -50,14 +53,14 @@ def peaks_and_slopes(
         return value, ()
     unit = 1 / (sigma * _SQRT_2PI * total)
     positive, safe = positive_rate(rate)
-    # without a rate there is no electron; the limit is what a first one would add
+    # at rate 0 the derivative is the contribution of a first electron
     of_rate = torch.where(positive, (mode - rate + moment / total) / safe, _cell(gap - 1, half, sigma) / total - 1)
     of_low, of_high = -at_low * unit, at_high * unit
     return value, (of_low, of_high, of_rate + of_low + of_high, stretch * unit)
 
 
 def _weights(mode: Tensor, rate: Tensor, reach: int) -> list[tuple[int, Tensor]]:
-    """Poisson masses of mode − reach … mode + reach electrons over that of the mode, with their numbers from the mode."""
+    """Poisson probabilities of mode − reach … mode + reach electrons relative to that of the mode, with k − mode."""
     _, safe = positive_rate(rate)
     up = down = torch.ones_like(mode)
     found = [(0, up)]
@@ -69,7 +72,7 @@ def _weights(mode: Tensor, rate: Tensor, reach: int) -> list[tuple[int, Tensor]]
 
 
 def _cell(apart: Tensor, half: Tensor, sigma: float) -> Tensor:
-    """Mass of a cell under a normal law, by the tail that keeps its digits; `apart` is its middle from the mean."""
+    """Probability of a cell under a normal distribution, from the more accurate tail; `apart` is middle − mean."""
     distance = apart.abs()
     near, far = (torch.erfc((distance + side * half) * (_SQRT_HALF / sigma)) for side in (-1, 1))
     return 0.5 * (near - far)

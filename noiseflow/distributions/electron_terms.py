@@ -1,4 +1,4 @@
-"""Poisson terms of the law of electrons plus read noise, and where the largest lies."""
+"""Poisson terms of the distribution of electrons plus read noise, and the position of the largest."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from torch import Tensor
 
 from noiseflow.distributions.electron_contour import poisson_normal_mode, positive_rate
 
-REACH = 6.5  # standard deviations of electrons that are summed: 1e-10 is left out, below the 3e-7 by which nodes of a cell err
+REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10, less than the quadrature error 3e-7
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
-    """log P(k = count): Stirling's leading terms are paired with the rate so that nothing large cancels."""
+    """log P(k = count), with the leading terms of Stirling's formula paired with the rate to avoid cancellation."""
     positive, safe = positive_rate(rate)
     shifted = count + 0.5
     u = (shifted - safe) / safe
-    at = count.clamp(max=1e7)  # beyond, the remainder changes by less than 1e-8
+    at = count.clamp(max=1e7)  # above this, the remainder changes by less than 1e-8
     remainder = torch.lgamma(at + 1) - (at + 0.5) * (torch.log(at + 0.5) - 1)
     deviance = safe * ((1 + u) * torch.log1p(u) - u)
     none = torch.where(count > 0, torch.full_like(rate, -1e300), -rate)

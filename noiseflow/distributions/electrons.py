@@ -1,14 +1,14 @@
-"""The exact law of shot noise plus read noise, in electrons: k + read_noise·n with k Poisson and n standard normal.
+"""The exact distribution of shot plus read noise, in electrons: k + read_noise·n with k Poisson and n standard normal.
 
-Two representations share the work; both are exact to about 1e-8 nats at any rate, and neither grows with the rate.
+Two representations are used. Both are accurate to about 1e-8 nats, at a cost that does not grow with the rate.
 
-*Sum*, where the read noise is below 1.5 electrons: the sum over k. Given an observation, k has a posterior narrower than the
-read noise, so a dozen integers around its mode carry everything; neighbouring terms differ by a factor that needs no logarithm.
+*Sum*, if the read noise is below 1.5 electrons: the sum over k. Given an observation, the posterior of k is narrower than the
+read noise, so a dozen integers around its mode suffice. Neighbouring terms differ by a factor that needs no logarithm.
 
-*Contour*, above: the inversion integral of the moment generating function (`electron_contour`), a dozen nodes or two.
+*Contour*, above: the inversion integral of the moment generating function (`electron_contour`), 12 to 24 nodes.
 
-Everything is computed in float64, because the fraction of an electron matters at a million electrons. Where the numerical route
-has free choices (window, line), they are detached: the result does not depend on them, so neither does its gradient.
+All computations are in float64, because fractions of an electron matter at a million electrons. Free choices of the numerical
+method (window, line) are detached: the result does not depend on them, and neither does its gradient.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_pois
 from noiseflow.distributions.normal import log_normal_cdf, log_normal_interval
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-RESOLVED = 1.5  # electrons: a read noise below which the sum is taken
+RESOLVED = 1.5  # electrons: read noise below which the sum is used
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
 
@@ -63,13 +63,13 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
 
 
 def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """log P(beyond the observation), on the side away from the mean: above it for residuals > 0, else below it.
+    """Log-probability of the tail beyond the observation: above it for residuals > 0, otherwise below it.
 
     Args:
         residual: observation − rate, electrons, float64.
         rate: expected electrons, ≥ 0, float64.
         read_noise: electrons, float64.
-        twice: take the contour in any case, because the sum needs incomplete gamma functions, which have no second derivative.
+        twice: always use the contour, because the incomplete gamma functions of the sum have no second derivative.
     """
     upper = residual.detach() > 0
     if not twice and _most(read_noise) < RESOLVED:
@@ -87,7 +87,7 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
 
 
 def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
-    """``(log P(≤ observation), log P(> observation))``; infinite residuals allowed."""
+    """``(log P(≤ observation), log P(> observation))``; residuals may be infinite."""
     finite = torch.isfinite(residual)
     near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
     near = torch.where(finite, near, torch.full_like(near, -math.inf))
@@ -97,7 +97,7 @@ def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice:
 
 
 def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """log P(low < residual ≤ high); the bounds, observation − rate in electrons, may be infinite; `twice` as in `log_tail`."""
+    """log P(low < residual ≤ high). The bounds (observation − rate, electrons) may be infinite; `twice` as in `log_tail`."""
     width = high - low
     if _most(read_noise) < RESOLVED:
         narrow = width.detach() <= 3
@@ -121,12 +121,12 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *,
 def interval_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """`log_interval`, several times faster where cells are narrow, and its derivatives with respect to all four arguments.
+    """`log_interval`, several times faster for narrow cells, with its derivatives with respect to all four arguments.
 
     Args:
         low, high, rate: (n,) or () electrons, float64.
         read_noise: scalar, electrons, float64.
-        slopes: whether the derivatives are wanted, shaped like the cells each.
+        slopes: whether to return the derivatives, each shaped like the cells.
     """
     if low.ndim == 0:
         value, parts = interval_and_slopes(low[None], high[None], rate[None], read_noise, slopes=slopes)
@@ -148,7 +148,7 @@ def interval_and_slopes(
                 out[left[here]] = part
             left, cells = left[~here], tuple(each[~here] for each in cells)  # type: ignore[assignment]
     empty = ~torch.isfinite(found[0])
-    if bool(empty.any()):  # a fast way underflows far from any electron, where the general one does not
+    if bool(empty.any()):  # far from any electron the fast methods underflow; the general one does not
         value, parts = _slowly(low[empty], high[empty], rate[empty], read_noise, slopes=slopes)
         for out, part in zip(found, (value, *parts), strict=True):
             out[empty] = part
@@ -156,7 +156,7 @@ def interval_and_slopes(
 
 
 def _ways(read_noise: float) -> list[tuple[Callable[..., Tensor], Callable[..., Any]]]:
-    """Which cells suit a way to compute them, and that way: the fastest first, and last one that suits all."""
+    """Pairs of a predicate for cells and a method for them: the fastest first, and last the one valid for all cells."""
     everything = (_always, _without_mode(_slowly))
     smooth = (_without_mode(is_smooth_cell), _without_mode(contour_and_slopes))
     if read_noise > MOST_READ_NOISE:
@@ -188,7 +188,7 @@ def _slowly(
     with torch.enable_grad():
         noise = read_noise.expand_as(low).clone()
         at = [each.detach().clone().requires_grad_() for each in (low, high, rate, noise)]
-        # a copy of the read noise for each pixel has a slope of its own
+        # one copy of the read noise per pixel, so that each has its own derivative
         value = log_interval(*at)
         found = torch.autograd.grad(value.sum(), at)
     return value.detach(), found
@@ -297,7 +297,7 @@ def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Te
 def _log_gamma_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
     mass = torch.where(upper, torch.special.gammainc(edge, rate), torch.special.gammaincc(edge, rate))
     shown = mass > 1e-290
-    # so far out the masses fall geometrically from the edge
+    # this far out the probabilities decrease geometrically from the edge
     last = torch.where(upper, edge, edge - 1)
     ratio = torch.where(upper, rate / (edge + 1), last / rate).clamp(max=0.5)
     beyond = log_poisson(last, rate) - torch.log1p(-ratio)

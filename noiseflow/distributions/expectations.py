@@ -1,4 +1,4 @@
-"""Expectations under a noise distribution by quadrature: nodes on panels, the mode, relative entropy."""
+"""Quadrature under a noise distribution: nodes on panels, and the mode."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 _NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
-_REFINEMENTS, _FINER = 3, 17  # of the mode: each time, 16 times finer between the neighbours of the best node
+_REFINEMENTS, _FINER = 3, 17  # for the mode: each refinement divides the interval around the best node by 16
 
 
 def panels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Gauss–Legendre's nodes and weights (4·count, *shape) on equal panels between two bounds of any shape."""
+    """Gauss–Legendre nodes and weights (4·count, *shape) on equal panels between two bounds of any shape."""
     ones = (1,) * low.ndim
     start = torch.arange(count, dtype=low.dtype, device=low.device).view(-1, 1, *ones)
     places = low.new_tensor(_NODES).view(1, -1, *ones)
@@ -24,7 +24,7 @@ def panels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def mode_of(distribution: Any) -> Tensor:
-    """The likeliest observation: the best node of the quadrature, refined where observations are continuous."""
+    """The mode: the best node of the quadrature, refined if observations are continuous."""
     nodes = torch.sort(distribution.quadrature()[0], 0).values
     best = distribution.log_prob(nodes).argmax(0, keepdim=True)
     if distribution.discrete:

@@ -1,4 +1,4 @@
-"""What identifies a model's numbers: a hash of their contents, which no way of changing them can pass by."""
+"""A hash that identifies the parameters of a model by their contents, however they were changed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PLAIN = (bool, int, float, str, type(None))
 
 @torch.no_grad()
 def fingerprint(model: nn.Module) -> str:
-    """A hash of all parameters, buffers, their number types and devices, and the plain settings of all modules inside."""
+    """Hash all parameters and buffers with their data types and devices, and the plain settings of all submodules."""
     digest = hashlib.blake2b(digest_size=16)
     for name, tensor in (*model.named_parameters(), *model.named_buffers()):
         digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}{tensor.device}".encode())

@@ -22,7 +22,7 @@ class LatentDistribution(NoiseDistribution):
 
     @abstractmethod
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """The latent of an observation and the log-derivative, ``(z, log dz/do)``."""
+        """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
 
     @abstractmethod
     def from_latent(self, latent: Tensor) -> Tensor:
@@ -39,8 +39,8 @@ class LatentDistribution(NoiseDistribution):
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)
         mass = log_normal_interval(bottom, top)
-        # the difference of latents keeps few digits in a narrow cell; there the slopes at its ends give the width, unless they
-        # differ by more than is lost, as about the cusp of a radial layer
+        # in a narrow cell the difference of latents loses digits; the slopes at its ends then give the width, unless they
+        # differ by more than is lost, as near the cusp of a radial layer
         middle, finite = (bottom + top) / 2, torch.isfinite(bottom) & torch.isfinite(top)
         width, eps = top - bottom, torch.finfo(bottom.dtype).eps
         alike = (slope_above - slope_below).abs() * width <= _ROUNDINGS * eps * (1 + middle.abs())

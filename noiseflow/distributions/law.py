@@ -1,4 +1,4 @@
-"""What a noise model returns: a distribution of one observation per pixel, given that pixel's signal."""
+"""The distribution that a noise model returns: one observation per pixel, given the signal."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from noiseflow.distributions.answers import answering
 from noiseflow.distributions.expectations import mode_of, panels
 from noiseflow.distributions.pixels import Pixels, Taking, broadcast_shapes
 
-# Of the default quadrature. Beyond the quantiles of this probability lie 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats of an entropy. The 13
-# standard deviations between them are cut into fortieths, four nodes each, so that at 100 electrons, where a deviation is 10
-# electrons, peaks of single electrons are resolved down to a read noise of 0.15.
+# Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
+# deviations between them have 40 panels of four nodes each per standard deviation. At 100 electrons (standard deviation 10),
+# this resolves single-electron peaks down to a read noise of 0.15 electrons.
 _PANELS, _TAIL = 512, 1e-10
 
 
 class NoiseDistribution(Pixels, Distribution):
-    """p(observation | signal), one observation per pixel: ``batch_shape`` is the signal's, ``event_shape`` is ().
+    """p(observation | signal), one observation per pixel. ``batch_shape`` is the shape of the signal, ``event_shape`` is ().
 
-    A subclass writes the mathematics: `log_prob`, `log_interval_prob`, `cdf`, `icdf` and `sample`, and `mean`, `variance` where
-    they have a closed form. What it writes answers like every other noise distribution: numbers and tensors of any real type are
-    taken, half precision is computed in single precision, the answer has the type that signal and observation promote to, NaN
-    gives NaN, an infinite observation has log-density −inf, large inputs are evaluated in pieces of bounded memory.
+    A subclass implements `log_prob`, `log_interval_prob`, `cdf`, `icdf` and `sample`, and `mean` and `variance` if they have a
+    closed form. The base class adds the common behaviour: arguments may be numbers or tensors of any real type, half precision
+    is computed in single precision, and the result has the type that signal and observation promote to. NaN gives NaN, and an
+    infinite observation has log-density −inf. Large inputs are evaluated in pieces of bounded memory.
 
     Args:
-        shape: batch shape, that of the signal.
-        like: a tensor with the number type and device of the answers: the signal.
+        shape: batch shape, the shape of the signal.
+        like: a tensor with the data type and device of the results, usually the signal.
     """
 
     has_rsample: ClassVar[bool] = True  # type: ignore[misc]
@@ -48,7 +48,7 @@ class NoiseDistribution(Pixels, Distribution):
 
     @abstractmethod
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density in nats per detector unit; of a digitised model, log-mass."""
+        """Log-density in nats per detector unit; log-probability of the value for a digitised model."""
 
     @abstractmethod
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
@@ -59,24 +59,24 @@ class NoiseDistribution(Pixels, Distribution):
         """P(observation ≤ value)."""
 
     def cdf_below(self, value: Tensor) -> Tensor:
-        """P(observation < value); differs from `cdf` only where single values have mass."""
+        """P(observation < value); differs from `cdf` only if single values have positive probability."""
         return self.cdf(value)
 
     @abstractmethod
     def icdf(self, value: Tensor) -> Tensor:
-        """The quantile: smallest observation whose CDF reaches `value`."""
+        """Quantile: the smallest observation whose CDF reaches `value`."""
 
     @abstractmethod
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Draw observations, ``(*sample_shape, *batch_shape)``."""
 
     def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        """Draw observations that are differentiable, once, in signal and parameters.
+        """Draw observations that are differentiable (first order) with respect to signal and parameters.
 
-        The draw stays at its place in the CDF: do/dθ = −(∂F/∂θ)/p (Figurnov et al. 2018, arXiv:1805.08498).
+        The derivative keeps the CDF of the draw constant: do/dθ = −(∂F/∂θ)/p (Figurnov et al. 2018, arXiv:1805.08498).
 
         Raises:
-            NotImplementedError: single values have mass, so that a draw cannot move with a parameter.
+            NotImplementedError: the observations are discrete, so that draws have no derivative.
         """
         if not self.has_rsample:
             raise NotImplementedError(
@@ -87,52 +87,52 @@ class NoiseDistribution(Pixels, Distribution):
         return drawn - (missing - missing.detach()) / slope.detach()
 
     def _place(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """The place of an observation in the distribution and its derivative, for `rsample`."""
+        """The position of an observation in the distribution and its derivative, for `rsample`."""
         return self.cdf(value), torch.exp(self.log_prob(value))
 
     def rescaled(self, scale: Tensor, shift: Tensor) -> NoiseDistribution:
-        """The distribution of scale·o + shift; a digitised one rounds and clips after that. Both broadcast with the batch."""
+        """The distribution of scale·o + shift, before any rounding and clipping. Both broadcast with the batch."""
         return RescaledDistribution(self, scale, shift)
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
-        """The least and the greatest possible observation, which may be infinite."""
+        """The smallest and the largest possible observation, which may be infinite."""
         infinity = torch.full((), math.inf, dtype=self.working_dtype, device=self.device)
         return -infinity, infinity
 
     @property
     def support(self) -> constraints.Constraint:
-        """Which observations are possible."""
+        """The possible observations."""
         return constraints.real
 
     @property
     def mode(self) -> Tensor:
-        """The likeliest observation, to 1/1000 of the spacing of the quadrature's nodes."""
+        """The most probable observation, accurate to 1/1000 of the spacing of the quadrature nodes."""
         return self.cast(mode_of(self))
 
     def entropy(self) -> Tensor:
-        """−E[log p], nats, by quadrature; the integral is over the density between clipping limits and a sum over masses."""
+        """Entropy −E[log p], nats, by quadrature: an integral over the density plus a sum over discrete values."""
         return self.cast(-self.expectation(self.log_prob))
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature, shape of the batch; the function takes observations ``(Q, *batch)``."""
         nodes, weights = self.quadrature()
-        values = function(nodes)  # infinite at impossible ones
+        values = function(nodes)  # infinite at impossible observations
         return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
 
     @property
     def mean(self) -> Tensor:
-        """Mean of each pixel's observations; by quadrature where a subclass knows no better."""
+        """Mean of the observations of each pixel; by quadrature unless a subclass has a closed form."""
         return self.cast(self.expectation(lambda observation: observation))
 
     @property
     def variance(self) -> Tensor:
-        """Variance of each pixel's observations; by quadrature where a subclass knows no better."""
+        """Variance of the observations of each pixel; by quadrature unless a subclass has a closed form."""
         mean = self.expectation(lambda observation: observation)
         return self.cast(self.expectation(lambda observation: (observation - mean) ** 2))
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        """Nodes and weights ``(Q, *batch)`` of expectations: Gauss–Legendre's rule on panels between far quantiles."""
+        """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""
         ends = (
             self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())),
             self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)),
@@ -149,7 +149,7 @@ class NoiseDistribution(Pixels, Distribution):
 def bisect_quantile(
     distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 60
 ) -> Tensor:
-    """The quantile by bisection between bounds that bracket it, for distributions without a closed form."""
+    """Quantile by bisection between bounds that bracket it, for distributions without a closed form."""
     with torch.no_grad():
         low, high = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
         for _ in range(num_steps):
@@ -164,7 +164,7 @@ class RescaledDistribution(NoiseDistribution):
 
     Args:
         base: distribution of o.
-        scale, shift: positive numbers and numbers that broadcast with the batch of `base`; new axes may only lead.
+        scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
     """
 
     def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
@@ -174,17 +174,17 @@ class RescaledDistribution(NoiseDistribution):
 
     @property
     def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels may be evaluated apart."""
+        """Whether pixels can be evaluated independently."""
         return self.base.independent
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
-        """Whether every observation has a mass."""
+        """Whether every observation has a probability rather than a density."""
         return self.base.discrete
 
     @property
     def has_rsample(self) -> bool:  # type: ignore[override]
-        """Whether draws have a derivative."""
+        """Whether draws are differentiable."""
         return self.base.has_rsample
 
     @property

@@ -1,4 +1,4 @@
-"""Observations that have masses: which there are, and the mass of several."""
+"""Levels of discrete observations, and the probability of ranges of them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-_FEW = 8  # levels whose masses are added one by one, exactly however small
+_FEW = 8  # up to this number of levels, probabilities are added one by one, which is exact even if they are tiny
 
 
 class Levels(constraints.Constraint):
-    """Whole multiples of a step above an origin, between two limits, which are levels themselves.
+    """Constraint to levels: multiples of a step from an origin, between two limits, which are levels too.
 
     Args:
         step: spacing, detector units.
         origin: one of the levels.
-        low, high: the least and the greatest.
+        low, high: the smallest and the largest level.
     """
 
     is_discrete = True
@@ -30,7 +30,7 @@ class Levels(constraints.Constraint):
         return f"Levels(step={self.step:g}, low={self.lower_bound:g}, high={self.upper_bound:g})"
 
     def check(self, value: Tensor) -> Tensor:
-        """Where values are possible, boolean."""
+        """Which values are levels, boolean."""
         steps = (value - self.origin) / self.step
         on_level = (steps - torch.round(steps)).abs() < 1e-3
         at_limit = (value == self.lower_bound) | (value == self.upper_bound)
@@ -38,11 +38,11 @@ class Levels(constraints.Constraint):
 
 
 def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:
-    """log P(low < k ≤ high) of whole numbers; the bounds are whole or infinite.
+    """log P(low < k ≤ high) for integers k; the bounds are integers or infinite.
 
     Args:
-        distribution: has ``log_masses(count)``, and ``masses_up_to(count, beyond=…)`` for either tail.
-        low, high: broadcast with its batch.
+        distribution: has ``log_masses(count)``, and ``masses_up_to(count, beyond=…)`` for both tails.
+        low, high: bounds that broadcast with the batch of the distribution.
     """
     few = (high - low <= _FEW) & torch.isfinite(low) & torch.isfinite(high)
     start = torch.where(few, low, torch.zeros_like(low))
@@ -52,7 +52,7 @@ def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:
         parts.append(torch.where(start + step <= high, mass, torch.full_like(mass, -math.inf)))
     summed = log_sum(torch.stack(parts))
     lower, upper = ([distribution.masses_up_to(bound, beyond=b) for bound in (low, high)] for b in (False, True))
-    # the smaller of the two tails keeps its digits
+    # use the smaller tail, which is the more accurate one
     many = torch.where(lower[0] < 0.5, lower[1] - lower[0], upper[0] - upper[1]).clamp(min=0)
     positive = many > 0
     log_many = torch.where(positive, torch.log(torch.where(positive, many, torch.ones_like(many))), -math.inf)

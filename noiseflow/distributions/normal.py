@@ -1,4 +1,4 @@
-"""The standard normal law far into its tails: CDF, intervals, hazard and expectations."""
+"""The standard normal distribution, accurate in its tails: CDF, intervals, hazard and expectations."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 def normal_quadrature(
     dtype: torch.dtype, device: torch.device | str = "cpu", *, limit: float = 12.0, count: int = 401
 ) -> tuple[Tensor, Tensor]:
-    """Nodes and weights (Q,) of the trapezoidal rule for a standard normal expectation.
+    """Nodes and weights (Q,) of the trapezoidal rule for expectations under a standard normal.
 
-    The rule converges geometrically for smooth functions and stays accurate at the kinks of splines and radial layers, where
-    Gauss–Hermite does not.
+    The rule converges geometrically for smooth functions. Unlike Gauss–Hermite quadrature, it stays accurate at the kinks of
+    splines and radial layers.
     """
     nodes = torch.linspace(-limit, limit, count, dtype=torch.float64, device=device)
     weights = torch.exp(-0.5 * nodes * nodes)
@@ -28,7 +28,7 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     """log[Φ(high) − Φ(low)] for low ≤ high, without cancellation in the tails or in narrow intervals.
 
     Args:
-        low, high: bounds in units of the standard normal; ``-inf`` and ``inf`` allowed.
+        low, high: bounds in units of the standard normal; may be ``-inf`` and ``inf``.
     """
     flip = low > -high  # an interval right of zero is its mirror image left of zero
     low, high = torch.where(flip, -high, low), torch.where(flip, -low, high)
@@ -36,7 +36,7 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     middle = low + width / 2
     narrow = width * (1 + middle.abs()) < 0.1
     zero = torch.zeros_like(low)
-    # narrow: the mean of the normal density over the interval, to fourth order in its width
+    # narrow intervals: mean of the normal density over the interval, to fourth order in its width
     w, m = torch.where(narrow, width, zero + 1), torch.where(narrow, middle, zero)
     log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - _LOG_SQRT_2PI
     log_narrow = log_narrow + torch.log1p(w * w * (m * m - 1) / 24)
@@ -59,7 +59,7 @@ def _log_wide_interval(low: Tensor, high: Tensor) -> Tensor:
 
 
 def log_normal_cdf(x: Tensor) -> Tensor:
-    """log Φ(x), with a gradient that holds far into both tails; torch's own fails beyond about −10⁸."""
+    """log Φ(x), with a gradient that is accurate far into both tails; that of torch fails below about −10⁸."""
     found: Tensor = _LogCdf.apply(x)  # type: ignore[no-untyped-call]
     return found
 
@@ -72,7 +72,7 @@ def normal_hazard(x: Tensor) -> Tensor:
 
 
 class _Hazard(torch.autograd.Function):
-    """`normal_hazard` h, whose derivative is −h·(x + h): torch has none for erfcx."""
+    """`normal_hazard` h with its derivative −h·(x + h), because torch has no derivative of erfcx."""
 
     generate_vmap_rule = True
 
@@ -96,13 +96,13 @@ class _Hazard(torch.autograd.Function):
 
 def _hazard_slope(x: Tensor) -> Tensor:
     hazard = normal_hazard(x)
-    # far left x + h tends to −1/x, and the sum keeps no digits
+    # far left, x + h tends to −1/x and the sum cancels
     far = x < -1e4
     return -hazard * torch.where(far, -1 / torch.where(far, x, -torch.ones_like(x)), x + hazard)
 
 
 def hazard_of(x: Tensor) -> Tensor:
-    """`normal_hazard`, differentiable once more."""
+    """`normal_hazard`, differentiable."""
     found: Tensor = _Hazard.apply(x)  # type: ignore[no-untyped-call]
     return found
 
@@ -138,7 +138,7 @@ class _LogRatio(torch.autograd.Function):
 
     @staticmethod
     def forward(low: Tensor, high: Tensor) -> Tensor:
-        # left of zero Φ(x) = exp(−x²/2)·erfcx(−x/√2)/2, and the difference of the squares is a product
+        # for x < 0, Φ(x) = exp(−x²/2)·erfcx(−x/√2)/2, and the difference of squares is computed as a product
         a, b = (-end.clamp(max=0) / math.sqrt(2) for end in (low, high))
         left = (b - a) * (a + b) + torch.log(torch.special.erfcx(a) / torch.special.erfcx(b))
         return torch.where(high <= 0, left, torch.special.log_ndtr(low) - torch.special.log_ndtr(high))

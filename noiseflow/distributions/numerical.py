@@ -1,4 +1,4 @@
-"""Any torch distribution of one number per pixel as a noise distribution: what it lacks is computed by quadrature."""
+"""Wraps any univariate torch distribution as a noise distribution; missing methods are computed by quadrature."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.levels import between, log_sum
 from noiseflow.distributions.pixels import is_traced
 
-_PANELS = 128  # of four nodes each, on a scale that is linear within a standard deviation and logarithmic beyond
-_REACH = 12.0  # the scale's ends: sinh(12) = 81 000 standard deviations
-_CELL_PANELS = 2  # of an interval narrower than half a standard deviation
-_FAR, _MOST_LEVELS = 40, 2**16  # standard deviations whose whole numbers are added up, and how many of them at most
+_PANELS = 128  # of four nodes each, on a scale that is linear within one standard deviation and logarithmic beyond
+_REACH = 12.0  # ends of the scale: sinh(12) = 81 000 standard deviations
+_CELL_PANELS = 2  # for intervals narrower than half a standard deviation
+_FAR, _MOST_LEVELS = 40, 2**16  # integers within 40 standard deviations are summed, at most 2**16 of them
 
 
 def as_noise_distribution(distribution: Any, *, like: Tensor | None = None) -> NoiseDistribution:
-    """A distribution as it is, or a torch distribution with its CDF, quantiles and interval masses made numerically.
+    """Return a noise distribution unchanged; wrap a torch distribution so that CDF, quantiles and intervals are available.
 
     Args:
-        distribution: of one number per pixel.
-        like: the signal, whose number type a torch distribution's answers take; by default that of its mean.
+        distribution: distribution of one number per pixel.
+        like: the signal, whose data type the results of a torch distribution take; by default that of its mean.
 
     Raises:
-        TypeError: no distribution.
+        TypeError: the argument is not a distribution.
         ValueError: an event is more than one number.
     """
     if isinstance(distribution, NoiseDistribution):
@@ -48,7 +48,7 @@ def as_noise_distribution(distribution: Any, *, like: Tensor | None = None) -> N
 
 
 def _unchecked(distribution: Distribution) -> Distribution:
-    """A copy that answers outside its support too, where nothing of the answer is used."""
+    """A copy that does not raise outside its support; results there are not used."""
     other = copy.copy(distribution)
     other._validate_args = False
     if isinstance(getattr(other, "base_dist", None), Distribution):
@@ -57,16 +57,16 @@ def _unchecked(distribution: Distribution) -> Distribution:
 
 
 class NumericalDistribution(NoiseDistribution):
-    """A torch distribution with a CDF, quantiles and masses of intervals, by Gauss–Legendre's rule where it has none.
+    """A torch distribution with CDF, quantiles and interval probabilities, by Gauss–Legendre quadrature if it has none.
 
-    `error` states how far the CDF may be wrong. Densities should be smooth on the scale of a third of a standard deviation.
+    `error` is an estimate of the error of the CDF. Densities should be smooth on the scale of a third of a standard deviation.
 
     Args:
-        base: one number per pixel, continuous or of whole numbers.
-        like: the number type and device of the answers; by default those of the mean.
+        base: one number per pixel, continuous or integer.
+        like: a tensor with the data type and device of the results; by default the mean.
     """
 
-    independent = False  # an arbitrary torch distribution cannot be taken apart
+    independent = False  # an arbitrary torch distribution cannot be split into pixels
 
     def __init__(self, base: Distribution, *, like: Tensor | None = None) -> None:
         kind = base.mean if like is None else like
@@ -77,7 +77,7 @@ class NumericalDistribution(NoiseDistribution):
 
     @staticmethod
     def _moments(base: Distribution) -> tuple[Tensor, Tensor]:
-        """Mean and variance; location and scale where these do not exist, as those of a Cauchy distribution."""
+        """Mean and variance; location and squared scale if these do not exist, as for a Cauchy distribution."""
         mean, variance = base.mean, base.variance
         known = torch.isfinite(mean) & torch.isfinite(variance)
         if not is_traced(known) and bool(known.all()):
@@ -87,19 +87,19 @@ class NumericalDistribution(NoiseDistribution):
             if is_traced(known):
                 return mean, variance
             raise ValueError(
-                f"{type(base).__name__} has no finite mean and variance, and no loc and scale to place its quadrature by; give "
-                "it the attributes loc and scale"
+                f"{type(base).__name__} has no finite mean and variance, so its quadrature cannot be placed; add the attributes "
+                "loc and scale to it"
             )
         return torch.where(known, mean, loc), torch.where(known, variance, scale**2)
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
-        """Whether observations are whole numbers."""
+        """Whether observations are integers."""
         return bool(self.support.is_discrete)
 
     @property
     def has_rsample(self) -> bool:  # type: ignore[override]
-        """Whether draws have a derivative."""
+        """Whether draws are differentiable."""
         return not self.discrete
 
     @property
@@ -134,7 +134,7 @@ class NumericalDistribution(NoiseDistribution):
         return torch.where(possible, found, torch.full_like(found, -math.inf))
 
     def log_masses(self, count: Tensor) -> Tensor:
-        """Log-masses of whole numbers; −inf outside the support."""
+        """Log-probabilities of integers; −inf outside the support."""
         low, high = self.limits
         possible = (count >= low) & (count <= high) & (count == torch.round(count))
         safe = torch.where(torch.isfinite(low), low, torch.zeros_like(low))
@@ -156,7 +156,7 @@ class NumericalDistribution(NoiseDistribution):
         return self.masses_up_to(torch.ceil(value) - 1, beyond=False) if self.discrete else self.cdf(value)
 
     def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
-        """P(k ≤ count), or P(k > count) where `beyond`, by adding up; the count may be infinite."""
+        """P(k ≤ count), or P(k > count) if `beyond`, by summation; the count may be infinite."""
         numbers = self._numbers()
         masses = torch.exp(self.log_masses(numbers)).reshape(
             numbers.shape[0], *(1,) * (count.ndim - self._known_mean.ndim), *numbers.shape[1:]
@@ -166,14 +166,14 @@ class NumericalDistribution(NoiseDistribution):
         return torch.where(chosen, masses, torch.zeros_like(masses)).sum(0)
 
     def _numbers(self) -> Tensor:
-        """(Q, *batch) whole numbers that matter."""
+        """(Q, *batch) integers to sum over."""
         mean, spread, (low, high) = self._known_mean.detach(), self._spread, self.limits
         first = torch.maximum(torch.floor(mean - _FAR * spread), low).clamp(min=-(2**40))
         last = torch.minimum(torch.ceil(mean + _FAR * spread + _FAR), high)
         count = int((last - first).max()) + 1 if first.numel() else 1
         if count > _MOST_LEVELS:
             raise ValueError(
-                f"{type(self.base).__name__}: {count} whole numbers within {_FAR} standard deviations are too many to add up; "
+                f"{type(self.base).__name__}: {count} integers within {_FAR} standard deviations are too many to sum over; "
                 "use a continuous distribution and Digitised"
             )
         steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
@@ -185,7 +185,7 @@ class NumericalDistribution(NoiseDistribution):
         return self._log_integral(low, high)
 
     def _log_integral(self, low: Tensor, high: Tensor) -> Tensor:
-        """log ∫ p between bounds, which may be infinite: a narrow interval by its own nodes, however far in a tail."""
+        """log ∫ p between bounds, which may be infinite. Narrow intervals have their own nodes, even far in a tail."""
         least, most = self.limits
         centre, spread = self._known_mean.detach(), self._spread
         ends = [centre + spread * math.sinh(side * _REACH) for side in (-1, 1)]
@@ -203,7 +203,7 @@ class NumericalDistribution(NoiseDistribution):
         return log_sum(self._log_density(nodes) + torch.log(weights))
 
     def _stretched(self, low: Tensor, high: Tensor, centre: Tensor, spread: Tensor) -> Tensor:
-        """On the scale asinh((o − mean)/deviation), which reaches far tails in few panels."""
+        """Integrate on the scale asinh((o − mean)/deviation), which reaches far tails in few panels."""
         start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
         nodes, weights = panels(start, stop, _PANELS)
         at = centre + spread * torch.sinh(nodes)
@@ -217,7 +217,7 @@ class NumericalDistribution(NoiseDistribution):
     @property
     @torch.no_grad()
     def error(self) -> Tensor:
-        """How far CDF and masses of intervals may be wrong: ``|∫ p − 1|`` over all observations, shape of the batch."""
+        """Error estimate of CDF and interval probabilities: ``|∫ p − 1|`` over all observations, shape of the batch."""
         if self.discrete:
             return (torch.exp(self.log_masses(self._numbers())).sum(0) - 1).abs()
         infinity = torch.full(self.batch_shape, math.inf).to(self._known_mean)
@@ -243,7 +243,7 @@ class NumericalDistribution(NoiseDistribution):
             return self.base.sample(shape)
         seed = int(torch.randint(2**31, (), generator=generator, device=generator.device))
         devices = [self.device] if self.device.type == "cuda" else []
-        with torch.random.fork_rng(devices):  # torch's own distributions take no generator
+        with torch.random.fork_rng(devices):  # torch distributions take no generator
             torch.manual_seed(seed)
             return self.base.sample(shape)
 

@@ -1,4 +1,4 @@
-"""Pixels picked from images, for the noise models that look beyond one pixel: at its place, its row or its neighbours."""
+"""Selected pixels of images, for noise models that depend on a pixel's position, row or neighbours."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class PickedSignal:
-    """Signals of some pixels of images.
+    """Signals of selected pixels of images.
 
     Attributes:
-        values: (...) their clean signals, detector units.
-        place: (...) where in its image each lies, y·width + x.
-        windows: (..., k²) clean signals of the window around each, row by row; None where no model asks for them.
+        values: (...) clean signals, detector units.
+        place: (...) position of each pixel in its image, y·width + x.
+        windows: (..., k²) clean signals of the window around each pixel, row by row; None if no model needs them.
     """
 
     values: Tensor
@@ -33,46 +33,46 @@ class PickedSignal:
 
 
 Signal = Tensor | PickedSignal
-"""What models that need an image take: images (..., y, x), or pixels picked from some."""
+"""Input of models that need images: images (..., y, x), or pixels selected from them."""
 
 
 def values_of(signal: Signal) -> Tensor:
-    """The signals alone."""
+    """The signal values."""
     return signal.values if isinstance(signal, PickedSignal) else signal
 
 
 def needs_image(noise_model: nn.Module) -> bool:
-    """Whether some part of a noise model looks beyond single pixels."""
+    """Whether any part of a noise model needs images rather than single pixels."""
     return any(getattr(module, "needs_image", False) for module in noise_model.modules())
 
 
 def window_size(noise_model: nn.Module) -> int:
-    """Side of the largest window that some part of a noise model looks at; 1 where none does."""
+    """Side of the largest window that any part of a noise model uses; 1 if none uses a window."""
     return max(int(getattr(module, "neighbourhood", 1)) for module in noise_model.modules())
 
 
 def given_to(noise_model: nn.Module, signal: Signal) -> Signal:
-    """A signal as a noise model inside another one takes it."""
+    """The signal in the form that a nested noise model takes."""
     return signal if needs_image(noise_model) else values_of(signal)
 
 
 def require_image(signal: Signal, what: str) -> None:
-    """Refuse a flat list of pixels.
+    """Check that a signal has image axes.
 
     Raises:
-        ValueError: the signal has fewer than two axes; the message says `what` needs them.
+        ValueError: the signal has fewer than two axes; `what` names the model in the message.
     """
     if isinstance(signal, Tensor) and signal.ndim < 2:
         raise ValueError(
-            f"{what}: give the signal as images (..., y, x); it has shape {tuple(signal.shape)}, in which pixels have no place"
+            f"{what}: give the signal as images (..., y, x); shape {tuple(signal.shape)} has no image axes"
         )
 
 
 def pick(predict: Callable[[Tensor], Tensor], pixels: Tensor, image: tuple[int, int], window: int) -> PickedSignal:
-    """The signals of pixels of a stack of images, and of the windows around them.
+    """Signals of selected pixels of a stack of images, and of the windows around them.
 
     Args:
-        predict: flat pixel indices to signals, a `SignalModel`.
+        predict: function from flat pixel indices to signals, a `SignalModel`.
         pixels: flat indices, any shape.
         image: height and width of each image.
         window: side of the windows, odd; 1 for none.
@@ -86,7 +86,7 @@ def pick(predict: Callable[[Tensor], Tensor], pixels: Tensor, image: tuple[int, 
 
 
 def window_indices(pixels: Tensor, image: tuple[int, int], window: int) -> Tensor:
-    """(..., window²) flat indices of the windows around pixels; at the border the outermost pixels stand in for those beyond."""
+    """(..., window²) flat indices of the windows around pixels; borders are padded with the nearest pixel."""
     height, width = image
     reach = torch.arange(window, device=pixels.device) - window // 2
     frame, place = pixels // (height * width), pixels % (height * width)
@@ -97,12 +97,14 @@ def window_indices(pixels: Tensor, image: tuple[int, int], window: int) -> Tenso
 
 
 def windows_of(signal: Signal, window: int) -> Tensor:
-    """(..., window²) signals around every pixel of images, or of picked pixels with windows at least as large."""
+    """(..., window²) signals around every pixel of images, or of selected pixels with windows at least as large."""
     if isinstance(signal, Tensor):
         index = torch.arange(signal.numel(), device=signal.device).reshape(signal.shape)
         return signal.reshape(-1)[window_indices(index, (signal.shape[-2], signal.shape[-1]), window)]
     if signal.windows is None:
-        raise ValueError("these pixels were picked without the windows around them; pick them with window_size(model)")
+        raise ValueError(
+            "these pixels were selected without the windows around them; call pick() with window=window_size(model)"
+        )
     side = round(signal.windows.shape[-1] ** 0.5)
     edge = (side - window) // 2
     square = signal.windows.reshape(*signal.shape, side, side)

@@ -1,4 +1,4 @@
-"""What every noise distribution knows of its pixels: number type and device, expanding, taking apart."""
+"""Base class for batches of pixels: data type, device, expanding and splitting."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Pixels:
     """A batch of independent pixels.
 
     Attributes:
-        independent: whether pixels may be evaluated apart from each other.
-        takes_missing: whether `log_prob` itself knows what an observation that is NaN means.
-        light: whether a gradient keeps a few numbers per pixel only, so that nothing is gained by evaluating it in pieces.
-        per_pixel: names of the attributes that hold one value or row of values per pixel; None to take all tensors whose first
-            axes are the batch's.
+        independent: whether pixels can be evaluated independently of each other.
+        takes_missing: whether `log_prob` handles NaN observations itself.
+        light: whether a gradient stores only a few numbers per pixel, so that evaluation in pieces has no benefit.
+        per_pixel: names of the attributes that hold one value or row of values per pixel; None for all tensors whose first
+            axes are the batch axes.
     """
 
     independent: ClassVar[bool] = True
@@ -33,7 +33,7 @@ class Pixels:
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
-        """The noise model and the signal, where likelihoods of large inputs may be looked up in tables."""
+        """The noise model and the signal if likelihoods of large inputs may be looked up in tables, otherwise None."""
         return None
 
     @property
@@ -47,7 +47,7 @@ class Pixels:
         self._computed: dict[bool, Any] = {}
 
     def once(self, compute: Callable[[], Kept]) -> Kept:
-        """What `compute` gives, computed once with gradients and once without."""
+        """The cached result of `compute`, computed once with gradients and once without."""
         key = torch.is_grad_enabled()
         if key not in self._computed:
             self._computed[key] = compute()
@@ -55,13 +55,13 @@ class Pixels:
         return kept
 
     def _pixels(self) -> Tensor | None:
-        """Some tensor of the batch's shape, of a subclass that has not said what its answers are like."""
+        """A tensor of the batch shape, for subclasses that do not set the data type of their results."""
         held = (value for value in vars(self).values() if isinstance(value, Tensor) and value.is_floating_point())
         return next((value for value in held if value.shape == self.batch_shape), None)
 
     @property
     def dtype(self) -> torch.dtype:
-        """Number type of samples, means and variances."""
+        """Data type of samples, means and variances."""
         if self._given_dtype is not None:
             return self._given_dtype
         pixels = self._pixels()
@@ -69,7 +69,7 @@ class Pixels:
 
     @property
     def device(self) -> torch.device:
-        """Where samples are."""
+        """Device of samples, means and variances."""
         if self._given_device is not None:
             return self._given_device
         pixels = self._pixels()
@@ -77,51 +77,51 @@ class Pixels:
 
     @property
     def working_dtype(self) -> torch.dtype:
-        """The number type of the computation: single precision at least."""
+        """Data type of the computation, at least single precision."""
         return torch.promote_types(self.dtype, torch.float32)
 
     def working(self, tensor: Tensor) -> Tensor:
-        """A tensor in the number type of the computation, or a wider one of its own."""
+        """Convert a tensor to the working data type unless its own is wider."""
         return tensor.to(torch.promote_types(tensor.dtype, self.working_dtype))
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
-        """An observation, as it was given, in a number type at least as wide."""
+        """Convert an observation to a data type that is at least as wide as its own."""
         return value.to(dtype)
 
     def clean(self, signal: Tensor) -> Tensor:
-        """A signal in the number type of the computation; NaN where it is not finite, so that all its answers are NaN."""
+        """Convert a signal to the working data type; non-finite signals become NaN, and so do all results for them."""
         signal = self.working(signal)
         if is_traced(signal) or not bool(torch.isfinite(signal).all()):
             return torch.where(torch.isfinite(signal), signal, torch.full_like(signal, math.nan))
         return signal
 
     def cast(self, tensor: Tensor) -> Tensor:
-        """An answer in the number type of the signal."""
+        """Convert a result to the data type of the signal."""
         return tensor if self._given_dtype is None else tensor.to(self._given_dtype)
 
     def anything(self) -> Tensor:
-        """A number of the working type, on the device."""
+        """A scalar of the working data type on the device."""
         return torch.zeros((), dtype=self.working_dtype, device=self.device)
 
     @property
     def batch_shape(self) -> torch.Size:
-        """The signal's shape."""
+        """Shape of the signal."""
         shape: torch.Size = self._batch_shape  # type: ignore[attr-defined]
         return shape
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Self:
-        """The same distribution for a larger batch; pixels of a new or stretched axis are independent of each other."""
+        """The same distribution for a larger batch; pixels along a new or expanded axis are independent of each other."""
         shape = torch.Size(batch_shape)
         broadcast_shapes(self.batch_shape, shape)
         return self.mapped(lambda tensor, rest: tensor.expand(*shape, *rest), shape)
 
     def flat(self) -> Self:
-        """The same pixels in one row."""
+        """The same pixels with one batch axis."""
         return self.mapped(lambda tensor, rest: tensor.reshape(-1, *rest), torch.Size([math.prod(self.batch_shape)]))
 
     def parts(self, size: int) -> list[Self]:
-        """Distributions of `size` consecutive pixels each, of a batch with one axis."""
-        split: dict[int, tuple[Tensor, tuple[Tensor, ...]]] = {}  # with the tensor, so that no other one gets its id
+        """Split a batch with one axis into distributions of `size` consecutive pixels each."""
+        split: dict[int, tuple[Tensor, tuple[Tensor, ...]]] = {}  # keeps the tensor alive, so that its id is not reused
 
         def part(index: int) -> Taking:
             return lambda tensor, rest: split.setdefault(id(tensor), (tensor, torch.split(tensor, size)))[1][index]
@@ -131,7 +131,7 @@ class Pixels:
         return [self.mapped(part(i), torch.Size([min(size, count - at)])) for i, at in enumerate(starts)]
 
     def mapped(self, take: Taking, shape: torch.Size) -> Self:
-        """A copy with every tensor of pixels replaced by ``take(tensor, shape of the axes after the batch's)``."""
+        """A copy with every per-pixel tensor replaced by ``take(tensor, shape of the axes after the batch axes)``."""
         other = copy.copy(self)
         other._batch_shape, other._computed = shape, {}  # type: ignore[attr-defined]
         size = len(self.batch_shape)
@@ -146,8 +146,8 @@ class Pixels:
 
     @property
     def splits(self) -> bool:
-        """Whether pixels can be distinguished in all that is kept: a tensor whose leading axes are not the batch's may hold
-        pixels along others, and such a distribution is computed whole."""
+        """Whether the distribution can be split into pixels. It cannot if a tensor may hold pixels along axes other than the
+        leading ones."""
         for name, value in vars(self).items():
             if isinstance(value, Pixels) and not value.splits:
                 return False
@@ -169,15 +169,15 @@ class Pixels:
 
 
 def is_traced(tensor: Tensor) -> bool:
-    """Whether values cannot be looked at: inside ``torch.compile`` or a transform of ``torch.func``."""
+    """Whether values are not accessible: inside ``torch.compile`` or a transform of ``torch.func``."""
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """The shape that all broadcast to. NumPy finds it, because the first call of torch's own loads SymPy, which takes a second.
+    """The shape that all shapes broadcast to. Uses NumPy, because the first call of torch's function loads SymPy (1 s).
 
     Raises:
-        ValueError: they do not broadcast; while torch compiles, a RuntimeError.
+        ValueError: the shapes do not broadcast (RuntimeError inside ``torch.compile``).
     """
     if torch.compiler.is_compiling():
         return torch.broadcast_shapes(*shapes)  # type: ignore[no-any-return, no-untyped-call]

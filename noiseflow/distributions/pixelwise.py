@@ -1,4 +1,4 @@
-"""Costly functions of single pixels: evaluated in pieces, kept without a graph, differentiable twice by every route of torch."""
+"""Costly elementwise functions: evaluated in pieces, stored without a graph, and twice differentiable."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from noiseflow.distributions.pixels import broadcast_shapes, is_traced
 from noiseflow.kept_memory import kept_memory
 
 PIECE = 2**14
-"""Pixels at once: a dozen float64 arrays of so many stay in the cache."""
+"""Pixels evaluated at once: a dozen float64 arrays of this size fit in the cache."""
 
-_LONG = 8 * PIECE  # beyond, giving memory back to the system and taking it again costs more than keeping it
+_LONG = 8 * PIECE  # above this, releasing memory and allocating it again costs more than keeping it
 
 Function = Callable[..., Tensor]
 
 
 def pixelwise(function: Function, *inputs: Tensor, with_slopes: Callable[..., Any] | None = None) -> Tensor:
-    """`function` of tensors that broadcast, float64, elementwise.
+    """Apply `function` elementwise, in float64, to tensors that broadcast.
 
-    Only the inputs are kept for the gradient: the function is evaluated again, piece by piece, when it is asked for. Ordinary
-    backward passes, ``torch.func`` (grad, vmap, jvp, hessian) and double backward all work; third derivatives do not.
+    Only the inputs are stored for the gradient; the function is evaluated again in pieces in the backward pass. Ordinary backward
+    passes, ``torch.func`` (grad, vmap, jvp, hessian) and double backward are supported; third derivatives are not.
 
     Args:
-        function: of as many float64 tensors of one shape (n,), or numbers of shape (), and of the keyword ``twice``: whether its
-            result must be differentiable twice by autograd, or once.
-        *inputs: tensors that broadcast together; single numbers stay single.
+        function: takes one float64 tensor of shape (n,) or () per input, and the keyword ``twice``: whether autograd must be able
+            to differentiate the result twice.
+        *inputs: tensors that broadcast together; scalars are not expanded.
 
     Returns:
         The values, float64; NaN where an input is NaN.
@@ -78,7 +78,7 @@ class _Value(torch.autograd.Function):
 
 
 class _Kept(torch.autograd.Function):
-    """The value with its derivatives, computed together and kept."""
+    """The value with its derivatives, computed together and stored."""
 
     @staticmethod
     def forward(ctx: Any, function: Function, with_slopes: Callable[..., Any], *inputs: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ class _Slopes(torch.autograd.Function):
 
 
 class _Curvature(torch.autograd.Function):
-    """The matrix of second derivatives of each pixel times a vector: inputs first, then the vector's entries."""
+    """Hessian of each pixel times a vector; takes the inputs, then the entries of the vector."""
 
     @staticmethod
     def forward(function: Function, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -163,11 +163,11 @@ class _Curvature(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        """Nothing to keep: there is no third derivative."""
+        """Store nothing, because there is no third derivative."""
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> None:
-        raise NotImplementedError("this likelihood has no third derivative; ask for the Hessian at most")
+        raise NotImplementedError("this likelihood has no third derivative; use derivatives up to the Hessian")
 
     @staticmethod
     def vmap(info: Any, in_dims: Sequence[int | None], function: Function, *tensors: Tensor) -> tuple[Any, Any]:
@@ -186,7 +186,7 @@ def _shape_of(inputs: Sequence[Tensor]) -> torch.Size:
 
 
 def _leaves(part: Sequence[Tensor]) -> list[Tensor]:
-    """(n,) leaves of the graph of one piece; single numbers are repeated, because each pixel has a derivative of its own."""
+    """(n,) leaves of the graph of one piece; scalars are repeated, because each pixel has its own derivative."""
     size = max(each.numel() for each in part)
     return [each.detach().double().expand(size).clone().requires_grad_() for each in part]
 
@@ -208,7 +208,7 @@ def _gradients(value: Tensor, at: Sequence[Tensor], *, create_graph: bool = Fals
 def _vector_product(
     function: Function, gradient: Tensor, inputs: Sequence[Tensor], needed: Sequence[bool]
 ) -> list[Tensor | None]:
-    """The gradient of each input that needs one, piece by piece; that of a single number is summed as it goes."""
+    """The gradient of each input that needs one, in pieces; gradients of scalars are summed."""
     wanted = [i for i, need in enumerate(needed) if need]
     shape, flat = _shape_of(inputs), gradient.reshape(-1)
     flat_inputs, count = [each.detach().reshape(-1) if each.ndim else each.detach() for each in inputs], flat.numel()
@@ -249,7 +249,7 @@ def _directional(slopes: Sequence[Tensor], tangents: Sequence[Tensor | None]) ->
 def _by_pieces(
     function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor], wanted: Sequence[bool]
 ) -> tuple[Tensor, ...]:
-    """Those of the outputs that are wanted, float64, shaped like the inputs that are not single numbers; NaN where one is NaN."""
+    """The requested outputs, float64, shaped like the non-scalar inputs; NaN where an input is NaN."""
     shape = _shape_of(inputs)
     size, device = math.prod(shape), inputs[0].device
     found = [torch.empty(size, dtype=torch.float64, device=device) for want in wanted if want]
@@ -271,7 +271,7 @@ def _fill(
 
 
 def _without_nan(part: list[Tensor]) -> tuple[Tensor | None, list[Tensor]]:
-    """Where some input is NaN, if anywhere, and the inputs with 1 in its place."""
+    """Mask of pixels where an input is NaN (None if there are none), and the inputs with NaN replaced by 1."""
     total = sum(each if each.ndim else each.detach() for each in part)
     nothing = torch.isnan(total)  # type: ignore[arg-type]
     if not bool(nothing.any()):
@@ -281,7 +281,7 @@ def _without_nan(part: list[Tensor]) -> tuple[Tensor | None, list[Tensor]]:
 
 
 def _unbatched(size: int, in_dims: Sequence[int | None], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Inputs of a batch, its axis first; what has no batch axis gets one of length 1."""
+    """Inputs with the batch axis first; inputs without a batch axis get one of length 1."""
     ndim = max(each.ndim - (dim is not None) for each, dim in zip(inputs, in_dims, strict=True))
     found = []
     for each, dim in zip(inputs, in_dims, strict=True):

@@ -20,7 +20,7 @@ from noiseflow.distributions.pixelwise import pixelwise
 
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Residual and rate, electrons, of one shape though one of value and signal may be a single number."""
+    """Residual and rate, electrons, of equal shape; one of value and signal may be a scalar."""
     residual = (value - signal) / gain
     return residual, ((signal - offset).clamp(min=0) / gain).expand_as(residual)
 
@@ -40,7 +40,7 @@ def _log_interval(
 def _bounds(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals of the bounds and rates, electrons; an infinite bound moves to where nothing is left beyond it."""
+    """Residuals of the bounds and rates, electrons; infinite bounds are replaced by finite ones beyond all probability."""
     (bottom, rate), (top, _) = (in_electrons(value, signal, gain, offset) for value in (low, high))
     finite = torch.isfinite(low), torch.isfinite(high)
     if bool((finite[0] & finite[1]).all()):
@@ -60,7 +60,7 @@ def _bounds(
 def _interval_and_slopes(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """By the chain rule from electrons to detector units."""
+    """Log-probability of an interval and its derivatives, by the chain rule from electrons to detector units."""
     bottom, top, rate = _bounds(low, high, signal, gain, offset, read_noise)
     value, found = interval_and_slopes(bottom, top, rate, read_noise, slopes=slopes)
     if not slopes:
@@ -103,12 +103,12 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     @property
     def light(self) -> bool:
-        """Yes: derivatives are kept, and no graph."""
+        """True: derivatives are stored instead of a graph."""
         return True
 
     @property
     def law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What functions of single pixels take after the observation: signal, gain, offset, read noise."""
+        """Arguments of elementwise functions after the observation: signal, gain, offset, read noise."""
         return self.signal, self.gain, self.offset, self.read_noise
 
     @property
@@ -155,7 +155,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
 
 class UnevenPoissonGaussian(PoissonGaussianDistribution):
-    """As `PoissonGaussianDistribution`, of pixels that have a read noise of their own.
+    """As `PoissonGaussianDistribution`, with a separate read noise for each pixel.
 
     Args:
         signal: clean pixel values, detector units, any shape.
@@ -180,8 +180,8 @@ class UnevenPoissonGaussian(PoissonGaussianDistribution):
 
 
 def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A function of single pixels and last of their read noises, called apart for those that resolve electrons and for others:
-    the two take different ways to the same law."""
+    """Split a call of an elementwise function by read noise: pixels that resolve single electrons use the sum, the others the
+    contour integral. The read noise is the last argument."""
 
     def parted(*inputs: Tensor, twice: bool = False) -> Tensor:
         resolved = inputs[-1].detach() < RESOLVED

@@ -1,4 +1,4 @@
-"""A table over signals and one more coordinate, looked up bilinearly, that knows where it is not accurate."""
+"""A table over signals and one more coordinate, with bilinear interpolation and error control."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from torch import Tensor
 
 from noiseflow.distributions.tabulated import RootScale
 
-_CHUNK = 2**16  # pixels; what a lookup writes for them stays in the cache
-_MARGIN = 2  # rows beyond the signals on either side, whose curvature can be judged
+_CHUNK = 2**16  # pixels per lookup, so that intermediate arrays fit in the cache
+_MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature
 _ROWS_AT_ONCE = 16
-_MOST_GROWTH = 4.0  # times the rows first made; beyond, the scale no longer suits and the table is made anew
+_MOST_GROWTH = 4.0  # relative to the initial rows; beyond this the scale is no longer suitable and the table is rebuilt
 
 Values = Callable[[Tensor], Tensor]
 
 
 class Table:
-    """Values at rows of signals, evenly spaced on a scale, and columns of another coordinate.
+    """Values on a grid: rows are signals, evenly spaced on a scale; columns are another coordinate.
 
-    Linear interpolation between nodes a step apart errs by up to an eighth of the second difference where the function is smooth,
-    and by up to half of it at a kink. Nodes where half of it exceeds the tolerance are NaN, and so is all that is interpolated
-    from them.
+    The error of linear interpolation is at most an eighth of the second difference where the function is smooth, and half of it
+    at a kink. Nodes where half of the second difference exceeds the tolerance are NaN, and so are all values interpolated from
+    them.
 
     Args:
-        scale: of the signals.
+        scale: scale of the signals.
         num_rows: rows between the ends of the scale.
-        columns: (C,) evenly spaced coordinates; one for none.
+        columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
         tolerance: largest error, in the unit of the values.
     """
 
@@ -43,12 +43,12 @@ class Table:
         self._beside: dict[Any, Table] = {}
 
     def cover(self, low: float, high: float, values: Values, unit: Values | None = None) -> bool:
-        """Add rows until the table covers signals from `low` to `high`; False where it would grow too much.
+        """Add rows until the table covers signals from `low` to `high`. Return False if it would grow too much.
 
         Args:
             low, high: detector units.
-            values: (rows, 1) signals, float64, to (rows, C) values.
-            unit: gives the unit of the tolerance, (rows, 1), at (rows, 1) signals; 1 where it is not given.
+            values: function from (rows, 1) signals, float64, to (rows, C) values.
+            unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
         """
         ends = self.scale.observation(torch.tensor([low, high], dtype=torch.float64))
         wanted = (float(ends[0]) - self.first) / self.step, (float(ends[1]) - self.first) / self.step
@@ -71,7 +71,7 @@ class Table:
         return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
 
     def _check(self, unit: Values | None) -> Tensor:
-        """The table with NaN where interpolation would err too much, (1, 1, rows, C)."""
+        """The table with NaN where interpolation is not accurate, (1, 1, rows, C)."""
         rows = self.rows
         allowed = torch.full_like(rows[:, :1], 2 * self._tolerance)
         if unit is not None:
@@ -85,7 +85,7 @@ class Table:
         return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
 
     def beside(self, key: Any, values: Values) -> Table:
-        """A table of one column with the same rows.
+        """A one-column table with the same rows.
 
         Raises:
             ValueError: this table covers no signals yet.
@@ -102,11 +102,11 @@ class Table:
         return table
 
     def look_up(self, signal: Tensor, column: Callable[[slice], Tensor] | None) -> Tensor:
-        """Values of (N,) pixels, in pieces that stay in the cache; NaN where the table is not accurate or does not reach.
+        """Values of (N,) pixels, in pieces that fit in the cache; NaN where the table is not accurate or out of range.
 
         Args:
             signal: (N,) detector units.
-            column: gives the column coordinates of a slice of the pixels; None for a table of one column.
+            column: function from a slice of the pixels to their column coordinates; None for a one-column table.
         """
         found = torch.empty_like(signal)
         for start in range(0, signal.numel(), _CHUNK):

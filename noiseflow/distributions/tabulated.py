@@ -1,6 +1,6 @@
-"""How a likelihood, a function of two scalars, is laid out as a table: a scale of signals, rows, columns.
+"""Table layout for a likelihood, a function of two scalars: scale of signals, rows and columns.
 
-Lookups are bilinear and run as one fused pass over the pixels (``grid_sample``), at about the cost of a normal log-density.
+Lookups are bilinear, in one fused pass over the pixels (``grid_sample``), at about the cost of a normal log-density.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _COARSE = 65
 
 @dataclass(frozen=True)
 class RootScale:
-    """A scale of pixel values on which noise is about equally wide everywhere: √((value − low)/(high − low) + shift).
+    """A scale of pixel values on which the noise has about constant width: √((value − low)/(high − low) + shift).
 
-    Below `low` it goes on along its slope, for observations fall below every signal.
+    Below `low` it continues linearly, because observations can be below every signal.
     """
 
     low: float
@@ -33,7 +33,7 @@ class RootScale:
 
     @staticmethod
     def of(noise_model: nn.Module, low: float, high: float, like: Tensor) -> RootScale:
-        """The scale for signals from `low` to `high`: the variance of the noise as a straight line between its extremes."""
+        """The scale for signals from `low` to `high`, if the noise variance is linear between its values at the ends."""
         variance = _variance(noise_model, low, high, like)
         least, most = float(variance.min()), float(variance.max())
         found = least / (most - least) if most > least else math.inf
@@ -41,29 +41,29 @@ class RootScale:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The scale at `low` and at `high`."""
+        """Positions of `low` and `high` on the scale."""
         return self.shift**0.5, (1 + self.shift) ** 0.5
 
     def signal(self, signal: Tensor) -> Tensor:
-        """The scale at signals inside the range."""
+        """Positions of signals inside the range."""
         scale = 1 / (self.high - self.low)
         return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
 
     def observation(self, observation: Tensor) -> Tensor:
-        """The scale at any pixel values."""
+        """Positions of any pixel values."""
         share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
         root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
         return root
 
     def inverse(self, root: Tensor) -> Tensor:
-        """The pixel values at places of the scale."""
+        """Pixel values at positions on the scale."""
         start = self.shift**0.5
         share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
         readings: Tensor = self.low + (self.high - self.low) * share
         return readings
 
     def slope(self, signal: Tensor) -> Tensor:
-        """Growth of the scale per unit of signal."""
+        """Derivative of the scale with respect to the signal."""
         return 0.5 / ((self.high - self.low) * self.signal(signal))
 
 
@@ -81,12 +81,12 @@ class Rows:
     count: int
 
     def signals(self, like: Tensor) -> Tensor:
-        """The rows' signals, (rows, 1)."""
+        """Signals of the rows, (rows, 1)."""
         root = torch.linspace(*self.scale.ends, self.count, dtype=torch.float64)
         return self.scale.inverse(root).to(like)[:, None]
 
     def position(self, root: Tensor, out: Tensor) -> Tensor:
-        """Row coordinate in [−1, 1] of places of the scale, written to `out`."""
+        """Row coordinates in [−1, 1] of positions on the scale, written to `out`."""
         start, stop = self.scale.ends
         return torch.add(root * (2 / (stop - start)), -2 * start / (stop - start) - 1, out=out)
 
@@ -95,7 +95,7 @@ class Rows:
 class Columns:
     """Equally spaced residuals on a scale, with a column at each end for observations on a clipping limit.
 
-    In texture coordinates an observation's column is offset − rate · (the signal's place on the scale); on a clipping limit
+    In texture coordinates the column of an observation is offset − rate · (position of the signal); on a clipping limit
     the rate is 0.
     """
 
@@ -112,7 +112,7 @@ class Columns:
         return (self.stop - self.start) / (self.count - 1)
 
     def values(self, signals: Tensor) -> Tensor:
-        """Observations tabulated for the rows' signals (rows, 1): (rows, columns)."""
+        """Observations tabulated for signals (rows, 1), (rows, columns)."""
         residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64, device=signals.device)
         inner = self.scale.inverse(self.scale.signal(signals.double()) + residuals[None, :]).to(signals)
         ends = [
@@ -121,8 +121,8 @@ class Columns:
         return torch.cat([ends[0], inner, ends[1]], dim=1)
 
     def position(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
-        """Offset, rate and, where some residuals may lie outside the columns, the bounds that keep them off the clipping
-        limits."""
+        """Offset and rate, and, if some residuals may lie outside the columns, the bounds that keep them away from the
+        clipping limits."""
         unit = 2 / (self.count + 1)
         root = self.scale.observation(observation)
         offset = root * (unit / self.step) + ((1 - self.start / self.step) * unit - 1)
@@ -138,7 +138,7 @@ class Columns:
 
     @staticmethod
     def of(noise_model: nn.Module, observation: Tensor, scale: RootScale, count: int) -> Columns:
-        """Columns for the residuals of given observations and the scale's signals."""
+        """Columns for the residuals between given observations and the signals of the scale."""
         rail_low, rail_high = (
             getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf))
         )
@@ -149,7 +149,7 @@ class Columns:
         coarse = torch.linspace(scale.low, scale.high, _COARSE, dtype=observation.dtype, device=observation.device)
         width = _variance(noise_model, scale.low, scale.high, observation).sqrt() * scale.slope(coarse)
         reach = 100 * float(width.max())
-        wide = stop - start > reach  # a few far outliers must not take the resolution from all others
+        wide = stop - start > reach  # a few extreme outliers must not reduce the resolution for all others
         if wide:
             start, stop = max(start, -reach / 2), min(stop, reach / 2)
         return Columns(scale, start, max(stop, start + 1e-9), count, rail_low, rail_high, wide)
@@ -161,8 +161,8 @@ def interpolate(table: Tensor, grid: Tensor) -> Tensor:
 
 
 def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, between_rails: bool) -> Tensor:
-    """Log-likelihood on a table. With `between_rails` only the outer columns know of the clipping limits, so that neighbours
-    of a clipping limit interpolate cleanly."""
+    """Log-likelihood on a table. With `between_rails` only the outer columns include clipping, so that interpolation near
+    a clipping limit is accurate."""
     if between_rails and hasattr(noise_model, "without_rails"):
         free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
         outer = [noise_model(signals).log_prob(end) for end in ends]
@@ -179,5 +179,5 @@ def mean_error(found: Tensor, exact: Tensor) -> float:
 
 
 def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
-    """What shows whether a model, and the range of its inputs, are still those that something was computed for."""
+    """A key that changes whenever the parameters of a model, or the given limits, change."""
     return (*limits, fingerprint(noise_model))

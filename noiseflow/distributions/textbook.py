@@ -1,4 +1,4 @@
-"""The distributions of the textbook noise models: normal and Poisson."""
+"""The distributions of the standard noise models: normal and Poisson."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.distributions import constraints
 from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.levels import Levels, between, log_sum
 
-_NEAR = 1e-3  # of a level: a value computed as gain·k + offset must count as having reached k
+_NEAR = 1e-3  # of the level spacing: a value computed as gain·k + offset must count as k
 
 
 class GaussianDistribution(LatentDistribution):
@@ -21,7 +21,7 @@ class GaussianDistribution(LatentDistribution):
 
     Args:
         signal: detector units, any shape.
-        log_scale: log of the standard deviation, a number.
+        log_scale: log of the standard deviation, a scalar.
     """
 
     per_pixel = ("signal",)
@@ -101,11 +101,11 @@ class PoissonDistribution(NoiseDistribution):
         return between(self, *(torch.floor(self._count(bound) + _NEAR) for bound in (low, high)))
 
     def log_masses(self, count: Tensor) -> Tensor:
-        """Log-masses of counts; −inf below 0."""
+        """Log-probabilities of counts; −inf below 0."""
         return self._log_mass(count)
 
     def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
-        """P(k ≤ count), or P(k > count) where `beyond`; the count may be infinite."""
+        """P(k ≤ count), or P(k > count) if `beyond`; the count may be infinite."""
         finite = torch.isfinite(count)
         inside = self._mass_up_to(torch.where(finite, count, torch.zeros_like(count)), beyond=beyond)
         return torch.where(finite, inside, ((count > 0) != beyond).to(inside.dtype))
@@ -130,12 +130,12 @@ class PoissonDistribution(NoiseDistribution):
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
-        """The offset, and infinity."""
+        """The offset and infinity."""
         return self.offset.detach(), torch.full_like(self.offset.detach(), math.inf)
 
     @property
     def support(self) -> constraints.Constraint:
-        """Offset plus whole multiples of the gain."""
+        """Offset plus integer multiples of the gain."""
         return Levels(float(self.gain), float(self.offset), float(self.offset), math.inf)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
@@ -147,7 +147,7 @@ class PoissonDistribution(NoiseDistribution):
         return self._value(nodes), torch.exp(self._log_mass(nodes))
 
     def entropy(self) -> Tensor:
-        """−Σ P log P over the electrons, nats, plus log gain: that of the density that `log_prob` gives."""
+        """−Σ P log P over the electrons plus log gain, nats: the entropy of the density that `log_prob` returns."""
         return super().entropy()
 
     @property
@@ -160,9 +160,9 @@ class PoissonDistribution(NoiseDistribution):
 
 
 class SpreadPoissonDistribution(PoissonDistribution):
-    """Scaled and shifted Poisson distribution whose masses are spread evenly over cells as wide as the gain.
+    """Scaled and shifted Poisson distribution whose probabilities are spread evenly over cells as wide as the gain.
 
-    It has the density that `PoissonDistribution.log_prob` gives, between the grid points too, and draws that follow it.
+    Its density is that of `PoissonDistribution.log_prob`, also between the grid points, and its draws follow this density.
 
     Args:
         signal: detector units, any shape.
@@ -172,7 +172,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
     discrete: ClassVar[bool] = False
 
     def _cells(self, value: Tensor) -> Tensor:
-        """Cells below a value: that of k electrons lies between k and k + 1."""
+        """Number of cells below a value; the cell of k electrons lies between k and k + 1."""
         return self._count(value) + 0.5
 
     def cdf(self, value: Tensor) -> Tensor:
@@ -210,17 +210,17 @@ class SpreadPoissonDistribution(PoissonDistribution):
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
-        """The lower edge of the cell of no electron, and infinity."""
+        """The lower edge of the cell of zero electrons, and infinity."""
         low, high = super().limits
         return low - 0.5 * self.gain.detach(), high
 
     @property
     def support(self) -> constraints.Constraint:
-        """All values from the lower edge of the cell of no electron."""
+        """All values from the lower edge of the cell of zero electrons."""
         return constraints.greater_than_eq(float(self.limits[0]))  # type: ignore[no-untyped-call]
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        """Gauss-Legendre nodes of each cell, two of them: exact to the third moment."""
+        """Two Gauss–Legendre nodes in each cell, exact to the third moment."""
         nodes, weights = super().quadrature()
         apart = self.gain.detach() / (2 * math.sqrt(3.0))
         return torch.cat([nodes - apart, nodes + apart]), torch.cat([weights, weights]) / 2

@@ -1,7 +1,7 @@
 """Monotone scalar maps in closed form: affine, radial, rational-quadratic spline, Student tail.
 
-Every map gives its value and ``ladj``, the log of its derivative *at its input*, in one call; ``inverse`` gives the same for the
-inverse map. Parameters are tensors that broadcast against the input.
+``forward`` returns the value and ``ladj``, the log of the derivative *at its input*; ``inverse`` does the same for the inverse
+map. Parameters are tensors that broadcast with the input.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Transform(Protocol):
         ...
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Transform:
-        """The maps whose parameters lie between those of the rows `row` and `row` + 1 of this one, by `weight` in [0, 1].
+        """Interpolate the parameters linearly between the rows `row` and `row` + 1, with `weight` in [0, 1].
 
-        The parameters of this one have a first axis of rows; those of the result have the shape of `row` and `weight`.
+        The parameters of this map have a first axis of rows; those of the result have the shape of `row` and `weight`.
         """
         ...
 
@@ -58,8 +58,8 @@ class Radial:
     It is parametrised by its slope at the centre, 1 + β/α = exp(log_slope), so that every parameter gives a monotone map.
 
     Args:
-        centre: where the slope differs most from one.
-        log_width: log α, the reach of the change.
+        centre: position where the slope differs most from one.
+        log_width: log α, the range of the change.
         log_slope: log of the slope at the centre.
     """
 
@@ -79,7 +79,7 @@ class Radial:
         u = (y - self.centre).abs()
         q = width * torch.exp(self.log_slope) - u
         root = torch.sqrt(q * q + 4 * width * u)
-        # both forms are the positive root of d² + q d − width·u; each is used where nothing cancels
+        # both forms are the positive root of d² + q d − width·u; each is used where it does not cancel
         distance = torch.where(q > 0, 2 * width * u / (q.clamp(min=0) + root), (root - q) / 2)
         x = self.centre + torch.sign(y - self.centre) * distance
         return x, -self._ladj(width / (width + distance))
@@ -97,7 +97,7 @@ class StudentTail:
     """y = sign(x)·√(log(1 + h x²)/h): turns power-law tails into Gaussian ones, and is the identity where h = 0.
 
     With h = 1/ν it normalises Student's t with ν degrees of freedom closely (Wallace 1959, doi:10.1214/aoms/1177706148).
-    The left and right tails have weights of their own.
+    The left and right tails have separate parameters.
     """
 
     left: Tensor
@@ -141,7 +141,7 @@ class Spline:
         x: (..., K+1) increasing knots.
         y: (..., K+1) increasing values at the knots.
         slope: (..., K+1) positive derivatives at the knots; the outermost ones are the slopes of the tails.
-        between: rows and weights: the knots of each of the rows are between those of this row and the next, by its weight.
+        between: rows and weights for linear interpolation of the knots between each row and the next.
     """
 
     x: Tensor
@@ -178,7 +178,7 @@ class Spline:
         return Spline(self.x, self.y, self.slope, (row, weight))
 
     def _clamped(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-        """The value brought between the outermost knots, and the slope of the tail on its side."""
+        """The value clamped to the range of the knots, and the slope of the tail on its side."""
         first = torch.zeros((), dtype=torch.long, device=value.device)
         last = first + knots.shape[-1] - 1
         low, high = self._knot(knots, first), self._knot(knots, last)
@@ -199,7 +199,7 @@ class Spline:
         return between_rows(inner, row, weight.detach())
 
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
-        """The knots of the given numbers."""
+        """The knots with the given indices."""
         if self.between is not None:
             (row, weight), (_, count) = self.between, knots.shape
             return between_rows(knots.reshape(-1), row * count + index, weight, step=count)
@@ -208,7 +208,7 @@ class Spline:
 
 
 def between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -> Tensor:
-    """Values between table[row] and table[row + step], by `weight`; (*row.shape, …) for tables of more axes."""
+    """Linear interpolation between table[row] and table[row + step]; (*row.shape, …) for tables with more axes."""
     flat, shape = row.reshape(-1), (*row.shape, *table.shape[1:])
     left, right = (table.index_select(0, at).reshape(shape) for at in (flat, flat + step))
     return left + weight.reshape((*weight.shape, *(1,) * (table.ndim - 1))) * (right - left)

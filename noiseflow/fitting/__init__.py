@@ -1,1 +1,1 @@
-"""The optimisation loop, its tables, and the choice among noise models."""
+"""Fitting of noise models: the optimisation loop, its tables, and model selection."""

@@ -1,4 +1,4 @@
-"""The running average of a model's weights, and which of the states of a fit to keep."""
+"""The running average of a model's weights, and the choice of the state that a fit returns."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _DECAY, _START = 0.98, 10
 class WeightAverage:
     """Exponential average of the weights over about the last fifty steps (Polyak & Juditsky 1992, doi:10.1137/0330046).
 
-    Single steps jitter about the most likely weights, and the looks at held-out pixels would pick among that jitter; their
-    average does not, and is as good after a fifth of the steps as the last weights at the end.
+    Weights after single steps fluctuate around the maximum of the likelihood, and held-out evaluations would select among these
+    fluctuations. The average does not fluctuate; after a fifth of the steps it is as good as the last weights at the end.
 
     Args:
-        model: whose trainable weights are averaged.
+        model: the model whose trainable weights are averaged.
     """
 
     def __init__(self, model: nn.Module) -> None:
@@ -29,13 +29,13 @@ class WeightAverage:
 
     @torch.no_grad()
     def restart(self) -> None:
-        """Begin again from the weights as they are."""
+        """Restart the average from the current weights."""
         self._average = [weight.detach().clone() for weight in self._weights]
         self._count = 0
 
     @torch.no_grad()
     def update(self) -> None:
-        """Take in the weights as they are."""
+        """Add the current weights to the average."""
         self._count += 1
         share = 1 - min(_DECAY, self._count / (self._count + _START))
         for average, weight in zip(self._average, self._weights, strict=True):
@@ -43,7 +43,7 @@ class WeightAverage:
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
-        """The model with the average for its weights, while it lasts."""
+        """Use the averaged weights in the model within the block."""
         self._exchange()
         try:
             yield
@@ -58,19 +58,20 @@ class WeightAverage:
             average.copy_(kept)
 
     def state(self) -> dict[str, Any]:
-        """What `load_state` takes."""
+        """The state for `load_state`."""
         return {"average": [average.clone() for average in self._average], "count": self._count}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that `state` returned."""
+        """Restore a state that `state` returned."""
         self._average, self._count = [average.clone() for average in state["average"]], state["count"]
 
 
 class BestState:
-    """The state to end at: the latest one that no earlier one beats beyond chance on the held-out pixels, or, `strict`, the best.
+    """The state that a fit returns.
 
-    A start that is the best of all is kept: then there is nothing to learn. Where looks are strict, it must be so beyond chance:
-    a signal comes from a fit to other noise, and steps that end at a small rate are worth more than a look that tells nothing.
+    By default this is the latest state for which no earlier one is significantly better on the held-out pixels; with `strict`,
+    the best state. The initial state is kept if it is the best of all. With `strict` it must be significantly better, because
+    the signal comes from a fit to other noise, and optimisation steps are more reliable than an insignificant comparison.
     """
 
     def __init__(self) -> None:
@@ -79,7 +80,7 @@ class BestState:
         self._start_leads = True
 
     def judge(self, state: dict[str, Any], scores: Tensor, *, start: bool, strict: bool) -> bool:
-        """Take a state with its log-likelihoods of the held-out pixels, (P,); whether it is now the one to end at."""
+        """Compare a state by its log-likelihoods of the held-out pixels, (P,). Return whether it is now the chosen one."""
         if self._scores is None:
             self._scores, self._start_leads, self.state = scores, start, state
             return True
@@ -94,9 +95,9 @@ class BestState:
         return True
 
     def saved(self) -> dict[str, Any]:
-        """What `load` takes."""
+        """The state for `load`."""
         return {"state": self.state, "scores": self._scores, "start_leads": self._start_leads}
 
     def load(self, saved: dict[str, Any]) -> None:
-        """Go on from what `saved` returned."""
+        """Restore what `saved` returned."""
         self.state, self._scores, self._start_leads = saved["state"], saved["scores"], saved["start_leads"]

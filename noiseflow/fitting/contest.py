@@ -1,4 +1,4 @@
-"""Noise models on their way to be chosen from: short fits, long fits, and more of them where one has not converged."""
+"""Fits of candidate noise models for model selection: short fits, long fits, and further fits of unconverged models."""
 
 from __future__ import annotations
 
@@ -18,20 +18,16 @@ from noiseflow.models.base import NoiseModelBase
 Progress = Callable[[int, str], None]
 _SCREENING_PIXELS = 32768
 _SCREENING_SHARE = 0.2  # of a model's steps
-_HOPELESS = 0.02  # nats per pixel; about ten times what the long fit still gains on the short one
-_SHARE_FROM_MAXIMUM = 0.1  # of the steps, for a model that starts at its most likely parameters
-_WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; a slower pace needs ten more of them
-_STILL_FAR = (
-    1.5  # times what the round before gained: at twice the rate, a model that has far to go gains twice as much
-)
-_SETTLED = (
-    5e-4  # nats per pixel gained in the second half of a fit, whose rates are small; a tenth of the path lies there
-)
+_HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
+_SHARE_FROM_MAXIMUM = 0.1  # of the steps, for a model that starts at its maximum-likelihood parameters
+_WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
+_STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
+_SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
 class Contest:
-    """Models with their log-likelihoods of the judging pixels, `scores`, and the rates at which they were fitted, `rates`."""
+    """Candidate models with log-likelihoods of the validation pixels (`scores`) and learning rates (`rates`)."""
 
     def __init__(
         self,
@@ -53,7 +49,7 @@ class Contest:
         self._progress, self._done = progress, 0
 
     def screen(self) -> None:
-        """A short fit of every model to some pixels; those far behind the best that do not catch up are screened out."""
+        """Fit every model briefly to some pixels; screen out models far behind the best that do not catch up."""
         for name, model in self.models.items():
             started, short = time.perf_counter(), self._short(name)
             pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
@@ -69,7 +65,7 @@ class Contest:
         self.screened_out = {name for name in self.models if self._is_hopeless(name)}
 
     def finish(self) -> None:
-        """The long fit of those that are left, and a longer one of those that are still gaining."""
+        """Fit the remaining models fully, and continue for those that still improve."""
         for name, model in self.models.items():
             if name in self.screened_out:
                 continue
@@ -80,7 +76,7 @@ class Contest:
                 self._go_on(name, pixels, self.steps[name])
 
     def learn_all(self, name: str) -> None:
-        """Fit a model to all pixels but a few that judge again; where these like it less, it stays as it was."""
+        """Fit a model to all pixels except a few for a second validation; keep the old model if it was better on these."""
         model, judge = self.models[name], self.pixels.judge_again
         before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
         self._fit_anew(name, self.pixels.everything(model))
@@ -89,7 +85,7 @@ class Contest:
             model.load_state_dict(kept)
 
     def best(self) -> Tensor:
-        """Log-likelihoods of the judging pixels under the best model."""
+        """Log-likelihoods of the validation pixels under the best model."""
         return max(self.scores.values(), key=lambda score: float(score.mean()))
 
     def _gap(self, name: str) -> float:
@@ -103,7 +99,7 @@ class Contest:
         return max(1, round(_SCREENING_SHARE * self.steps[name]))
 
     def _go_on(self, name: str, pixels: dict[str, Any], num_steps: int) -> None:
-        """Rounds from where the model is, each at twice the rate, while they close a tenth of the gap or gain ever more."""
+        """Continue the fit in rounds, doubling the rate, while a round closes a tenth of the gap or gains accelerate."""
         model = self.models[name]
         for _ in range(_MOST_ROUNDS):
             started, before, rate = time.perf_counter(), self.scores[name], self.rates[name]
@@ -113,7 +109,7 @@ class Contest:
             self._fit(name, pixels, num_steps)
             self._score(name, started)
             gained = float(self.scores[name].mean() - before.mean())
-            if not gained > 0:  # too fast, or nothing to gain
+            if not gained > 0:  # the rate is too high, or there is nothing to gain
                 model.load_state_dict(kept)
                 self.scores[name], self.rates[name] = before, rate
                 return
@@ -122,14 +118,19 @@ class Contest:
                 return
 
     def _fit_anew(self, name: str, pixels: dict[str, Any]) -> float:
-        """A fit from the standardised start, or from where a model is that had far to go from there; a few steps where the start
-        is nearly the end. What was gained in its second half, nats per pixel."""
+        """Fit a model fully from the standardised start, or from its current state if it was far from convergence.
+
+        Models that start near the maximum take a few steps only.
+
+        Returns:
+            The gain of the second half of the fit, nats per pixel.
+        """
         num_steps = self.steps[name]
         if self.models[name].starts_most_likely:
             num_steps = max(1, round(_SHARE_FROM_MAXIMUM * num_steps))
         elif (
             name not in self._went_on
-        ):  # not on from the short fit: fresh steps of the optimiser leave what weights have learnt
+        ):  # does not continue the short fit: first steps of a new optimiser would move away from the learnt weights
             self.models[name].load_state_dict(self.starts[name])
         return self._fit(name, pixels, num_steps)
 
@@ -155,8 +156,8 @@ class Contest:
 
 
 def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[float, float]:
-    """Mean of (N,) differences and its standard error, from the scatter of whole blocks where there are some."""
-    # −inf − −inf: pixels that both models call impossible do not tell them apart
+    """Mean of (N,) differences and its standard error, from the scatter of whole blocks if blocks are given."""
+    # −inf − −inf: pixels that are impossible under both models do not distinguish them
     difference = torch.nan_to_num(difference, nan=0.0, posinf=math.inf)
     mean = float(difference.mean())
     if not math.isfinite(mean):

@@ -1,4 +1,4 @@
-"""Fitting a noise model: alone on known signals, or jointly with any model of the signal. One call for both."""
+"""Fitting a noise model on known signals, or jointly with a model of the signal."""
 
 from __future__ import annotations
 
@@ -55,45 +55,46 @@ def fit(
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
 
-    The loss is the mean negative log-likelihood of the training pixels, plus the signal model's ``penalty()`` where it has one.
-    Learning rates fall geometrically to 1 %; in a joint fit more slowly at first, and to nothing at the end.
+    The loss is the mean negative log-likelihood of the training pixels, plus the ``penalty()`` of the signal model if it has one.
+    Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
 
     Args:
-        noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals; one without
-            trainable parameters stays as it is.
-        signal: clean signals, a tensor or an array shaped like `observation`, or a `SignalModel`. A trainable one may offer
-            ``parameter_groups()``, parameter groups with their learning rates for Adam.
-        observation: noisy images, a tensor or an array of any shape and real type, detector units; for models that look
-            beyond single pixels, images (..., y, x).
-        mask: pixels to use, shaped like `observation`; all by default. What a masked array masks is left out besides.
-        skip_non_finite: leave NaN and infinite pixels out instead of refusing them.
-        digitise: look for rounding and clipping limits (`detect_digitisation`), and where there are any put a `Digitised` around
-            a model that does not describe them itself. The result holds the model so wrapped, and a log message says so.
-        held_out: fraction of the pixels, or those, boolean, that judge the fit and never train it.
-        num_steps: optimisation steps; by default as many as the noise model asks for (its ``num_steps``, 500 by default).
+        noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
+            without trainable parameters is not changed.
+        signal: clean signals, a tensor or array shaped like `observation`, or a `SignalModel`. A trainable signal model may
+            define ``parameter_groups()``, parameter groups with learning rates for Adam.
+        observation: noisy images, a tensor or array of any shape and real type, detector units; images (..., y, x) if the
+            noise model depends on neighbouring pixels.
+        mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
+        skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
+        digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
+            in `Digitised`. The result holds the wrapped model; a log message reports it.
+        held_out: fraction of the pixels to hold out for validation, or a boolean mask of these pixels.
+        num_steps: optimisation steps; by default ``num_steps`` of the noise model, or 500.
         batch_size: pixels per noise-model step.
-        learning_rate: starting rate of the noise model, and of a signal model without ``parameter_groups()``; by default the
-            noise model's own (its ``learning_rate``, 0.01 by default).
-        warm_up: share of the steps of a joint fit in which its rates grow to their full size. Adam's first steps move everything
-            as far, which a rough start gains from and a good one is lost to.
-        noise_interval, noise_steps: in a joint fit, this many noise-model steps after every so many signal steps.
-        standardise: measure the data's scaling first and store it in the noise model.
-        train_noise: whether the noise model learns; otherwise it stays as it is.
+        learning_rate: initial learning rate of the noise model, and of a signal model without ``parameter_groups()``; by
+            default ``learning_rate`` of the noise model, or 0.01.
+        warm_up: share of the steps of a joint fit over which learning rates increase to their full value. Adam's first steps
+            all have the full length: this helps a rough starting point and harms a good one.
+        noise_interval, noise_steps: in a joint fit, take `noise_steps` noise-model steps after every `noise_interval` signal
+            steps.
+        standardise: first measure the scaling of the data and store it in the noise model.
+        train_noise: whether to train the noise model; otherwise it is not changed.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
-        progress: called with the steps done and a note.
-        checkpoint: called at every look at the held-out pixels, and on Ctrl-C, with all that `resume` needs.
-        checkpoint_interval: call it after a step every so many seconds instead.
-        resume: a state that `checkpoint` was given; the fit continues from there.
-        parameter_groups: of the signal model with their learning rates, in place of its own ``parameter_groups()``.
-        tables: keeps the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
+        progress: called with the number of completed steps and a note.
+        checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C.
+        checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
+        resume: a state passed to `checkpoint`; the fit continues from it.
+        parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
+        tables: stores the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
-        The fitted model, the held-out likelihood and its history. Both models end at their best held-out state.
+        The fitted model, the held-out likelihood and its history. Both models are left in their best held-out state.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, too few pixels, no share of steps, a signal model that gives other
-            shapes than `SignalModel` says, or no finite step could be made.
+        ValueError: shapes differ, pixels are not finite, there are too few pixels, `warm_up` is out of range, the signal model
+            returns shapes that `SignalModel` does not allow, or the likelihood is never finite.
 
     Example:
         >>> import noiseflow, torch
@@ -104,7 +105,7 @@ def fit(
         3.0
     """
     if not 0 <= warm_up < 1:
-        raise ValueError(f"warm_up {warm_up} is a share of the steps: give 0 or more, and less than 1")
+        raise ValueError(f"warm_up is {warm_up}; give a share of the steps, at least 0 and less than 1")
     (signal, observation), kept = unmasked(signal, observation)
     if is_array(signal):
         signal = as_tensor(signal)
@@ -126,7 +127,7 @@ def fit(
         model, digitisation = _behind_converter(model, observation, use)
     if model.needs_image and observation.ndim < 2:
         raise ValueError(
-            f"{type(model).__name__} looks beyond single pixels: give images (..., y, x); these pixels have shape "
+            f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
             f"{tuple(observation.shape)}"
         )
     axis = model.shared_axis
@@ -162,8 +163,8 @@ def _usable(signal_model: nn.Module, observation: Tensor, mask: Tensor | None, s
     count = int((use & ~finite).sum())
     if count:
         raise ValueError(
-            f"{count} pixels of signal or observation are NaN or infinite; pass skip_non_finite=True or a mask that leaves "
-            "them out"
+            f"{count} pixels of signal or observation are NaN or infinite; pass skip_non_finite=True or a mask that excludes "
+            "them"
         )
     return use
 
@@ -175,25 +176,25 @@ def _as_floating(observation: Tensor) -> Tensor:
 def _behind_converter(
     noise_model: NoiseModelBase, observation: Tensor, use: Tensor
 ) -> tuple[NoiseModelBase, Digitisation]:
-    """The model behind the rounding and clipping that its pixel values show, and these; itself where they show none."""
+    """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
     values = observation.detach().reshape(-1)[use].cpu()
     found = detect_digitisation((values.float() if values.dtype == torch.bfloat16 else values).numpy())
     if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
-        "pixel values are %s: the model is fitted behind that, and the result's noise_model describes it "
-        "(digitise=False: do not)",
+        "pixel values are %s: the model is wrapped in Digitised, and noise_model of the result includes it "
+        "(disable with digitise=False)",
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
 
 
 def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:
-    """Whether the model's distributions give the mass of an interval; those of other libraries do not."""
+    """Whether the distributions of the model provide interval probabilities; those of other libraries do not."""
     return isinstance(noise_model(torch.zeros(1, device=device)), NoiseDistribution)
 
 
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:
-    """A stream of its own: data sampled with the same seed must not share its random numbers with the choice of pixels."""
+    """A separate random stream, so that the choice of pixels is independent of data sampled with the same seed."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))

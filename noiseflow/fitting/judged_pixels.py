@@ -1,4 +1,4 @@
-"""The pixels that noise models are compared on: which train and which judge, the same for every model."""
+"""Training and validation pixels for the comparison of noise models, the same for every model."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from noiseflow.arrays import as_tensor
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 
-_JUDGING_AGAIN = 0.1  # of the pixels, in the last fit of the chosen model
+_JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model
 
 
 @dataclass(frozen=True)
 class JudgedPixels:
-    """Pixels of known signals, divided into those that train and those that judge.
+    """Pixels with known signals, divided into training and validation pixels.
 
     Attributes:
-        signal, observation: shaped as given, floating.
-        use, judge, judge_again: (N,) boolean: usable pixels, those that judge, and the few of them that judge the last fit.
-        blocks: (N,) number of each pixel's block, or None where pixels err independently.
+        signal, observation: shaped as given, floating point.
+        use, judge, judge_again: (N,) boolean: usable pixels, validation pixels, and the few of these that validate the last fit.
+        blocks: (N,) block number of each pixel, or None if errors of pixels are independent.
     """
 
     signal: Tensor
@@ -45,10 +45,10 @@ class JudgedPixels:
         blocks: Tensor | NDArray[np.integer[Any]] | None,
         seed: int,
     ) -> JudgedPixels:
-        """Divide the pixels: by `held_out` where it says which, else whole blocks or lines at random.
+        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines.
 
         Raises:
-            ValueError: sizes differ, or no pixels judge or train.
+            ValueError: shapes differ, or there are no validation or too few training pixels.
         """
         if signal.shape != observation.shape:
             raise ValueError(
@@ -59,7 +59,7 @@ class JudgedPixels:
         block = _flat(blocks, observation, "blocks")
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if isinstance(held_out, float | int):
-            # NumPy's stream, not torch's: noise that was sampled with the same seed must not decide which pixels judge
+            # NumPy's generator, not torch's: the split must not depend on noise sampled with the same seed
             draw = _drawn(group, observation.numel(), seed)
             judge, again = draw < held_out, draw < min(held_out, _JUDGING_AGAIN)
         else:
@@ -67,23 +67,25 @@ class JudgedPixels:
             judge = torch.zeros_like(use) if chosen is None else chosen.bool().cpu()
             again = judge & (_drawn(group, observation.numel(), seed) < 0.5)
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
-            raise ValueError("held_out leaves no pixels to judge or too few to fit; give a fraction between 0 and 1")
+            raise ValueError(
+                "held_out leaves no validation pixels or too few training pixels; give a fraction between 0 and 1"
+            )
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
         block = None if block is None else block.to(observation.device)
         return JudgedPixels(signal.float(), observation.float(), use, judge, again, block)
 
     @property
     def num_judging(self) -> int:
-        """How many pixels judge."""
+        """Number of validation pixels."""
         return int(self.judge.sum())
 
     @property
     def judging_blocks(self) -> Tensor | None:
-        """The block of each judging pixel."""
+        """The block of each validation pixel."""
         return None if self.blocks is None else self.blocks[self.judge].cpu()
 
     def training(self, model: NoiseModelBase, *, most: int | None = None) -> dict[str, Any]:
-        """Arguments of a fit of a model to the training pixels, or to about so many of them."""
+        """Arguments of a fit of a model to the training pixels, or to about `most` of them."""
         train = self.use & ~self.judge
         if model.needs_image:
             return {"signal": self.signal, "observation": self.observation, "mask": train.reshape(self.signal.shape)}
@@ -91,7 +93,7 @@ class JudgedPixels:
         return {name: value.reshape(-1)[train][part] for name, value in self._values().items()}
 
     def everything(self, model: NoiseModelBase) -> dict[str, Any]:
-        """Arguments of a fit of a model to all pixels but those that judge again."""
+        """Arguments of a fit of a model to all pixels except those that validate the last fit."""
         if model.needs_image:
             whole = {
                 "mask": self.use.reshape(self.signal.shape),
@@ -106,7 +108,7 @@ class JudgedPixels:
 
     @torch.no_grad()
     def score(self, model: NoiseModelBase, judge: Tensor | None = None) -> Tensor:
-        """Log-likelihood of each judging pixel, float64, on the CPU."""
+        """Log-likelihood of each validation pixel, float64, on the CPU."""
         judge = self.judge if judge is None else judge
         if not model.needs_image:
             found: Tensor = pixel_log_prob(model, *(value.reshape(-1)[judge] for value in self._values().values()))
@@ -129,7 +131,7 @@ def _flat(given: Any, observation: Tensor, name: str) -> Tensor | None:
 
 
 def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None:
-    """The line of each pixel, where pixels of a line share an offset under some model; None where pixels are independent."""
+    """The line of each pixel if pixels of a line share an offset under some model; None if pixels are independent."""
     axes = {model.shared_axis for model in models if model.needs_image}
     if not axes or len(shape) < 2:
         return None
@@ -141,7 +143,7 @@ def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None
 
 
 def _drawn(group: Tensor | None, count: int, seed: int) -> Tensor:
-    """A uniform number for each pixel, the same for all pixels of a group."""
+    """A uniform random number for each pixel, the same for all pixels of a group."""
     random = np.random.default_rng(seed)
     if group is None:
         return torch.from_numpy(random.random(count))

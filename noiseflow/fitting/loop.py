@@ -1,4 +1,4 @@
-"""The one optimisation loop: steps of the noise model and of the signal model, looks at the held-out pixels, recovery."""
+"""The optimisation loop: steps of noise and signal model, evaluation of the held-out pixels, and recovery."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
-_DECAY = 0.3  # of a joint fit, besides a straight line to nothing
-_LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not stray far from their table between two
+_DECAY = 0.3  # of a joint fit, multiplied by a linear decrease to zero
+_LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not move far from their table between two evaluations
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How a fit goes: see `noiseflow.fit`."""
+    """Settings of a fit; see `noiseflow.fit`."""
 
     num_steps: int
     batch_size: int
@@ -48,7 +48,7 @@ class Schedule:
 
 
 class FitLoop:
-    """A noise model, a signal model and pixels, on their way to the most likely parameters."""
+    """Maximum-likelihood fit of a noise model and a signal model to pixels."""
 
     def __init__(
         self,
@@ -77,10 +77,10 @@ class FitLoop:
         """Scale the noise model to the data and set up the optimisers.
 
         Args:
-            learning_rate: of the noise model, and of a signal model without parameter groups.
-            standardise: measure the data's scaling first.
-            train_noise: whether the noise model learns.
-            parameter_groups: of the signal model, in place of its own.
+            learning_rate: learning rate of the noise model, and of a signal model without parameter groups.
+            standardise: measure the scaling of the data first.
+            train_noise: whether to train the noise model.
+            parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:
             with torch.no_grad():
@@ -99,7 +99,7 @@ class FitLoop:
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
     def run(self, schedule: Schedule, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
-        """Take all steps that are left, and end at the best held-out state."""
+        """Take all remaining steps, and restore the best held-out state."""
         started = saved = time.perf_counter()
         num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
@@ -110,7 +110,7 @@ class FitLoop:
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
         if self.done == 0:
-            self._judge(0)  # a good start must not be lost to worse steps
+            self._judge(0)  # a good initial state must not be lost
         try:
             for step in range(self.done + 1, num_steps + 1):
                 past = (step - 1) / num_steps
@@ -146,7 +146,7 @@ class FitLoop:
         return self.result
 
     def _take_step(self, step: int, schedule: Schedule) -> bool:
-        """One step of whatever learns; False where it met a number that is not finite."""
+        """Take one step of all trainable models. Return False if loss or gradient was not finite."""
         joint = self.signal_optimiser is not None
         finite = self._signal_step(schedule.batch_size)
         if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
@@ -159,13 +159,13 @@ class FitLoop:
         return finite
 
     def _judge(self, step: int) -> dict[str, Any] | None:
-        """Look at the held-out pixels with the average of the weights, where there is one; the weights to go back to."""
+        """Evaluate the held-out pixels, with averaged weights if there are any. Return the state to recover to."""
         with nullcontext() if self.average is None else self.average.in_place():
             scores, count = self._look()
             nll = -float(scores.sum()) / count
             if not math.isfinite(nll):
                 return None
-            # a joint fit moves on slowly, and each of its looks is as good as its weights: there the best look counts
+            # a joint fit changes slowly and its weights are not averaged: there the best evaluation counts
             models = self._models()
             if self.best.judge(models, scores, start=step == 0, strict=self.average is None):
                 self.result.held_out_nll = nll
@@ -173,7 +173,7 @@ class FitLoop:
         return models if self.average is None else self._models()
 
     def _look(self, most: int | None = None) -> tuple[Tensor, int]:
-        """Log-likelihoods of some held-out pixels; from the table, where it is accurate and the noise model stays as it is."""
+        """Log-likelihoods of some held-out pixels, from the table if it is accurate and the noise model is frozen."""
         if most is None:
             most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
         if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
@@ -183,13 +183,13 @@ class FitLoop:
             return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
 
     def _never_improves(self, schedule: Schedule) -> bool:
-        """Whether the start is still the best of several looks after 40 % of the steps: there is nothing left to learn."""
+        """Whether the initial state is still the best of several evaluations after 40 % of the steps."""
         history = self.result.history
         late = self.done >= 0.4 * schedule.num_steps and len(history) > 1
         return late and history.get(0, math.inf) <= min(history.values())
 
     def _check_table(self, *, rarely: bool) -> None:
-        """Signals may leave the table; a model that learns may outgrow it, but slowly: seen in every fifth look."""
+        """Update the table: signals may leave it, and a trained noise model slowly changes (checked every fifth time)."""
         table = self.table
         if table is None:
             return
@@ -219,7 +219,7 @@ class FitLoop:
 
     @torch.no_grad()
     def _compute_fixed_part(self) -> Tensor | None:
-        """What of every pixel's likelihood no step can change, where the noise model knows such a thing."""
+        """The part of each pixel's likelihood that no step changes, if the noise model defines one."""
         pixels = torch.cat([self.pixels.train, self.pixels.judge])
         if pixels.numel() > _FIXED_COUNT:
             return None
@@ -236,7 +236,7 @@ class FitLoop:
     def _full_batch_loss(self) -> Tensor:
         signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
         observation, weight = self.pixels.observation, self.pixels.weight
-        if self.table is not None:  # a step wants the gradient alone, and the tangent has the same
+        if self.table is not None:  # a step needs only the gradient, which the tangent shares
             return -torch.dot(self.table.slope(signal).mul_(weight), signal)
         if needs_image(self.noise_model):
             shape = self.pixels.shape
@@ -246,7 +246,7 @@ class FitLoop:
         return -torch.dot(log_prob, weight.to(log_prob.dtype))
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
-        """Mean negative log-likelihood of pixels (P,) or of lines of them (P, L), nats per pixel."""
+        """Mean negative log-likelihood of pixels (P,) or of lines of pixels (P, L), nats per pixel."""
         log_prob = self._log_prob(pixels, learn_signal=learn_signal)
         return -log_prob.mean() if pixels.ndim == 1 else -log_prob.sum() / self._count(pixels)
 
@@ -273,7 +273,7 @@ class FitLoop:
 
     @torch.no_grad()
     def held_out_log_prob(self, most: int) -> tuple[Tensor, int]:
-        """Log-likelihoods of at most so many held-out pixels, or of lines of as many, and the number of pixels."""
+        """Log-likelihoods of at most `most` held-out pixels, or of lines with as many pixels, and the number of pixels."""
         pixels = thinned(self.pixels.judge, most)
         parts = torch.split(pixels, max(1, 32768 // pixels[0].numel()))
         return torch.cat([self._log_prob(part).double() for part in parts]), self._count(pixels)
@@ -307,7 +307,7 @@ class FitLoop:
                 group["lr"] = rate * factor
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on from here."""
+        """Everything needed to resume from this point."""
         return {
             **self._models(),
             "best": self.best.saved(),
@@ -322,7 +322,7 @@ class FitLoop:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go back to a state that `state` returned."""
+        """Restore a state that `state` returned."""
         self._load_models(state)
         for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)

@@ -15,27 +15,27 @@ from noiseflow.distributions.tabulated import SIZES, Columns, RootScale, Rows, i
 
 _MAX_LEVELS = 1024
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
-_CHUNK = 2**18  # pixels; what a lookup writes for them stays in the cache
-_WORTHWHILE = 0.7  # error of finer columns, relative to that of the size before
+_CHUNK = 2**18  # pixels per lookup, so that intermediate arrays fit in the cache
+_WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
 
 
 class ObservationTable:
-    """log p(o | s) and its signal derivative for pixels whose observations stay fixed while their signals change.
+    """log p(o | s) and its derivative with respect to the signal, for pixels with fixed observations and changing signals.
 
-    Rows are signals. Where the observations have few levels (integer counts, 8-bit data), columns are the levels themselves:
-    nothing is interpolated along them, and the table is small. Otherwise, or where no such table is accurate enough, columns are
-    residuals: noise changes fast along the residual and slowly along the signal. Beyond the rows the log-likelihood continues
-    along its slope, so that a stray signal is still pulled back.
+    Rows are signals. If the observations have few levels (integer counts, 8-bit data), columns are the levels: there is no
+    interpolation along them, and the table is small. Otherwise, or if such a table is not accurate enough, columns are
+    residuals, because the likelihood changes fast along the residual and slowly along the signal. Beyond the rows the
+    log-likelihood continues linearly, so that signals out of range still have a gradient towards it.
 
     Args:
         noise_model: the model to tabulate; call `rebuild` after it changes.
         observation: (N,) pixel values.
-        signal_low, signal_high: range of the signals to expect.
+        signal_low, signal_high: expected range of the signals.
         tolerance: accepted mean absolute interpolation error, nats per pixel.
-        resume: what `state` returned; the table takes the same rows and columns again.
+        resume: the result of `state`, to build the table with the same rows and columns.
 
     Attributes:
-        error: the error last measured, nats per pixel.
+        error: the last measured error, nats per pixel.
     """
 
     def __init__(
@@ -59,17 +59,17 @@ class ObservationTable:
             self._build_again(noise_model, resume)
 
     def state(self) -> dict[str, Any]:
-        """What makes the same rows and columns again: their number, the range of signals, the model they were laid out for."""
+        """Layout of the table: its size, the range of signals, and the model it was made for."""
         return {"low": self.low, "high": self.high, "size": self._size, "laid_out_for": self._laid_out_for}
 
     @property
     def _num_sizes(self) -> int:
-        """Of tables to try: rows with all levels of the observations for columns, if they are few, then rows and residuals."""
+        """Number of table sizes to try: first with observation levels as columns, if they are few, then with residuals."""
         return len(SIZES) if self._levels is None else 2 * len(SIZES)
 
     @cached_property
     def _levels(self) -> Tensor | None:
-        """All levels of the observations, if they are few."""
+        """All levels of the observations if they are few, otherwise None."""
         some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
         return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
 
@@ -82,8 +82,8 @@ class ObservationTable:
         self.error = self.measure_error(noise_model)
 
     def _refine(self, noise_model: nn.Module) -> None:
-        """Take the first size from the present one on that is accurate enough, or else the most accurate one; sizes of one kind
-        are left out where finer ones gain little."""
+        """Choose the first size, from the present one on, that is accurate enough, or otherwise the most accurate one. Finer
+        sizes of a kind are skipped if refinement gains little."""
         errors: dict[int, float] = {}
         size = self._size
         while size < self._num_sizes:
@@ -99,20 +99,20 @@ class ObservationTable:
             self.error = self._build(noise_model, best)
 
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
-        """Lay the rows out for a wider range where more than a few of the signals have left them: beyond the rows the
-        likelihood has no curvature, and where clipping limits hide the observations nothing else would hold a signal back."""
+        """Rebuild the rows for a wider range if more than a few signals have left it. Beyond the rows the likelihood has no
+        curvature, and signals of clipped observations would be unconstrained."""
         stray = int(_STRAY * signal.numel())
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
         if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
             return
         span = max(self.high - self.low, high - low)
-        # a wide margin at the weak end would take the resolution from weak signals, whose noise is the narrowest
+        # a wide margin at the low end would reduce the resolution for weak signals, which have the narrowest noise
         self.low = 2 * low - self.low - _LOW_MARGIN * span if low < self.low else self.low
         self.high = high + _MARGIN * span if high > self.high else self.high
         self._refine(noise_model)
 
     def check(self, noise_model: nn.Module) -> float:
-        """Measure the error again, and refine the table where the model has outgrown it."""
+        """Measure the error again, and refine the table if it is no longer accurate."""
         self.error = self.measure_error(noise_model)
         if self.error > self._tolerance and self._size + 1 < self._num_sizes:
             self._refine(noise_model)
@@ -140,19 +140,19 @@ class ObservationTable:
 
     @torch.no_grad()
     def rebuild(self, noise_model: nn.Module) -> None:
-        """Tabulate the model as it is now."""
+        """Tabulate the current model."""
         value = log_likelihood(noise_model, self._signals, self._values, between_rails=self._columns is not None)
         (slope,) = torch.gradient(value, spacing=(self._signals[:, 0],), dim=0)
         if self._columns is not None:
-            # along a column of equal residual r = t(o) − t(s) the observation moves with the signal:
+            # along a column of constant residual r = t(o) − t(s) the observation changes with the signal:
             # ∂/∂s at fixed o = ∂/∂s at fixed r − t'(s) ∂/∂r
             (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
             slope[:, 1:-1] -= along * self._scale.slope(self._signals)
-        # two tables, for a lookup of both channels of one takes three times as long as that of a single one
+        # two tables, because a lookup in a two-channel table takes three times as long as in a one-channel table
         self._value, self._slope = value[None, None].contiguous(), slope[None, None].contiguous()
 
     def log_prob(self, signal: Tensor, part: slice | Tensor = slice(None)) -> Tensor:
-        """Log-likelihood at (N,) signals, without gradient; of a part of the pixels, or some, where they are given."""
+        """Log-likelihood at (N,) signals, without gradient; `part` selects pixels."""
         signal = signal.detach()
         clamped = signal.clamp(self.low, self.high)
         places = self._places(clamped, part)
@@ -170,7 +170,7 @@ class ObservationTable:
         return found
 
     def _places(self, signal: Tensor, part: slice | Tensor) -> Tensor:
-        """Texture coordinates of signals within the rows, (n, 2)."""
+        """Texture coordinates of the signals, clamped to the rows, (n, 2)."""
         root, places = self._scale.signal(signal), signal.new_empty(2, signal.numel())
         across = torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=places[0])
         if self._bounds is not None:
@@ -194,10 +194,10 @@ class ObservationTable:
 
 
 class TableKeeper:
-    """The table of some pixels under a noise model that stays as it is, made by the first fit that needs it.
+    """Stores the table of a set of pixels under a frozen noise model, built by the first fit that needs it.
 
     Attributes:
-        resume: what `state` returned; the table is made again with the same rows and columns.
+        resume: the result of `state`, to build the table with the same rows and columns.
     """
 
     def __init__(self) -> None:
@@ -205,11 +205,11 @@ class TableKeeper:
         self.resume: dict[str, Any] | None = None
 
     def get(self, make: Callable[[dict[str, Any] | None], ObservationTable]) -> ObservationTable:
-        """The table, made by ``make(resume)`` if there is none."""
+        """The table, built by ``make(resume)`` if there is none."""
         if self.table is None:
             self.table, self.resume = make(self.resume), None
         return self.table
 
     def state(self) -> dict[str, Any] | None:
-        """What makes the same table again; None where there is none."""
+        """Layout of the table, to build it again; None if there is none."""
         return self.resume if self.table is None else self.table.state()

@@ -1,4 +1,4 @@
-"""The pixels of a fit: which train and which judge, one by one or in whole lines."""
+"""Training and validation pixels of a fit, chosen singly or in whole lines."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class FitPixels:
     """The pixels of a fit.
 
     Attributes:
-        observation: (N,) pixel values; unusable ones hold some finite number, or NaN where lines are fitted.
-        shape: of the images they come from.
-        train, judge: indices of the pixels that train and of those that judge, (P,); or of lines of pixels, (P, L).
+        observation: (N,) pixel values; unusable ones are replaced by a finite number, or by NaN if lines are fitted.
+        shape: shape of the images.
+        train, judge: indices of training and validation pixels, (P,), or of lines of pixels, (P, L).
         weight: (N,) weight of each pixel in a full-batch loss.
         generator: source of the random choices.
     """
@@ -39,11 +39,11 @@ class FitPixels:
         train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
         if train.numel() < 2 or judging.numel() < 1:
             raise ValueError(
-                f"{int(use.sum())} usable pixels are too few to fit and judge a noise model; use a larger image"
+                f"{int(use.sum())} usable pixels are too few to fit and validate a noise model; use a larger image"
             )
         flat = observation.reshape(-1)
         bad = ~torch.isfinite(flat)
-        if bool(bad.any()):  # unused pixels get weight 0, and 0·NaN must not reach the sum
+        if bool(bad.any()):  # unused pixels have weight 0, but 0·NaN would make the sum NaN
             flat = torch.where(bad, flat[use].mean(), flat)
         weight = (use & ~judge).to(flat.dtype) / train.numel()
         return FitPixels(flat, observation.shape, train, judging, weight, generator)
@@ -52,7 +52,7 @@ class FitPixels:
     def choose_lines(
         observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator, *, axis: int
     ) -> FitPixels:
-        """Divide whole rows (axis −1) or columns (−2) of images; a given `held_out` takes the lines of which it holds most.
+        """Divide whole rows (axis −1) or columns (−2) of images. A mask `held_out` selects lines of which it covers most.
 
         Raises:
             ValueError: too few lines.
@@ -67,7 +67,7 @@ class FitPixels:
         train, judging = lines[~judge], lines[judge]
         if len(train) < 2 or len(judging) < 1:
             raise ValueError(
-                f"{len(lines)} usable rows or columns are too few to fit and judge offsets of each; use a larger image"
+                f"{len(lines)} usable rows or columns are too few to fit and validate an offset for each; use a larger image"
             )
         flat = torch.where(use, observation.reshape(-1), math.nan)
         return FitPixels(flat, observation.shape, train, judging, torch.zeros_like(flat), generator)
@@ -78,7 +78,7 @@ class FitPixels:
         return self.shape[-2], self.shape[-1]
 
     def batch(self, size: int) -> Tensor:
-        """About `size` training pixels, or lines of as many, drawn at random."""
+        """About `size` training pixels, or lines with as many pixels, drawn at random."""
         count = min(size, self.train.numel()) * len(self.train) // self.train.numel()
         draw = torch.randint(len(self.train), (max(1, count),), generator=self.generator)
         return self.train[draw.to(self.train.device)]
@@ -91,5 +91,5 @@ def _drawn(use: Tensor, held_out: float | Tensor, generator: torch.Generator) ->
 
 
 def thinned(pixels: Tensor, most: int) -> Tensor:
-    """At most `most` pixels, evenly picked from pixels (P,) or lines (P, L)."""
+    """At most `most` pixels, evenly selected from pixels (P,) or lines (P, L)."""
     return pixels[:: max(1, -(-pixels.numel() // most))]

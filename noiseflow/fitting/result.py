@@ -1,4 +1,4 @@
-"""What a fit reached."""
+"""The result of a fit."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from noiseflow.models.digitisation import Digitisation
 @described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
 @dataclass
 class FitResult:
-    """What a fit reached.
+    """The result of a fit.
 
     Attributes:
-        noise_model: the fitted model: the one given, behind a `Digitised` where rounding or clipping limits were found.
-        digitisation: the rounding and clipping limits it was put behind; none where it was left as it is.
+        noise_model: the fitted model, wrapped in `Digitised` if rounding or clipping was detected.
+        digitisation: the detected rounding and clipping limits; none if the model was not wrapped.
         held_out_nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
         num_steps: steps taken.
         seconds: wall time.
-        recoveries: how often a non-finite step was undone with half the learning rate.
-        history: step → held-out NLL, in the order measured.
-        table_error: interpolation error of the tabulated likelihood, nats per pixel; None where none was used.
+        recoveries: number of non-finite steps that were undone and repeated with half the learning rate.
+        history: step → held-out NLL, in order of measurement.
+        table_error: interpolation error of the tabulated likelihood, nats per pixel; None if no table was used.
 
     Example:
         >>> import noiseflow, torch

@@ -1,4 +1,4 @@
-"""Which noise model suffices: several are fitted to the same pixels, and held-out likelihood chooses the simplest that does."""
+"""Model selection: fit several noise models to the same pixels and choose the simplest sufficient one."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 
 NEGLIGIBLE = 2e-4
-"""nats per pixel that never speak against a simpler model: the interpolation of tables and the end of a fit differ by as much."""
+"""Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
+this large."""
 MOST_FOR_SIMPLICITY = 5e-4
-"""nats per pixel above which a simpler model is never taken, however uncertain: a million pixels would lose 500 nats."""
+"""Loss in nats per pixel above which a simpler model is never chosen, whatever its standard error: a million pixels would lose
+500 nats."""
 LEAST_PIXEL_COST = 8.0
-"""nats over all judging pixels that may be lost to simplicity where these are few: what chance gives a model (χ²/2) whose
-parameters, of which the judging pixels tell about sixteen apart, describe nothing."""
+"""Total loss in nats over all validation pixels that is accepted for a simpler model if these are few: the gain by chance (χ²/2)
+of a model with about sixteen superfluous parameters."""
 
 
 class _Scored(Protocol):
-    """A candidate with its held-out figures."""
+    """A candidate with its held-out likelihood."""
 
     @property
     def excess(self) -> float: ...
@@ -47,14 +49,14 @@ class Candidate:
     """A fitted noise model and its held-out likelihood.
 
     Attributes:
-        name: of the candidate.
+        name: name of the candidate.
         model: the fitted model.
         nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
-        excess: `nll` above the best candidate's.
+        excess: `nll` minus that of the best candidate.
         excess_error: standard error of `excess`, from the same pixels under both models.
-        seconds: time to fit.
-        screened_out: whether the short first fit showed that it cannot be chosen, so that it was not fitted further.
-        learning_rate: starting rate of its last fit: its own, or more where it had not converged.
+        seconds: fitting time.
+        screened_out: whether the model was excluded after the short first fit.
+        learning_rate: initial learning rate of its last fit; larger than its default if it had not converged.
     """
 
     name: str
@@ -73,10 +75,10 @@ class Selection:
     """All candidates, simplest first, and the chosen one.
 
     Attributes:
-        candidates: as given, simplest first.
-        chosen: the `simplest_sufficient` one. Its `nll` and `excess` are those of the comparison; its model has since learnt
-            from the judging pixels too, unless it was not to be fitted again.
-        digitisation: rounding and clipping detected, and put around every candidate.
+        candidates: all candidates in the given order, simplest first.
+        chosen: the `simplest_sufficient` candidate. Its `nll` and `excess` are those of the comparison; its model was then
+            fitted to the validation pixels too, unless `refit` was False.
+        digitisation: detected rounding and clipping, included in every candidate.
     """
 
     candidates: tuple[Candidate, ...]
@@ -85,7 +87,7 @@ class Selection:
 
 
 def default_candidates() -> dict[str, nn.Module]:
-    """The noise models that compete, simplest (fewest parameters) first."""
+    """The default candidates for model selection, simplest (fewest parameters) first."""
     return {
         "Gaussian": baselines.Gaussian(),
         "PoissonGaussian": physical.PoissonGaussian(),
@@ -99,26 +101,26 @@ def default_candidates() -> dict[str, nn.Module]:
 
 
 def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, negligible: float = NEGLIGIBLE) -> _Item:
-    """The simplest model whose held-out likelihood lies within one standard error of the best: the one rule of the library.
+    """The simplest model whose held-out likelihood is within one standard error of the best.
 
-    One standard error counts as at least `negligible` and at most `MOST_FOR_SIMPLICITY` nats per pixel, or `LEAST_PIXEL_COST`
-    nats over all judging pixels where that is more.
+    The standard error is limited to the range from `negligible` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
+    nats over all validation pixels if that is more.
 
     Args:
-        candidates: simplest first, with their excess over the best and its standard error, nats per pixel.
-        num_judging: number of judging pixels.
-        negligible: nats per pixel that never speak against a simpler model; more where the signal is an estimate, whose
-            errors a richer model may describe.
+        candidates: candidates, simplest first, with their excess over the best and its standard error, nats per pixel.
+        num_judging: number of validation pixels.
+        negligible: difference that is never held against a simpler model, nats per pixel; larger if the signal is an estimate,
+            whose errors a more flexible model may describe.
 
     Raises:
-        ValueError: every candidate calls some judging pixel impossible.
+        ValueError: some validation pixels are impossible under every candidate.
     """
     most = max(MOST_FOR_SIMPLICITY, LEAST_PIXEL_COST / num_judging)
     for item in candidates:
         if item.excess <= max(min(item.excess_error, most), negligible):
             return item
     raise ValueError(
-        "every candidate calls some of the judging pixels impossible; add a candidate such as SplineFlow()"
+        "some validation pixels are impossible under every candidate; add a more flexible candidate such as SplineFlow()"
     )
 
 
@@ -136,31 +138,31 @@ def select(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Selection:
-    """Fit several noise models to the same pixels and choose the simplest that suffices: see `simplest_sufficient`.
+    """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    Rounding and clipping are detected and put around every candidate. All candidates get a short fit to some of the pixels;
-    those whose held-out likelihood is then hopelessly behind (0.02 nats, and three standard errors) get no long one. Rates and
-    steps are the models' own (``learning_rate``, ``num_steps``); a model that is behind and still gaining on the best goes on
-    from where it is, at twice the rate, for as long as that closes a tenth of the gap. The chosen one is fitted again to all
-    pixels but a tenth, which says when to stop.
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. All candidates are first fitted briefly to
+    some of the pixels; those whose held-out likelihood is then far behind (0.02 nats and three standard errors) are screened out.
+    The others are fitted fully, with the learning rate and number of steps of each model. A model that is behind but still
+    improving is fitted further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then
+    fitted again to all pixels except a tenth, which are used for early stopping.
 
     Args:
-        signal, observation: tensors or arrays of equal shapes, detector units; images (..., y, x) where a candidate looks beyond
-            single pixels.
+        signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
+            neighbouring pixels.
         candidates: models by name, simplest first; they are fitted in place. `default_candidates` by default.
         mask: pixels to use, shaped like `observation`; all by default.
-        held_out: fraction of the pixels kept apart to judge, or those, boolean, shaped like `observation`.
-        blocks: number of the block that each pixel belongs to, shaped like `observation`: pixels of one block may err alike.
-            Whole blocks are kept apart, and standard errors come from their scatter.
-        num_steps: optimisation steps of each, in place of the models' own; a tenth of them for one that starts at its most
-            likely parameters.
-        digitise: look for rounding and clipping; without, candidates are fitted as they are.
-        refit: fit the chosen one again to the judging pixels too.
-        seed: of all random choices.
-        progress: called with the fits done and the name of the candidate.
+        held_out: fraction of the pixels to hold out for validation, or a boolean mask shaped like `observation`.
+        blocks: block number of each pixel, shaped like `observation`, if errors within a block are correlated. Whole blocks are
+            held out, and standard errors are computed from the scatter of blocks.
+        num_steps: optimisation steps of each model, instead of its own number; a tenth for models that start at their
+            maximum-likelihood parameters.
+        digitise: detect rounding and clipping; if False, candidates are not wrapped.
+        refit: fit the chosen model again with the validation pixels included.
+        seed: seed of all random choices.
+        progress: called with the number of completed fits and the name of the candidate.
 
     Raises:
-        ValueError: as `fit`; no candidates; or all of them call some pixel impossible.
+        ValueError: as `fit`; there are no candidates; or some pixels are impossible under all of them.
 
     Example:
         >>> import noiseflow, torch
@@ -198,12 +200,12 @@ def select(
 
 
 def _needs_converter(model: NoiseModelBase) -> bool:
-    """Whether rounding and clipping are put around a candidate: the grid of a `Poisson` model is its own, not the converter's."""
+    """Whether a candidate is wrapped in `Digitised`; not a `Poisson` model, which has its own grid of values."""
     return isinstance(model, baselines.Poisson) or not model.describes_single_readings
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:
-    """All candidates with their held-out figures."""
+    """All candidates with their held-out likelihoods."""
     best, found = contest.best(), []
     for name, score in contest.scores.items():
         model = contest.models[name]

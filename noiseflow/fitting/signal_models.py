@@ -1,4 +1,4 @@
-"""Models of the clean signal that ship with the library: a known image, and a still scene seen many times."""
+"""Models of the clean signal: a known image, and a static scene observed repeatedly."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from noiseflow.arrays import as_tensor
 from noiseflow.models.base import Described
 
-_RATE = 0.15  # of the frames' deviation: some hundred steps, their rates falling, reach the estimate of any pixel
+_RATE = 0.15  # of the standard deviation of the exposures: a hundred steps with decreasing rates reach the estimate of any pixel
 
 
 class KnownSignal(Described):
-    """A known clean image as a signal model: nothing to learn.
+    """A known clean image as a signal model without parameters.
 
     Args:
         signal: clean image, any shape, detector units.
@@ -44,21 +44,21 @@ class KnownSignal(Described):
 
 
 class StaticScene(Described):
-    """Repeated exposures of one still scene: the clean image is learnt, one value per pixel.
+    """Repeated exposures of a static scene: the clean image is estimated, with one parameter per pixel.
 
-    Where noise is Gaussian the most likely image is the mean of the exposures. Where it has outliers, a long tail or clipping, a
-    joint fit finds an image that is nearer to the truth, for it weighs every exposure by the noise that it learns.
+    For Gaussian noise the maximum-likelihood image is the mean of the exposures. For noise with outliers, long tails or clipping,
+    a joint fit gives a more accurate image, because it weights every exposure according to the fitted noise.
 
-    Every exposure has a share in the image it is compared with, so residuals are too small by √(1 − 1/n) (Neyman & Scott 1948,
-    doi:10.2307/1914288). What the model predicts for a pixel of an exposure therefore lies further from that exposure, by the
-    inverse factor: the noise learnt has the right width, of whatever law, and its skewness to about 1/n.
+    Every exposure contributes to the image it is compared with, so residuals are too small by √(1 − 1/n) (Neyman & Scott 1948,
+    doi:10.2307/1914288). The prediction for each pixel of an exposure is therefore moved away from that exposure by the inverse
+    factor. The fitted noise then has the correct width for any distribution, and the correct skewness to about 1/n.
 
-    Scenes need signals over many widths of the noise, or a noise model that does not depend on the signal: a free value for every
-    pixel could otherwise tell the noise model, by moving a little, how far its exposures are off.
+    The signals must span many widths of the noise, unless the noise model does not depend on the signal. Otherwise the free pixel
+    values can encode the residuals of their exposures for the noise model.
 
     Args:
-        exposures: (n, ...) repeated exposures, detector units; the clean image starts at their mean. NaN and infinite pixels are
-            left out.
+        exposures: (n, ...) repeated exposures, detector units; the clean image is initialised with their mean. NaN and infinite
+            pixels are excluded.
 
     Raises:
         ValueError: fewer than two exposures.
@@ -76,7 +76,9 @@ class StaticScene(Described):
     def __init__(self, exposures: Tensor | NDArray[Any]) -> None:
         super().__init__()
         if exposures.shape[0] < 2:
-            raise ValueError("a static scene needs at least two exposures; one exposure cannot tell signal from noise")
+            raise ValueError(
+                "a static scene needs at least two exposures; a single one cannot separate signal from noise"
+            )
         frames = as_tensor(exposures).detach()
         frames = frames if frames.is_floating_point() else frames.to(torch.get_default_dtype())
         self.count, self.shape = frames.shape[0], frames.shape[1:]
@@ -86,7 +88,7 @@ class StaticScene(Described):
         number = seen.sum(0).clamp(min=1).to(flat.dtype)
         mean = flat.sum(0) / number
         self.scene = nn.Parameter(torch.where(seen.any(0), mean, mean.mean()))
-        # not part of the state: copies of a fit's state would each hold all exposures
+        # not part of the state, because every copy of the state would hold all exposures
         self.register_buffer("exposures", torch.where(seen, flat, mean).reshape(-1), persistent=False)
         widening = torch.where(number > 1, torch.sqrt(number / (number - 1).clamp(min=1)), torch.ones_like(number))
         self.register_buffer("widening", widening, persistent=False)
@@ -97,7 +99,7 @@ class StaticScene(Described):
         return self._apart(self.scene[place], self.exposures[pixels], self.widening[place])
 
     def signal(self) -> Tensor:
-        """What the model predicts for all pixels of all exposures, flat."""
+        """Predictions for all pixels of all exposures, flat."""
         return self._apart(self.scene.repeat(self.count), self.exposures, self.widening.repeat(self.count))
 
     @staticmethod
@@ -105,7 +107,7 @@ class StaticScene(Described):
         return exposure + (scene - exposure) * widening
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The scene, at a rate that suits the deviation of the exposures."""
+        """The scene, with a learning rate proportional to the standard deviation of the exposures."""
         spread = self._deviation or float(self.scene.detach().std()) or 1.0
         return [{"params": [self.scene], "lr": _RATE * spread}]
 
@@ -119,11 +121,11 @@ class StaticScene(Described):
 
 @torch.no_grad()
 def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
-    """Refuse a signal model that gives other shapes than `SignalModel` says, before anything is fitted to it.
+    """Check that a signal model returns the shapes that `SignalModel` specifies.
 
     Raises:
-        TypeError: not a module.
-        ValueError: `signal()` is not flat, `penalty()` no scalar, or the prediction of two pixels not two numbers.
+        TypeError: it is not a module.
+        ValueError: `signal()` is not flat, `penalty()` is not a scalar, or the prediction for two pixels is not two numbers.
     """
     if not isinstance(signal_model, nn.Module):
         raise TypeError(
@@ -135,8 +137,8 @@ def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
         shape = tuple(signal_model.signal().shape)  # type: ignore[operator]
         if shape != (num_pixels,):
             raise ValueError(
-                f"{kind}.signal() has shape {shape} and the observation {num_pixels} pixels; return all of them flat, "
-                "with .reshape(-1)"
+                f"{kind}.signal() has shape {shape}, but the observation has {num_pixels} pixels; return all pixels as "
+                "a flat tensor, with .reshape(-1)"
             )
     some = torch.arange(min(2, num_pixels), device=device)
     shape = tuple(signal_model(some).shape)

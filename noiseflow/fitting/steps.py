@@ -1,4 +1,4 @@
-"""Single steps of an optimiser that a number that is not finite cannot spoil."""
+"""Single optimiser steps that are skipped if loss or gradient is not finite."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from torch import Tensor
 
 
 def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
-    """An optimiser without the guards that keep torch's compiler out of its methods: the first call of one loads the whole
-    compiler, which takes seconds."""
+    """An optimiser class without torch's compiler guards, whose first call loads the compiler and takes seconds."""
     names = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
     methods = {name: inspect.unwrap(getattr(kind, name)) for name in names}
     return type(kind.__name__, (kind,), methods | {"step": torch.no_grad()(inspect.unwrap(kind.step))})
@@ -22,13 +21,13 @@ _Adam, _LBFGS = _without_compiler(torch.optim.Adam), _without_compiler(torch.opt
 
 
 def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
-    """Adam, with a short memory of the gradients' sizes."""
+    """Adam with a short memory of squared gradients."""
     optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=(0.9, 0.99), fused=True)
     return optimiser
 
 
 def lbfgs(parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 100) -> torch.optim.LBFGS:
-    """L-BFGS with a line search by the strong Wolfe conditions."""
+    """L-BFGS with a strong-Wolfe line search."""
     optimiser: torch.optim.LBFGS = _LBFGS(
         list(parameters), max_iter=max_iter, history_size=history_size, line_search_fn="strong_wolfe"
     )
@@ -36,7 +35,7 @@ def lbfgs(parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 10
 
 
 def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> bool:
-    """One step of an optimiser; False, and no step, where loss or gradient is not finite."""
+    """Take one optimiser step. Return False, without a step, if loss or gradient is not finite."""
     optimiser.zero_grad(set_to_none=True)
     value = loss()
     if not bool(torch.isfinite(value)):

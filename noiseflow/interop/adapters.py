@@ -18,18 +18,18 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.mixture import MixtureDistribution
 
 _NUM_PIXELS, _AT_ONCE = 100_000, 8192
-_LEAST_VARIANCE = 1e-4  # of the noise's own
+_LEAST_VARIANCE = 1e-4  # relative to the variance of the noise
 
 
 def to_deepinv(noise_model: nn.Module, *, seed: int = 0) -> Any:
-    """A noise model as a ``deepinv.physics.NoiseModel``: a module called with ``(x, seed=None)`` that gives noisy ``x``.
+    """Convert a noise model to a ``deepinv.physics.NoiseModel``, called as ``model(x, seed=None)``.
 
     Args:
-        noise_model: the model; it is not copied.
-        seed: of the generator that is used where a call gives no seed.
+        noise_model: the noise model; it is not copied.
+        seed: seed of the generator for calls without a seed.
 
     Returns:
-        What ``deepinv.physics.Physics(noise_model=…)`` takes. Images are in the noise model's detector units, any shape.
+        A module for ``deepinv.physics.Physics(noise_model=…)``. Images have any shape and the detector units of the noise model.
 
     Raises:
         ModuleNotFoundError: deepinv is not installed.
@@ -39,13 +39,13 @@ def to_deepinv(noise_model: nn.Module, *, seed: int = 0) -> Any:
 
 
 def to_deepinv_fidelity(noise_model: nn.Module) -> Any:
-    """A noise model's likelihood as a ``deepinv.optim.DataFidelity``: −log p(y | A(x)), summed over each image.
+    """Convert the likelihood of a noise model to a ``deepinv.optim.DataFidelity``: −log p(y | A(x)), summed over each image.
 
     Args:
-        noise_model: the model; it is not copied.
+        noise_model: the noise model; it is not copied.
 
     Returns:
-        What deepinv's optimisers take as ``data_fidelity``. Measurements are in the noise model's detector units.
+        The argument ``data_fidelity`` of deepinv's optimisers. Measurements have the detector units of the noise model.
 
     Raises:
         ModuleNotFoundError: deepinv is not installed.
@@ -57,7 +57,9 @@ def _deepinv() -> Any:
     try:
         return import_module("noiseflow.interop.deepinv")
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("this needs deepinv; python -m pip install 'noiseflow[deepinv]'") from error
+        raise ModuleNotFoundError(
+            "this needs deepinv; install it with: python -m pip install 'noiseflow[deepinv]'"
+        ) from error
 
 
 def to_pn2v_gmm(
@@ -70,33 +72,33 @@ def to_pn2v_gmm(
     num_steps: int = 1000,
     seed: int = 0,
 ) -> float:
-    """Write the Gaussian-mixture noise model of PN2V and CAREamics that comes closest to a noise model.
+    """Approximate a noise model by the Gaussian-mixture model of PN2V and CAREamics, and write it to a file.
 
-    A mixture whose means, variances and log-weights are polynomials of the signal is fitted to draws of the model, whichever that
-    is. The file's form leaves out what the pixel's place decides and what the converter does: of a `Digitised` or `WithMaps`
-    model, the model inside is written; of `ScanNoise`, the law of single pixels; of one that looks at a neighbourhood, that of
-    even surroundings. The mean of the mixture is the signal.
+    A mixture whose means, variances and log-weights are polynomials of the signal is fitted to draws of the model. The mean of
+    the mixture is the signal. The file format cannot describe digitisation or dependence on the pixel's position. For `Digitised`
+    and `WithMaps`, the inner model is written; for `ScanNoise`, the distribution of single pixels; for models that depend on a
+    neighbourhood, the distribution with uniform surroundings.
 
     Args:
-        noise_model: the model.
+        noise_model: the noise model.
         path: ``.npz`` file to write; ``GaussianMixtureNMConfig(path=…)`` of CAREamics reads it.
-        signal_range: signals to cover, detector units; those the model was fitted on by default.
-        num_gaussians: Gaussians of the mixture.
-        num_coefficients: coefficients of each polynomial.
+        signal_range: range of signals to cover, detector units; by default the range that the model was fitted on.
+        num_gaussians: number of Gaussians in the mixture.
+        num_coefficients: number of coefficients of each polynomial.
         num_steps: optimisation steps.
-        seed: of all random choices.
+        seed: seed of all random choices.
 
     Returns:
-        The divergence of the mixture from the model, nats per pixel, mean over the signals.
+        Mean divergence of the mixture from the model over the signals, nats per pixel.
 
     Raises:
-        ValueError: the model does not tell which signals it was fitted on and `signal_range` is not given, or the range is empty.
+        ValueError: `signal_range` is empty, or not given although the model has no record of the signals it was fitted on.
     """
     path = check_output(path, suffixes=frozenset({".npz"}))
     model = as_noise_model(noise_model).without_converter()
     low, high = _fitted_range(model) if signal_range is None else signal_range
     if not low < high:
-        raise ValueError(f"signal_range is {low:g} … {high:g}; the first must lie below the second")
+        raise ValueError(f"signal_range is {low:g} … {high:g}; the first value must be below the second")
     generator = torch.Generator().manual_seed(seed)
     signal = low + (high - low) * torch.rand(_NUM_PIXELS, generator=generator)
     observation = _draws(model, signal, generator)
@@ -104,20 +106,20 @@ def to_pn2v_gmm(
     fit(mixture, signal, observation, digitise=False, num_steps=num_steps, learning_rate=3e-2, generator=generator)
     with atomic_path(path) as partial:
         np.savez(partial, **mixture.arrays())
-    observation = _draws(model, signal, generator)  # others than those it was fitted to
+    observation = _draws(model, signal, generator)  # independent of the draws used for fitting
     return float((_log_prob(model, signal, observation) - pixel_log_prob(mixture, signal, observation)).mean())
 
 
 def _fitted_range(model: NoiseModelBase) -> tuple[float, float]:
     if model.fitted_range is None:
         raise ValueError(
-            f"{type(model).__name__} does not say which signals it was fitted on; give signal_range=(low, high) in detector units"
+            f"{type(model).__name__} has no record of the signals it was fitted on; give signal_range=(low, high), detector units"
         )
     return model.fitted_range
 
 
 def _even(values: Tensor, model: NoiseModelBase) -> Tensor:
-    """(N, k, k) even images around pixels (N,), as large as the window that the model looks at."""
+    """(N, k, k) uniform images with the values of (N,) pixels, as large as the window of the model."""
     return values.to(model.device)[:, None, None].expand(-1, model.neighbourhood, model.neighbourhood)
 
 
@@ -136,13 +138,13 @@ def _draws(model: NoiseModelBase, signal: Tensor, generator: torch.Generator) ->
 
 @torch.no_grad()
 def _log_prob(model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
-    """Log-density of each of (N,) observations by itself, float64, on the CPU."""
+    """Log-density of each of (N,) independent observations, float64, on the CPU."""
     if not model.needs_image:
         return pixel_log_prob(model, signal.to(model.device), observation.to(model.device)).cpu()
     middle, parts = model.neighbourhood // 2, []
     for s, o in zip(torch.split(signal, _AT_ONCE), torch.split(observation, _AT_ONCE), strict=True):
         values = _even(o, model).clone()
-        if model.shared_axis is not None:  # those beside are missing, or the pixel's density would be that given them
+        if model.shared_axis is not None:  # neighbours are set to NaN, so that the density is not conditional on them
             values.fill_(torch.nan)
             values[:, middle, middle] = o.to(values)
         parts.append(model(_even(s, model)).log_prob(values)[:, middle, middle].double().cpu())
@@ -152,8 +154,8 @@ def _log_prob(model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Ten
 class PolynomialMixture(NoiseModelBase):
     """The noise model of PN2V (Prakash et al. 2020, arXiv:1911.12291) as CAREamics evaluates it.
 
-    With t the signal from 0 at `low` to 1 at `high`: the variances are Σ exp(a_i)·tⁱ, the log-weights Σ b_i·tⁱ before they are
-    normalised, and the means Σ c_i·tⁱ less their weighted mean, plus the signal.
+    Let t be the signal scaled to 0 at `low` and 1 at `high`. The variances are Σ exp(a_i)·tⁱ, the unnormalised log-weights
+    Σ b_i·tⁱ, and the means Σ c_i·tⁱ minus their weighted mean plus the signal.
 
     Args:
         low, high: range of the signals, detector units.

@@ -13,7 +13,7 @@ from noiseflow.models.around import as_noise_model
 
 
 class FittedNoise(NoiseModel):  # type: ignore[misc]
-    """Noise of a noise model, as deepinv's ``Physics(noise_model=…)`` takes it.
+    """The noise of a noise model for deepinv's ``Physics(noise_model=…)``.
 
     Args:
         model: the noise model.
@@ -31,7 +31,7 @@ class FittedNoise(NoiseModel):  # type: ignore[misc]
 
 
 class LikelihoodDistance(Distance):  # type: ignore[misc]
-    """−log p(y | u) of an image u and its observation y, summed over all but the first axis.
+    """−log p(y | u) for an image u and its observation y, summed over all but the first axis.
 
     Args:
         model: the noise model.

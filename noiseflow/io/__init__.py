@@ -1,4 +1,4 @@
-"""Images, tilt angles and alignments in and out. Every output is written beside its target and renamed into place."""
+"""Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
 from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms

@@ -1,4 +1,4 @@
-"""Alignments of a tilt series: IMOD's ``.xf`` files, read and applied on request."""
+"""Alignments of a tilt series: reading and applying IMOD's ``.xf`` files."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def read_transforms(path: str | Path) -> NDArray[np.float64]:
         (section, 2, 3): the matrix A and the shift in pixels, in the order (x, y) of IMOD.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a line is not six numbers, a matrix cannot be inverted, or there is none.
+        FileNotFoundError: the file does not exist.
+        ValueError: a line does not hold six numbers, a matrix is not invertible, or the file is empty.
     """
     path = Path(path)
     rows = []
@@ -36,29 +36,29 @@ def read_transforms(path: str | Path) -> NDArray[np.float64]:
             raise ValueError(f"{path} line {count}: six numbers A11 A12 A21 A22 DX DY are needed") from None
         row = np.array([[a11, a12, dx], [a21, a22, dy]])
         if not np.isfinite(row).all() or abs(np.linalg.det(row[:, :2])) < 1e-6:
-            raise ValueError(f"{path} line {count}: this transform cannot be inverted")
+            raise ValueError(f"{path} line {count}: this transform is not invertible; check the alignment file")
         rows.append(row)
     if not rows:
-        raise ValueError(f"{path} holds no transforms; it needs one line of six numbers per section")
+        raise ValueError(f"{path} holds no transforms; one line of six numbers per section is required")
     return np.stack(rows)
 
 
 def apply_transforms(images: NDArray[Any], transforms: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Move every image by its transform, as IMOD's ``newstack -xform``: (x', y') = A·(x − c) + (DX, DY) + c.
+    """Transform every image as IMOD's ``newstack -xform`` does: (x', y') = A·(x − c) + (DX, DY) + c.
 
-    Cubic splines interpolate, which correlates the noise of neighbouring pixels; what comes from outside an image
-    takes the image's mean.
+    Images are interpolated with cubic splines, which correlates the noise of neighbouring pixels. Regions outside the original
+    image are filled with its mean.
 
     Args:
         images: (section, y, x).
-        transforms: (section, 2, 3) of `read_transforms`; c is the middle of the image.
+        transforms: (section, 2, 3) from `read_transforms`; c is the centre of the image.
 
     Returns:
-        (section, y, x), in a temporary file where it is large.
+        (section, y, x), in a temporary file if it is large.
 
     Raises:
-        OSError: the disk has no room for that file.
-        ValueError: another number of transforms than of images.
+        OSError: the disk does not have enough space for that file.
+        ValueError: the numbers of transforms and images differ.
     """
     from scipy.ndimage import affine_transform
 
@@ -67,7 +67,7 @@ def apply_transforms(images: NDArray[Any], transforms: NDArray[np.float64]) -> N
     centre = (np.array(images.shape[1:]) - 1) / 2
     moved = mapped.temporary_map(images.shape, np.float32, in_memory=mapped.IN_MEMORY)
     for image, transform, target in zip(images, transforms, moved, strict=True):
-        back = np.linalg.inv(transform[::-1, 1::-1])  # (y, x), from the output to the input
+        back = np.linalg.inv(transform[::-1, 1::-1])  # (y, x), from output to input
         offset = centre - back @ (centre + transform[::-1, 2])
         source = image.astype(np.float64)
         affine_transform(source, back, offset, output=target, order=3, mode="constant", cval=float(source.mean()))

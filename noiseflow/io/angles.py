@@ -1,4 +1,4 @@
-"""Tilt angles: from text files, SerialEM's ``.mdoc``, and whatever lies beside a stack."""
+"""Tilt angles from text files, from SerialEM's ``.mdoc`` files, and from the angle file next to a stack."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from noiseflow.io.image_file import ImageFile
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
 LARGEST_ANGLE = 720
-"""Degrees; two full turns are more than any stage counts, and what is beyond is no angle."""
+"""Largest plausible tilt angle, degrees: two full turns, more than any stage reports."""
 
 
 def read_angles(path: str | Path) -> NDArray[np.float64]:
@@ -25,31 +25,31 @@ def read_angles(path: str | Path) -> NDArray[np.float64]:
         path: a text file with one angle per line (``.rawtlt``, ``.tlt``; blank lines are skipped), or an ``.mdoc`` file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a line is not a number, or there is none.
+        FileNotFoundError: the file does not exist.
+        ValueError: a line is not a number, or the file is empty.
     """
     path = Path(path)
     lines = text_lines(path, "angle file", holds="one angle in degrees per line")
     values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
     if not values:
-        raise ValueError(f"{path} holds no angles; it needs one angle in degrees per line")
+        raise ValueError(f"{path} holds no angles; one angle in degrees per line is required")
     return np.array(values)
 
 
 def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
-    """The tilt angles of a stack: from the angle file beside it, or else from the file itself.
+    """The tilt angles of a stack, from the angle file next to it or else from the file itself.
 
     Args:
-        stack: the file the stack was read from. Beside ``name.st`` are looked for ``name.rawtlt``, ``name.tlt``,
-            ``name.st.mdoc`` and ``name.mdoc``; an aligned stack (``.ali``) takes the refined ``.tlt`` first. Of a folder of
-            images, the one such file inside counts, too.
-        image: what was read.
+        stack: the file the stack was read from. For ``name.st``, the files ``name.rawtlt``, ``name.tlt``, ``name.st.mdoc``
+            and ``name.mdoc`` are tried; for an aligned stack (``.ali``), the refined ``.tlt`` first. For a folder of images, a
+            single such file inside the folder is used, too.
+        image: the image file that was read.
 
     Returns:
         (section,) degrees.
 
     Raises:
-        FileNotFoundError: neither is there.
+        FileNotFoundError: there are no angles in either place.
         ValueError: the angle file cannot be read.
     """
     if (angle_file := angle_file_of(stack)) is not None:
@@ -60,12 +60,12 @@ def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
         return image.tilt_angles
     names = ", ".join(candidate.name for candidate in _candidates(stack)[:2])
     raise FileNotFoundError(
-        f"no tilt angles: {stack} holds none and there is no {names} or .mdoc beside it; give the file with --angles"
+        f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
     )
 
 
 def angle_file_of(stack: str | Path) -> Path | None:
-    """The angle file that `tilt_angles_of` takes; None where there is none."""
+    """The angle file that `tilt_angles_of` uses; None if there is none."""
     return next((candidate for candidate in _candidates(stack) if candidate.is_file()), None)
 
 
@@ -79,7 +79,7 @@ def _candidates(stack: str | Path) -> list[Path]:
 
 
 def beside(stack: Path) -> list[Path]:
-    """Where the angle files of a stack may be, likely ones first."""
+    """Possible angle files of a stack, most likely first."""
     refined = stack.suffix.lower() == ".ali" or stack.stem.endswith("_ali")
     stem = stack.with_name(stack.name.removesuffix(stack.suffix).removesuffix("_ali") + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
@@ -107,7 +107,7 @@ def _angle_lines(lines: list[str], path: Path) -> list[float]:
                 raise ValueError(f"{path} line {count}: '{line.strip()[:40]}' is not an angle in degrees") from None
             if not abs(values[-1]) <= LARGEST_ANGLE:
                 raise ValueError(
-                    f"{path} line {count}: {line.strip()[:40]} is no tilt angle; angles are degrees within ±{LARGEST_ANGLE}"
+                    f"{path} line {count}: {line.strip()[:40]} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}"
                 )
     return values
 

@@ -1,4 +1,4 @@
-"""Refusals that name the pixel or the line: what comes after may trust the data."""
+"""Input checks whose errors name the pixel or the line."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 
 def number(text: str) -> float:
-    """A number as instruments write it: without what Python allows besides, such as ``6_0`` or digits of other scripts.
+    """Parse a number as instruments write it; Python's extensions such as ``6_0`` or non-ASCII digits are rejected.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a number.
     """
     if "_" in text or not text.isascii():
-        raise ValueError(f"'{text}' is no number")
+        raise ValueError(f"'{text}' is not a number")
     return float(text)
 
 
 class Unsupported(ValueError):
-    """A sound file with contents that noiseflow cannot use; the message follows the file's name."""
+    """A valid file with contents that noiseflow cannot use; the message is appended to the file's name."""
 
 
 def as_array(data: Any) -> NDArray[Any]:
-    """A NumPy array of an array, a list, or a tensor on any device."""
+    """Convert an array, a list, or a tensor on any device to a NumPy array."""
     return np.asarray(data.detach().cpu() if hasattr(data, "detach") else data)
 
 
 def require_finite(data: NDArray[Any], name: str | Path) -> None:
-    """Refuse NaN and infinite pixels, naming how many there are and where the first one is."""
+    """Raise ValueError if pixels are NaN or infinite; the message gives their number and the first position."""
     if not np.issubdtype(data.dtype, np.floating):
         return
     count = sum(part.size - int(np.isfinite(part).sum()) for part in np.atleast_2d(data))
@@ -43,19 +43,19 @@ def require_finite(data: NDArray[Any], name: str | Path) -> None:
 
 
 def require_contrast(data: NDArray[Any], name: str | Path) -> None:
-    """Refuse an image whose pixels are all equal."""
+    """Raise ValueError if all pixels of an image are equal."""
     if data.size and data.min() == data.max():
         raise ValueError(f"{name} is flat: every pixel is {data.flat[0]}; check that the right file was given")
 
 
 def require_room(claimed: int, path: Path, *, compressed: bool = False, size: int | None = None) -> None:
-    """Refuse pixels that the file cannot hold, before memory is taken for them.
+    """Check that a file can hold the pixels that its header claims, before memory is allocated for them.
 
     Args:
-        claimed: bytes of pixels that the header promises.
+        claimed: bytes of pixels according to the header.
         path: the file.
-        compressed: allow a thousand times the file's size; no compression of real images comes near.
-        size: bytes stored, where that is not the size of one file.
+        compressed: allow a thousand times the file size, far more than any compression of real images.
+        size: bytes stored, if that is not the size of one file.
     """
     stored = path.stat().st_size if size is None else size
     if claimed > (1000 * stored if compressed else stored):
@@ -63,30 +63,32 @@ def require_room(claimed: int, path: Path, *, compressed: bool = False, size: in
 
 
 def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_name: str) -> NDArray[Any]:
-    """The same values in the first of a format's number types that holds them all.
+    """Convert values to the first data type of a format that represents them exactly.
 
     Raises:
-        ValueError: none does.
+        ValueError: no type does.
     """
     for kind in kinds:
         other = data.astype(kind)
         if np.array_equal(other.astype(data.dtype), data, equal_nan=data.dtype.kind == "f"):
             return other
     raise ValueError(
-        f"{format_name} holds no {data.dtype}, and values up to {data.max()} would lose digits; write .npy instead"
+        f"{format_name} cannot store {data.dtype}, and values up to {data.max()} would lose digits; write .npy instead"
     )
 
 
 def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
-    """The lines of a text file of this kind.
+    """The lines of a text file; `kind` names it in errors.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no text.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is not text.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{kind} {path} {'is no file' if path.exists() else 'does not exist'}; check the path")
+        raise FileNotFoundError(
+            f"{kind} {path} {'is not a file' if path.exists() else 'does not exist'}; check the path"
+        )
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     if "\0" in text:
-        raise ValueError(f"{path} is no text; an {kind} holds {holds}")
+        raise ValueError(f"{path} is not a text file; an {kind} holds {holds}")
     return text.splitlines()

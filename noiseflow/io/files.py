@@ -1,4 +1,4 @@
-"""Output files: checked before the work, written beside their target, renamed into place when whole."""
+"""Output files: checked before the computation, written to a temporary file, and renamed when complete."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 
 
 def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, overwrite: bool = True) -> Path:
-    """Fail now, before long work, where a result could not be written; returns the path.
+    """Check that a result can be written before a long computation starts, and return the path.
 
     Args:
-        path: the file to write; of a link, its target.
-        suffixes: allowed ones; by default those of the image formats that `write` knows.
-        overwrite: replace whatever is there; otherwise only what this program wrote.
+        path: the file to write; for a link, its target is written.
+        suffixes: allowed suffixes; by default those of the image formats that `write` supports.
+        overwrite: replace any existing file; otherwise only files that this program wrote.
 
     Raises:
-        ValueError: another suffix, or a folder of that name.
+        ValueError: the suffix is not allowed, or the path is a folder.
         FileNotFoundError: the folder does not exist.
-        FileExistsError: without `overwrite`, a file that this program did not write.
+        FileExistsError: without `overwrite`, the file exists and this program did not write it.
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
@@ -56,17 +56,17 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
 
 
 def require_other(output: str | Path, *inputs: str | Path | None) -> None:
-    """Refuse an output that would replace one of the inputs, or one of the images of a folder that is an input.
+    """Check that an output does not replace an input, or an image of a folder that is an input.
 
     Raises:
-        ValueError: it would.
+        ValueError: the output is one of the inputs.
     """
     target = Path(output)
     if not target.exists():
         return
     for source in inputs:
         if source is not None and any(path.exists() and target.samefile(path) for path in _parts(source)):
-            raise ValueError(f"{output} is an input too and would be lost; name another output")
+            raise ValueError(f"{output} is also an input and would be overwritten; name another output")
 
 
 def _parts(source: str | Path) -> list[Path]:
@@ -82,20 +82,20 @@ def check_folder(
     beside: Sequence[Path | None] = (),
     overwrite: bool = True,
 ) -> Path:
-    """Fail now, before long work, where results could not be written into a folder, which need not exist yet.
+    """Check that results can be written to a folder before a long computation starts. The folder need not exist yet.
 
     Args:
         path: the folder.
-        num_bytes: room that the results will take.
+        num_bytes: size of the results, bytes.
         holds: names of the files that will be written there.
-        beside: other files that will be written, whose name the folder cannot have.
-        overwrite: replace files of these names whoever wrote them; otherwise only those that this program wrote.
+        beside: other output files, whose names the folder cannot have.
+        overwrite: replace existing files of these names; otherwise only files that this program wrote.
 
     Raises:
-        ValueError: a file of that name, or a file above it, or there will be one.
-        FileExistsError: without `overwrite`, one of the files is there and this program did not write it.
-        PermissionError: it could not be made or written to.
-        OSError: the disk has not as much room.
+        ValueError: the path, or a parent, is a file or will be one.
+        FileExistsError: without `overwrite`, one of the files exists and this program did not write it.
+        PermissionError: the folder cannot be created or written to.
+        OSError: the disk does not have enough space.
     """
     path = Path(path)
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
@@ -110,24 +110,24 @@ def check_folder(
     free = shutil.disk_usage(existing).free
     if num_bytes > free:
         raise OSError(
-            f"{path} would take {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB left; "
+            f"{path} needs {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB free; "
             "free some space, choose another disk or a smaller size"
         )
     return path
 
 
 def reserve(path: Path, num_bytes: int) -> None:
-    """Take the room of a file before it is written through a memory map, where a full disk would end the program.
+    """Allocate a file on the disk before it is written through a memory map, where a full disk would crash the program.
 
     Raises:
-        OSError: the disk has not as much room.
+        OSError: the disk does not have enough space.
     """
     with path.open("r+b") as stream:
         reserve_room(stream.fileno(), num_bytes)
 
 
 def reserve_room(handle: int, num_bytes: int) -> None:
-    """The same for an open file, which becomes as long. Raises as `reserve`."""
+    """As `reserve`, for an open file, which is extended to this length."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, num_bytes)
     else:
@@ -135,7 +135,7 @@ def reserve_room(handle: int, num_bytes: int) -> None:
 
 
 def _require_writable(folder: Path) -> None:
-    """Refuse a folder that takes no files: by its permissions, or because making one fails."""
+    """Raise PermissionError if a folder is not writable, by its permissions or because creating a file fails."""
     refusal = f"{folder} is not writable; choose another output folder"
     if not os.access(folder, os.W_OK):
         raise PermissionError(refusal)
@@ -146,34 +146,34 @@ def _require_writable(folder: Path) -> None:
 
 
 def require_whole(path: Path, num_bytes: int) -> None:
-    """Raise what a full disk should have raised: some libraries lose the last buffer without a word."""
+    """Raise OSError if a file is too short; on a full disk some libraries lose the last buffer without an error."""
     if path.stat().st_size < num_bytes:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A name for a temporary file, renamed onto `path` when the block succeeds; of a link, onto its target."""
+    """Yield the name of a temporary file that is renamed to `path`, or to the target of a link, if the block succeeds."""
     with partial_folder(path) as folder:
         partial = folder / Path(path).name
         try:
             yield partial
         except OSError as error:
-            if error.errno is None and _CUT_SHORT.fullmatch(str(error)):  # NumPy's, which hides the system's reason
+            if error.errno is None and _CUT_SHORT.fullmatch(str(error)):  # NumPy's error, which hides the reason
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
             raise
         put_in_place(partial, path)
 
 
 def put_in_place(partial: Path, path: str | Path) -> None:
-    """Rename a whole file that lies in a temporary folder beside an output onto it, or onto a link's target."""
+    """Rename a complete file in a temporary folder next to an output to this output, or to the target of a link."""
     partial.chmod(0o666 & ~_umask())
     partial.replace(link_target(path))
 
 
 @contextlib.contextmanager
 def output_folder(path: str | Path, *, parents: bool = True) -> Iterator[Path]:
-    """A folder, made if need be, with those above it; what was made is gone again if the block fails and left nothing there."""
+    """Create a folder, with its parents if needed. If the block fails and left no files, created folders are removed."""
     path = Path(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=parents, exist_ok=True)
@@ -188,7 +188,7 @@ def output_folder(path: str | Path, *, parents: bool = True) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder, which takes the place of `path`, or of a link's target, when the block succeeds."""
+    """Yield a temporary folder that replaces `path`, or the target of a link, if the block succeeds."""
     target = link_target(path)
     with partial_folder(path) as folder:
         partial = folder / "new"

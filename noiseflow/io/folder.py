@@ -1,4 +1,4 @@
-"""A folder of single images as one stack, in natural order, with the tilt angles that the names tell."""
+"""Folders of single images as one stack, in natural order, with tilt angles from the file names."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 
 def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
-    """Stack the images of a folder; files of another type than most are left out.
+    """Stack the images of a folder. Files of other types than the most common one are ignored.
 
     Args:
-        folder: of the images.
-        read: reads one of them.
+        folder: the folder of images.
+        read: function that reads one image.
 
     Raises:
-        ValueError: fewer than two images, or images of different sizes.
+        ValueError: there are fewer than two images, or their sizes differ.
     """
     files = files_of(folder)
     if len(files) < 2:
-        found = f"with one image only, {files[0].name}" if files else "without images"
+        found = f"with only one image, {files[0].name}" if files else "without images"
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
     names = [file.name for file in files]
     images = [read(file) for file in files]
@@ -38,13 +38,13 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         section = image.data[0] if image.data.ndim == 3 and len(image.data) == 1 else image.data
         if section.ndim != 2:
             raise ValueError(
-                f"{folder / name} holds a stack of shape {image.data.shape}; a folder needs single "
-                "images: name the stack itself, or move it elsewhere"
+                f"{folder / name} holds a stack of shape {image.data.shape}; a folder must hold single "
+                "images: give the stack itself, or move it to another folder"
             )
         if sections and section.shape != sections[0].shape:
             raise ValueError(
                 f"{folder / name} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
-                "the images of a folder must have one size"
+                "all images of a folder must have the same size"
             )
         sections.append(section)
     angles = [image.tilt_angles for image in images if image.tilt_angles is not None]
@@ -53,7 +53,7 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
 
 
 def files_of(path: str | Path) -> list[Path]:
-    """The files that `read` opens: a folder's images of the commonest type in natural order, all files of a ``.zarr``."""
+    """The files that `read` opens: images of the most common type in a folder, in natural order; all files of a ``.zarr``."""
     from tifffile import natural_sorted
 
     path = Path(str(path).partition("::")[0])
@@ -67,10 +67,10 @@ def files_of(path: str | Path) -> list[Path]:
 
 
 def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:
-    """Tilt angles that file names tell, degrees, or None where they tell none, or not without doubt.
+    """Tilt angles in file names, degrees, or None if there are none or they are ambiguous.
 
-    A number of the name counts as the angle if it has decimals or a sign in some names, or follows a word such as
-    ``tilt``, and if it differs from name to name within ±180. A minus in front of all the numbers is a hyphen.
+    A number in the name is taken as the angle if it has decimals or a sign in some names, or follows a word such as
+    ``tilt``, and if it differs between names and is within ±180. A minus in front of all numbers is a hyphen.
     """
     rows = [list(_NUMBER.finditer(name.rsplit(".", 1)[0])) for name in names]
     if len(names) < 2 or len({len(row) for row in rows}) != 1:

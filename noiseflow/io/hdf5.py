@@ -1,4 +1,4 @@
-"""HDF5 and NeXus files: the largest array of numbers, or the one that is named (extra ``[formats]``)."""
+"""HDF5 and NeXus files: the largest numeric array, or a named one (extra ``[formats]``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from noiseflow.io.units import in_angstrom
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read an image, stack or volume; tilt angles come from ``theta``, ``rotation_angle`` and the like.
+    """Read an image, stack or volume. Tilt angles are read from ``theta``, ``rotation_angle`` and similar datasets.
 
     Args:
         path: the file.
@@ -55,7 +55,7 @@ def _text(value: Any) -> str:
 
 
 def _voxel_size(dataset: Any) -> VoxelSize | None:
-    """From ``element_size_um``, (z, y, x) in µm, as ilastik, BigDataViewer and others write it; or ``voxel_size`` in units."""
+    """Read ``element_size_um``, (z, y, x) in µm, as written by ilastik and BigDataViewer, or ``voxel_size`` with its unit."""
     sizes = np.asarray(dataset.attrs.get("element_size_um", ()), dtype=float).reshape(-1)
     unit = in_angstrom("µm") or 0.0
     if sizes.size != 3 or not (sizes > 0).all():

@@ -1,4 +1,4 @@
-"""What an image file holds, and the suffixes of the formats that are known."""
+"""Contents of an image file, and the suffixes of supported formats."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
 PNG_SUFFIX = ".png"
-"""Read as a single image; apart from `SUFFIXES`, as the PNG files beside data are pictures of them."""
+"""Suffix of PNG files, read as single images. Not in `SUFFIXES`, because PNG files next to data are usually previews."""
 
 VoxelSize = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """What an image file holds.
+    """Contents of an image file.
 
     Attributes:
-        data: the pixels in the file's own number type, (y, x) or (section, y, x).
-        voxel_size: Å along each axis of ``data``'s (z, y, x), or None where the file does not say.
-        tilt_angles: (section,) degrees, or None where the file does not say.
-        tilt_axis: its direction in the images, degrees from y towards −x, or None where the file does not say.
+        data: pixels in the data type of the file, (y, x) or (section, y, x).
+        voxel_size: Å along (z, y, x), or None if the file does not state it.
+        tilt_angles: (section,) degrees, or None if the file does not state them.
+        tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
     """
 
     data: NDArray[Any]

@@ -1,4 +1,4 @@
-"""Any image, stack or volume in and out: finds the format by the file's suffix."""
+"""Reading and writing of images, stacks and volumes; the suffix determines the format."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, one grey ``.png`` image, or a folder
-            of single images of the other formats; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr`` and HDF5.
-            Of a file that holds several images, ``FILE::NAME`` names one.
-        mapped: leave the pixels on the disk until they are used; changes to them stay out of the file. Large stacks that do not
-            lie there as they are (compressed TIFF, HDF5, OME-Zarr) are read piece by piece into a temporary file.
+        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, a grey ``.png`` image, or a folder
+            of single images of these formats except PNG; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr``
+            and HDF5. ``FILE::NAME`` selects one image of a file that holds several.
+        mapped: memory-map the pixels; changes to the array are not written to the file. Large stacks that cannot be mapped
+            (compressed TIFF, HDF5, OME-Zarr) are read in pieces into a temporary file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is empty, truncated, of an unknown kind, or holds something that is not a real image.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is empty, truncated or of an unknown type, or does not hold a real-valued image.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
     from noiseflow.io.folder import read_folder
@@ -70,19 +70,19 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
         ) from error
     except Unsupported as error:
         raise ValueError(f"{path} {error}") from error
-    except Exception as error:  # each library raises its own types on damaged bytes
+    except Exception as error:  # each library raises its own errors for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
     return _checked(image, path)
 
 
 def read_image(path: str | Path) -> NDArray[Any]:
-    """Read one 2D image, (y, x); a stack of one section counts as one image. Raises as `read`."""
+    """Read a 2D image, (y, x); a stack of one section is accepted. Raises as `read`."""
     data = read(path).data
     if data.ndim == 3 and data.shape[0] == 1:
         return np.asarray(data[0])
     if data.ndim != 2:
-        raise ValueError(f"{path} holds an array of shape {data.shape}; a single 2D image is needed here")
+        raise ValueError(f"{path} holds an array of shape {data.shape}; a single 2D image is required here")
     return data
 
 
@@ -90,13 +90,13 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
-        path: target; ``.mrc``-like, ``.tif``, ``.npy`` or, with the extra ``[formats]``, ``.zarr`` (OME-Zarr). An existing
-            file is replaced only once the new one is whole.
-        data: (y, x) or (z, y, x), in a ``.npy`` file any more axes; an array or a tensor.
+        path: target; an MRC suffix, ``.tif``, ``.npy`` or, with the extra ``[formats]``, ``.zarr`` (OME-Zarr). An existing
+            file is replaced only when the new one is complete.
+        data: (y, x) or (z, y, x), array or tensor; ``.npy`` files may have more axes.
         voxel_size: Å along (z, y, x).
 
     Raises:
-        ValueError: unknown suffix, no image, or a number type the format cannot hold.
+        ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
     """
     from noiseflow.io import mrc, numpy_files, ome_zarr, tiff
 
@@ -105,8 +105,8 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
     suffix = path.suffix.lower()
     if data.dtype.kind not in "iuf" or data.ndim < 2 or (data.ndim > 3 and suffix != ".npy"):
         raise ValueError(
-            f"{path}: an array of {data.dtype} and shape {data.shape} is no image; 2D or 3D numbers are needed "
-            "(.npy holds more axes)"
+            f"{path}: an array of {data.dtype} and shape {data.shape} is not an image; give a 2D or 3D numeric array "
+            "(.npy files may have more axes)"
         )
     if suffix == ".zarr":
         with atomic_folder(path) as folder:
@@ -133,13 +133,15 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix == ".npz":
         return partial(numpy_files.read_npz, member=member)
     if suffix in _NO_IMAGES:
-        raise ValueError(f"{path} is no image but {_NO_IMAGES[suffix]}; check the order and the names of what you gave")
+        raise ValueError(
+            f"{path} is not an image but {_NO_IMAGES[suffix]}; check the order and the names of the arguments"
+        )
     if suffix not in SUFFIXES | {PNG_SUFFIX}:
         raise ValueError(
             f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}"
         )
     if member is not None:
-        raise ValueError(f"{path}::{member}: a {suffix} file holds one image; leave ::{member} out")
+        raise ValueError(f"{path}::{member}: a {suffix} file holds one image; remove ::{member}")
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
     if suffix in TIFF_SUFFIXES:
@@ -154,9 +156,9 @@ def _checked(image: ImageFile, path: Path) -> ImageFile:
     if data.size == 0:
         raise ValueError(f"{path} holds no pixels (shape {data.shape})")
     if data.dtype.kind not in "iuf":
-        raise ValueError(f"{path} holds {data.dtype} values; real integers or floats are needed")
+        raise ValueError(f"{path} holds {data.dtype} values; integers or real floating-point numbers are required")
     if data.ndim == 3 and data.shape[-1] in (3, 4) and data.dtype == np.uint8 and data.shape[0] > 4:
         raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim not in (2, 3):
-        raise ValueError(f"{path} has {data.ndim} dimensions (shape {data.shape}); 2 or 3 are needed")
+        raise ValueError(f"{path} has {data.ndim} dimensions (shape {data.shape}); 2 or 3 are required")
     return image

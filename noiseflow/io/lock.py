@@ -1,4 +1,4 @@
-"""One run at a time for one output: a lock file that names its holder, released by the system when the holder dies."""
+"""Lock files: one run at a time per output. The system releases the lock if its process ends."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ _UNKNOWN = "another process"
 
 @contextlib.contextmanager
 def locked(output: str | Path) -> Iterator[None]:
-    """Within the block, no other run can take the lock of this output; a block within a block of the same thread may.
+    """Hold the lock of an output within the block. Nested blocks of the same thread are allowed.
 
-    The lock is a file beside the output, ``.NAME.lock``, gone when the block ends. One that a killed run left holds nobody up.
+    The lock is the file ``.NAME.lock`` next to the output, which is removed at the end of the block. A file left by a killed run
+    does not block others.
 
     Raises:
         BlockingIOError: another run holds the lock; the message names its process and host.
-        OSError: the lock file cannot be made.
+        OSError: the lock file cannot be created.
     """
     path = lock_file(output)
     key = str(path), threading.get_ident()
@@ -43,7 +44,7 @@ def locked(output: str | Path) -> Iterator[None]:
 
 
 def lock_file(output: str | Path) -> Path:
-    """Where the lock of an output lies: beside the file that is written, which is a link's target."""
+    """The lock file of an output, next to the file that is written (the target of a link)."""
     path = link_target(output).absolute()
     return path.with_name(f".{path.name}.lock")
 
@@ -57,7 +58,7 @@ def _acquired(path: Path, output: str | Path) -> Iterator[None]:
         os.write(handle, json.dumps(holder).encode())
         yield
     finally:
-        if os.name != "nt":  # while it is held: nobody else can have locked this file
+        if os.name != "nt":  # removed while the lock is held, so that no other process can have locked this file
             path.unlink(missing_ok=True)
         os.close(handle)
         with contextlib.suppress(OSError):
@@ -71,10 +72,10 @@ def _open_and_lock(path: Path, output: str | Path) -> int:
         try:
             if not _try_lock(handle):
                 raise BlockingIOError(
-                    f"{output} is being written by {_holder(path)}; wait until it ends, stop it, or name another output"
+                    f"{output} is being written by {_holder(path)}; wait until it finishes, stop it, or name another output"
                 )
             with contextlib.suppress(FileNotFoundError):
-                if os.fstat(handle).st_ino == path.stat().st_ino:  # else its last holder removed it just now
+                if os.fstat(handle).st_ino == path.stat().st_ino:  # otherwise its last holder has just removed it
                     return handle
         except BaseException:
             os.close(handle)
@@ -87,7 +88,7 @@ def _try_lock(handle: int) -> bool:
         if os.name == "nt":
             import msvcrt
 
-            os.lseek(handle, 2**30, os.SEEK_SET)  # beyond the text, which others must be able to read
+            os.lseek(handle, 2**30, os.SEEK_SET)  # beyond the text, which other processes must be able to read
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
             os.lseek(handle, 0, os.SEEK_SET)
         else:
@@ -95,7 +96,7 @@ def _try_lock(handle: int) -> bool:
 
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        # a disk that knows no locks: better to run unlocked than not at all
+        # the file system does not support locks: run without one
         return error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
     return True
 

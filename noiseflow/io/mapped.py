@@ -1,4 +1,4 @@
-"""Arrays that live on the disk: temporary ones, and output files that are filled part by part."""
+"""Memory-mapped arrays: temporary ones, and output files that are written in parts."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
 from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start, signature
 
 IN_MEMORY = 2**28
-"""Bytes up to which a temporary array is kept in memory: a file would only cost time."""
+"""Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
 
 
 def is_large(path: str | Path) -> bool:
-    """Whether a file is better left on the disk."""
+    """Whether a file is large enough to be memory-mapped."""
     file = Path(str(path).partition("::")[0])
     parts = file.rglob("*") if file.suffix.lower() == ".zarr" else [file]
     return sum(part.stat().st_size for part in parts if part.is_file()) > IN_MEMORY
 
 
 def is_mapped(array: NDArray[Any]) -> bool:
-    """Whether an array, or what it is a view of, lies in a file."""
+    """Whether an array, or its base, is memory-mapped."""
     base: Any = array
     while base is not None:
         if isinstance(base, np.memmap):
@@ -38,8 +38,8 @@ def is_mapped(array: NDArray[Any]) -> bool:
 
 
 def let_go(array: NDArray[Any]) -> None:
-    """Give back the memory of pages of a file that were read or written; they stay in the file. Not for maps whose changes never
-    reach their file: they would be lost."""
+    """Release the memory of mapped pages; their contents remain in the file. Not for copy-on-write maps, which would lose
+    their changes."""
     base: Any = array
     while base is not None and not isinstance(base, mmap.mmap):
         base = getattr(base, "base", None)
@@ -50,16 +50,16 @@ def let_go(array: NDArray[Any]) -> None:
 def temporary_map(
     shape: Sequence[int], dtype: Any, *, folder: str | Path | None = None, in_memory: int = 0
 ) -> NDArray[Any]:
-    """An array of zeros in a file without a name, gone when the array is let go of.
+    """An array of zeros in an unnamed temporary file, which is deleted with the array.
 
     Args:
-        shape: of the array.
-        dtype: its number type.
-        folder: where the file lies; by default the system's folder for temporary files, which ``TMPDIR`` names.
-        in_memory: bytes up to which memory takes the place of the file.
+        shape: shape of the array.
+        dtype: its data type.
+        folder: folder of the file; by default the system's temporary folder (``TMPDIR``).
+        in_memory: size in bytes up to which memory is used instead of a file.
 
     Raises:
-        OSError: the disk has not as much room.
+        OSError: the disk does not have enough space.
     """
     num_bytes = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
     if num_bytes <= max(in_memory, 1):  # an empty file cannot be mapped
@@ -72,7 +72,7 @@ def temporary_map(
 def mapped_copy(
     sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any, *, in_memory: int = 0
 ) -> NDArray[Any]:
-    """Sections, one after the other, in a temporary file. Arguments and errors as of `temporary_map`."""
+    """Copy sections one by one to a temporary file. Arguments and errors as for `temporary_map`."""
     result = temporary_map(shape, dtype, in_memory=in_memory)
     for target, section in zip(result, sections, strict=True):
         target[...] = section
@@ -80,18 +80,18 @@ def mapped_copy(
 
 
 def is_filled_by_parts(path: Path) -> bool:
-    """Whether `create_volume` makes files of this suffix."""
+    """Whether `create_volume` supports files with this suffix."""
     return path.suffix.lower() in MRC_SUFFIXES | {".npy"}
 
 
 def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | None = None) -> NDArray[np.float32]:
-    """A new MRC or ``.npy`` file of float32 zeros, mapped to memory, whose room on the disk is taken.
+    """Create a memory-mapped MRC or ``.npy`` file of float32 zeros, with its disk space allocated.
 
-    An MRC file's statistics are those of an unfinished file: see `finish_volume`.
+    The statistics in an MRC header are set by `finish_volume`.
 
     Raises:
-        OSError: the disk has not as much room.
-        ValueError: another suffix.
+        OSError: the disk does not have enough space.
+        ValueError: the suffix is not supported.
     """
     if path.suffix.lower() == ".npy":
         start = npy_start()
@@ -109,14 +109,14 @@ def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | No
                 file.voxel_size = voxel_size[::-1]
             begin = 1024
     else:
-        raise ValueError(f"{path}: only .npy and MRC files are filled part by part")
+        raise ValueError(f"{path}: only .npy and MRC files can be written in parts")
     with path.open("r+b") as stream:
         reserve_room(stream.fileno(), begin + 4 * int(np.prod(shape, dtype=object)))
     return np.memmap(path, "<f4", "r+", begin, shape)
 
 
 def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
-    """Write what is left of a volume that was filled, and the statistics that an MRC header holds."""
+    """Flush a volume to its file, and write the statistics of an MRC header."""
     if isinstance(volume, np.memmap):
         volume.flush()
     if path.suffix.lower() not in MRC_SUFFIXES:
@@ -124,7 +124,7 @@ def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
     import mrcfile
 
     low, high, mean, squares, count = math.inf, -math.inf, 0.0, 0.0, 0
-    for part in volume:  # once over the file: mean and sum of squares about it, part by part
+    for part in volume:  # one pass over the file: mean and sum of squared deviations, part by part
         low, high = min(low, float(part.min())), max(high, float(part.max()))
         own = float(part.mean(dtype=np.float64))
         squares += float(np.sum((part - own) ** 2, dtype=np.float64))

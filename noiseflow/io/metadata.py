@@ -1,4 +1,4 @@
-"""Tilt angles in the metadata of any file: numbers under a telling name, as many as there are sections."""
+"""Tilt angles in the metadata of any file: as many numbers as sections, under a matching name."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _DEGREES = {
 
 
 def in_degrees(unit: object) -> float | None:
-    """How many degrees one unit is, by its name or symbol; None for what is no unit of angles."""
+    """Degrees per unit, by its name or symbol; None if it is not an angular unit."""
     return _DEGREES.get(str(unit).strip(" []").lower())
 
 
 def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> NDArray[np.float64] | None:
-    """The first list of `count` plausible tilt angles, degrees, under a name that speaks of tilts.
+    """The first list of `count` plausible tilt angles, degrees, under a name that refers to tilts.
 
     Args:
-        leaves: (name, numbers); names that differ in their digits only, as of a list of sections, count as one list.
+        leaves: (name, numbers); names that differ only in their digits, as in a list of sections, form one list.
         count: sections of the stack.
     """
     recorded: dict[str, list[float]] = {}
@@ -34,13 +34,13 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
             recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(values)
     for values in recorded.values():
         plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= 180
-        if plausible and (count == 1 or np.ptp(values) > np.pi):  # else radians, or a stage that stood still
+        if plausible and (count == 1 or np.ptp(values) > np.pi):  # otherwise radians, or a stage that did not move
             return np.array(values)
     return None
 
 
 def leaves_of(tree: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
-    """(name, numbers) of every numeric leaf of a tree of metadata."""
+    """(name, numbers) of every numeric leaf of a metadata tree."""
     if isinstance(tree, Mapping):
         for name, child in tree.items():
             yield from leaves_of(child, f"{path}/{name}")

@@ -1,4 +1,4 @@
-"""The microscopes' own formats, through rosettasciio: DM3, DM4, EMD, SER, hspy (extra ``[formats]``)."""
+"""Microscope formats, through rosettasciio: DM3, DM4, EMD, SER, hspy (extra ``[formats]``)."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ Axes = Sequence[dict[str, Any]]
 
 
 def read(path: Path, member: str | None = None) -> ImageFile:
-    """Read the largest image, stack or volume of a microscope's file, with its pixel size and tilt angles.
+    """Read the largest image, stack or volume of a microscope file, with its pixel size and tilt angles.
 
     Args:
         path: the file.
-        member: the title of the image to read, where the file holds several.
+        member: title of the image to read, if the file holds several.
     """
     plugin = _PLUGINS[path.suffix.lower()]
     signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
@@ -58,15 +58,15 @@ def read(path: Path, member: str | None = None) -> ImageFile:
 
 
 def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
-    """Which of a file's arrays to read: the one that is asked for, or else the one that is largest.
+    """Index of the array to read: the named one, or else the largest one.
 
     Raises:
-        Unsupported: no such name, no image at all, or several of the largest size.
+        Unsupported: the name does not exist, there is no image, or several images have the largest size.
     """
     listed = ", ".join(f"'{name}'" for name in names[:12])
     if wanted is not None:
         if wanted not in names:
-            raise Unsupported(f"holds no '{wanted}', but {listed or 'nothing'}")
+            raise Unsupported(f"holds no '{wanted}'; available: {listed or 'nothing'}")
         return names.index(wanted)
     images = [index for index, shape in enumerate(shapes) if len(shape) in (2, 3)]
     if not images:
@@ -80,7 +80,7 @@ def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wante
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:
-    """Å along (z, y, x); a section of a tilt series counts as deep as a pixel is wide."""
+    """Å along (z, y, x); the depth of a section of a tilt series is set to the pixel width."""
     edges = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis["scale"])) for axis in axes]
     *depth, y, x = edges
     if not (y > 0 and x > 0):
@@ -89,7 +89,7 @@ def _voxel_size(axes: Axes) -> VoxelSize | None:
 
 
 def _tilt_angles(signal: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Degrees: the stage's own readings for every section, or the calibration of the stack's first axis."""
+    """Degrees: the recorded stage angle of every section, or the calibration of the first axis of the stack."""
     count = shape[0] if len(shape) == 3 else 1
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     recorded = recorded_angles(leaves_of(trees), count)

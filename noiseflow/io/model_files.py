@@ -1,4 +1,4 @@
-"""Noise-model files: safetensors with kind, units and provenance as JSON metadata. Opening one runs no code from it."""
+"""Noise-model files: safetensors with model type, units and provenance as JSON metadata. Loading runs no code from the file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from noiseflow.plugins import load_plugins
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 _LEAST_BYTES = 4
-"""That a file holds for each bin, level or pixel of a model that has many: at least one number in single precision."""
+"""Smallest number of bytes per bin, level or pixel of a model: one number in single precision."""
 MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
@@ -30,16 +30,16 @@ _REGISTERED: dict[str, type[NoiseModelBase]] = {}
 
 
 def register(kind: Kind) -> Kind:
-    """Let model files name a class of noise models; a class decorator. No package needs to be installed.
+    """Register a noise-model class so that its models can be saved and loaded. Use it as a class decorator.
 
-    A program that loads such a file registers the class too, before `load`: a file holds parameters and never code.
+    A program that loads such a file must register the class before `load`, because files contain parameters and no code.
 
     Args:
-        kind: a concrete subclass of `NoiseModelBase`; its ``config()`` gives the arguments that make the model again.
+        kind: a concrete subclass of `NoiseModelBase`; its ``config()`` returns the arguments that recreate the model.
 
     Raises:
-        TypeError: not a noise model, or an abstract one.
-        ValueError: another class has that name already.
+        TypeError: the class is not a noise model, or is abstract.
+        ValueError: another class has the same name.
 
     Example:
         >>> import noiseflow, pathlib, tempfile, torch
@@ -56,20 +56,20 @@ def register(kind: Kind) -> Kind:
     """
     if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
         raise TypeError(
-            f"{kind!r} is no class of noise models; derive it from noiseflow.NoiseModelBase and give it forward()"
+            f"{kind!r} is not a noise-model class; derive it from noiseflow.NoiseModelBase and define forward()"
         )
     taken = kinds().get(kind.__name__)
     if taken is not None and (taken.__module__, taken.__qualname__) != (kind.__module__, kind.__qualname__):
         raise ValueError(
-            f"{kind.__name__} is the name of {taken.__module__}.{taken.__qualname__}; give the class another"
+            f"{kind.__name__} is already the name of {taken.__module__}.{taken.__qualname__}; rename the class"
         )
     _REGISTERED[kind.__name__] = kind
     return kind
 
 
 def kinds() -> dict[str, type[nn.Module]]:
-    """Every noise model that a file may name: the public ones here, those given to `register`, and those of installed packages
-    (entry points ``noiseflow.noise_models``)."""
+    """All noise-model classes that a file may name: public classes of this package, registered classes, and those of installed
+    packages (entry points ``noiseflow.noise_models``)."""
     own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
     found = {
         name: kind
@@ -87,11 +87,11 @@ def save(
     Args:
         model: any model whose class is in `kinds`, on any device.
         path: target, ``.safetensors``.
-        units: units of signal and observation; by default those of the model, which `load` keeps.
-        provenance: where the model comes from: anything JSON can hold.
+        units: units of signal and observation; by default those of the model. `load` restores them.
+        provenance: origin of the model, any JSON-serialisable mapping.
 
     Raises:
-        ValueError: unknown kind of model, or a path that cannot be written.
+        ValueError: the class of the model is unknown, or the path cannot be written.
 
     Example:
         >>> import noiseflow, pathlib, tempfile
@@ -118,8 +118,9 @@ def load(path: str | Path) -> nn.Module:
     """Load a noise model, ready to use on the CPU.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: not a noise-model file, damaged, of an unknown kind or from a newer version of the library.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a noise-model file, is damaged, names an unknown class, or is from a newer version of the
+            library.
 
     Example:
         >>> import noiseflow, pathlib, tempfile
@@ -132,7 +133,7 @@ def load(path: str | Path) -> nn.Module:
     try:
         description = json.loads(metadata["model"])
         _check_sizes(description, sum(tensor.nbytes for tensor in tensors.values()))
-        with torch.device("meta"):  # takes no memory, whatever the description claims
+        with torch.device("meta"):  # allocates no memory, whatever sizes the description claims
             _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
@@ -151,7 +152,7 @@ def load(path: str | Path) -> nn.Module:
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Kind, units, provenance and versions of a noise-model file. Raises as `load`."""
+    """Model type, units, provenance and versions of a noise-model file. Raises as `load`."""
     metadata, _ = _open(Path(path))
     model = json.loads(metadata.get("model", "{}"))
     return {
@@ -172,20 +173,20 @@ def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> No
 
 
 def _check_sizes(description: Mapping[str, Any], num_bytes: int, *, depth: int = 0) -> None:
-    """Refuse what could only cost memory and time: a size larger than the parameters it would have, and models nested
-    without end."""
+    """Raise ValueError for descriptions that would waste memory or time: sizes larger than the stored parameters allow, and
+    deeply nested models."""
     inner = description.get("models", {})
     if depth > _DEEPEST or len(inner) > _DEEPEST:
-        raise ValueError("models within models without end; fit and save the model again")
+        raise ValueError("the description nests too many models; fit and save the model again")
     largest = max(_whole_numbers(description["arguments"]), default=0)
     if largest > max(num_bytes // _LEAST_BYTES, _LARGEST_USUAL_SIZE):
-        raise ValueError(f"a size of {largest} with {num_bytes} bytes of parameters; fit and save the model again")
+        raise ValueError(f"a size of {largest} with only {num_bytes} bytes of parameters; fit and save the model again")
     for child in inner.values():
         _check_sizes(child, num_bytes, depth=depth + 1)
 
 
 def _whole_numbers(value: Any) -> Iterator[int]:
-    """Sizes of all whole numbers in nested values."""
+    """Absolute values of all integers in nested values."""
     if isinstance(value, int):
         yield abs(value)
     elif isinstance(value, (list, dict)):
@@ -200,8 +201,8 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
         raise FileNotFoundError(f"{path} does not exist; make a noise model with: noiseflow calibrate")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; give the noise-model file inside it")
-    if not path.is_file():  # a pipe could be waited on for ever
-        raise ValueError(f"{path} is no file; a noise model cannot be read from a pipe or a device")
+    if not path.is_file():  # reading a pipe could block forever
+        raise ValueError(f"{path} is not a regular file; a noise model cannot be read from a pipe or a device")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = dict(file.metadata() or {})
@@ -221,7 +222,7 @@ def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
         raise ValueError(
-            f"{kind} is not a known kind of noise model; put @noiseflow.register before its class, or name it under the "
+            f"{kind} is not a known noise-model class; decorate it with @noiseflow.register, or list it in the "
             "entry points 'noiseflow.noise_models' of a package"
         )
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
@@ -232,7 +233,8 @@ def _build(description: Mapping[str, Any]) -> nn.Module:
     known = kinds()
     if description["kind"] not in known:
         raise ValueError(
-            f"unknown kind of noise model {description['kind']!r}; known are {', '.join(sorted(known))}; import what registers it"
+            f"unknown noise-model class {description['kind']!r}; import the module that registers it "
+            f"(known: {', '.join(sorted(known))})"
         )
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
     return known[description["kind"]](**description["arguments"], **inner)

@@ -1,4 +1,4 @@
-"""MRC files of all makers: byte order, signed bytes and tilt angles in the extended header (MRC2014, IMOD, SerialEM, FEI)."""
+"""MRC files of all variants: byte order, signed bytes, and tilt angles in the extended header (MRC2014, IMOD, SerialEM, FEI)."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _REFUSED = {
 }
 _IMOD_STAMP = 1146047817
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
-"""Bytes that each kind of SerialEM's short data takes per section, by its flag."""
+"""Bytes per section of each field of SerialEM's extended header, by its flag."""
 
 _OLD_FEI_REALS, _OLD_FEI_AXIS = 32, 10
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read an MRC file in its own number type; the header is believed only as far as the file's size bears it out.
+    """Read an MRC file in its own data type. The header is checked against the file size.
 
-    Pixels in the machine's byte order are left in the file, where `mapped`, and changes to the array stay out of it.
+    If `mapped`, pixels in native byte order are memory-mapped, and changes to the array are not written to the file.
     """
     size = path.stat().st_size
     if size < _HEADER_BYTES:
-        raise ValueError(f"an MRC header has {_HEADER_BYTES} bytes; the file has {size}")
+        raise ValueError(f"an MRC header has {_HEADER_BYTES} bytes, but the file has {size}")
     with path.open("rb") as stream:
         header = _header(stream.read(_HEADER_BYTES), path, size)
         extended = stream.read(int(header["nsymbt"]))
@@ -54,7 +54,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
-    """Write 8 and 16-bit integers and floats as they are; float64 is rounded to float32, wide integers must fit exactly.
+    """Write 8- and 16-bit integers and float32 unchanged; float64 is rounded to float32, wider integers must fit exactly.
 
     Returns:
         The pixels as stored.
@@ -63,7 +63,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
     class Sectionwise(MrcFile):  # type: ignore[misc]
         def update_header_stats(self) -> None:
-            """As the original does at once, in twice the memory of the data."""
+            """Compute the statistics section by section; the original needs twice the memory of the data."""
             sections = np.atleast_3d(self.data)
             header, total = self.header, sum(float(part.sum(dtype=np.float64)) for part in sections)
             header.dmin, header.dmax, header.dmean = self.data.min(), self.data.max(), total / self.data.size
@@ -88,7 +88,7 @@ def _storable(data: NDArray[Any]) -> NDArray[Any]:
 
 
 def _header(raw: bytes, path: Path, size: int) -> np.void:
-    """The header in the byte order in which it makes sense; where the machine stamp says another, a warning tells."""
+    """The header in the byte order that gives plausible values; warns if the machine stamp differs."""
     import mrcfile.dtypes
 
     stamped = ">" if raw[212:213] == b"\x11" else "<"
@@ -102,14 +102,15 @@ def _header(raw: bytes, path: Path, size: int) -> np.void:
     if problems[1] is None:
         names = {"<": "little", ">": "big"}
         warnings.warn(
-            f"{path} is stamped as {names[stamped]}-endian but is {names[orders[1]]}-endian; read as such", stacklevel=5
+            f"{path} is stamped as {names[stamped]}-endian but is {names[orders[1]]}-endian; it is read as such",
+            stacklevel=5,
         )
         return headers[1]
     mode = int(headers[0]["mode"])
     if mode in _REFUSED and _problem(headers[0], size, mode_matters=False) is None:
-        raise Unsupported(f"holds {_REFUSED[mode]} (MRC mode {mode}); real grey images are needed")
+        raise Unsupported(f"holds {_REFUSED[mode]} (MRC mode {mode}); real grey-level images are required")
     if mode not in _TYPES:
-        raise ValueError(f"it is no MRC file: its header says mode {mode}")
+        raise ValueError(f"it is not an MRC file: its header says mode {mode}")
     raise ValueError(problems[0])
 
 
@@ -119,7 +120,7 @@ def _problem(header: np.void, size: int, *, mode_matters: bool = True) -> str | 
         return f"its header says mode {mode}"
     expected = nx * ny * nz * np.dtype(_TYPES.get(mode, "i1")).itemsize + _HEADER_BYTES + skipped
     if min(nx, ny, nz) < 1 or skipped < 0 or expected > size:
-        return f"its header claims {nx} x {ny} x {nz} pixels, {expected} bytes; the file has {size}"
+        return f"its header claims {nx} x {ny} x {nz} pixels, {expected} bytes, but the file has {size}"
     return None
 
 
@@ -134,7 +135,7 @@ def _is_big_endian(header: np.void) -> bool:
 
 
 def _bytes_are_signed(header: np.void) -> bool:
-    """IMOD says it with a flag; else pixel statistics beyond one type's range tell; MRC2014 bytes are signed."""
+    """From IMOD's flag, or else from statistics outside the range of one type; MRC2014 bytes are signed."""
     stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], ">i4" if _is_big_endian(header) else "<i4")
     if stamp == _IMOD_STAMP:
         return bool(flags & 1)
@@ -149,7 +150,7 @@ def _voxel_size(header: np.void) -> VoxelSize | None:
 
 
 def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
-    """(z, y, x), whatever axes the file's columns, rows and sections are."""
+    """Reorder the axes to (z, y, x) according to the header."""
     axes = [int(header[name]) for name in ("maps", "mapr", "mapc")]
     if data.ndim == 3 and sorted(axes) == [1, 2, 3] and axes != [3, 2, 1]:
         return np.ascontiguousarray(data.transpose([axes.index(axis) for axis in (3, 2, 1)]))
@@ -157,7 +158,7 @@ def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
 
 
 def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.float64] | None:
-    """Degrees, from the extended header of SerialEM (``SERI``), FEI (``FEI1 FEI2``) or Agard's format; else None."""
+    """Degrees, from the extended header of SerialEM (``SERI``), FEI (``FEI1 FEI2``) or Agard's format; otherwise None."""
     import mrcfile.dtypes
 
     order = ">" if _is_big_endian(header) else "<"
@@ -184,7 +185,7 @@ def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.flo
 
 
 def _tilt_axis(header: np.void, extended: bytes) -> float | None:
-    """Degrees, from a title such as SerialEM writes, or from the first record of FEI's extended headers, where zero is unset."""
+    """Degrees, from a title as SerialEM writes it, or from the first record of FEI's extended header, where 0 means unset."""
     import mrcfile.dtypes
 
     titles = (bytes(label).decode("latin-1", "replace") for label in header["label"])

@@ -1,4 +1,4 @@
-"""NumPy's own files: ``.npy`` with one array, ``.npz`` with several by name."""
+"""NumPy files: ``.npy`` with one array, ``.npz`` with several named arrays."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def read_npy(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the array as it is, or leave it in the file, where `mapped`; the memory map refuses claims beyond the file."""
+    """Read the array, or memory-map it if `mapped`; the memory map checks the claimed size against the file."""
     data = np.load(path, mmap_mode="c", allow_pickle=False)
     return ImageFile(data if mapped else np.array(data))
 
 
 def read_npz(path: Path, member: str | None = None) -> ImageFile:
-    """Read the largest image, stack or volume, or the one of a name; tilt angles come from ``tilt_angles`` and the like."""
+    """Read the named or largest image, stack or volume. Tilt angles are read from ``tilt_angles`` and similar names."""
     with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)
         shapes = [_claim(archive, name, path) for name in names]
@@ -36,7 +36,7 @@ def read_npz(path: Path, member: str | None = None) -> ImageFile:
 
 
 def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
-    """Write an array of any number type as it is, section by section, with the mark of `noiseflow.io.ownership`.
+    """Write an array of any data type unchanged, section by section, with the mark of `noiseflow.io.ownership`.
 
     Returns:
         The pixels as stored.
@@ -51,7 +51,7 @@ def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
 
 
 def _claim(archive: Any, name: str, path: Path) -> tuple[int, ...]:
-    """The shape that an array's header claims, refused where the file cannot hold it."""
+    """The shape in an array's header; raises ValueError if the file cannot hold it."""
     with archive.zip.open(f"{name}.npy") as stream:
         version = np.lib.format.read_magic(stream)
         shape, _, dtype = _HEADERS[version](cast(IO[bytes], stream))

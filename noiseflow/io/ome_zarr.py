@@ -24,7 +24,7 @@ _CHUNK = 128
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
-    """Write an image or volume with coarser copies, each half as fine, down to 64 pixels along its longest edge."""
+    """Write an image or volume with a pyramid of coarser levels, each binned by 2, down to 64 pixels along the longest edge."""
     import zarr
 
     axes = "zyx"[-data.ndim :]
@@ -56,30 +56,30 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
 
 
 def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[slice, ...]]:
-    """The chunks of an array, one after the other: all that memory holds of it."""
+    """The chunks of an array, so that only one is in memory at a time."""
     for number in np.ndindex(*(-(-edge // chunk) for edge, chunk in zip(shape, chunks, strict=True))):
         corner = [index * chunk for index, chunk in zip(number, chunks, strict=True)]
         yield tuple(slice(c, min(c + chunk, edge)) for c, chunk, edge in zip(corner, chunks, shape, strict=True))
 
 
 def _twice(part: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Where a part of a level lies in the level twice as fine, of that shape."""
+    """The region of the next finer level, of the given shape, that corresponds to a part of a level."""
     return tuple(slice(2 * p.start, 2 * p.stop) if edge > 1 else p for p, edge in zip(part, shape, strict=True))
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the finest level of an OME-Zarr image or volume, of version 0.4 or 0.5; `mapped`, to a temporary file, if large."""
+    """Read the finest level of an OME-Zarr image (version 0.4 or 0.5); if `mapped`, large ones into a temporary file."""
     import zarr
 
     node = zarr.open(path, mode="r")
     attributes: Any = node.attrs.asdict()
     multiscales = attributes.get("ome", attributes).get("multiscales")
     if not isinstance(node, zarr.Group) or not multiscales:
-        raise Unsupported("is no OME-Zarr image: it has no multiscales")
+        raise Unsupported("is not an OME-Zarr image: it has no multiscales")
     first = multiscales[0]
     array = node[first["datasets"][0]["path"]]
     if not isinstance(array, zarr.Array):
-        raise Unsupported("is no OME-Zarr image: its first dataset is no array")
+        raise Unsupported("is not an OME-Zarr image: its first dataset is not an array")
     require_room(array.nbytes, path, compressed=True, size=int(array.nbytes_stored()))
     data = temporary_map(array.shape, array.dtype, in_memory=IN_MEMORY if mapped else array.nbytes)
     for part in _parts(array.shape, array.chunks):
@@ -97,7 +97,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
 
 
 def _halved(data: NDArray[Any]) -> NDArray[Any]:
-    """Means of 2 × 2 (× 2) pixels; a last odd row is left out, an axis of one pixel stays."""
+    """Means of 2 × 2 (× 2) pixels; an odd last row is dropped, an axis of one pixel is kept."""
     mean = data.astype(np.float64)
     for axis, edge in enumerate(data.shape):
         if edge > 1:

@@ -1,9 +1,9 @@
-"""Which files this program wrote: each carries its mark, and what carries none is not overwritten unasked.
+"""Marks in output files. Files without the mark of this program are not overwritten without `--overwrite`.
 
-The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` among a Zarr group's attributes,
-the format's name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table. An
-``.npy`` header has no place for words: ours is padded to 1024 bytes, which every reader skips and no other program writes. Angles
-belong to the stack beside them.
+The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` in the attributes of a Zarr group,
+the format name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table. An
+``.npy`` header has no room for text: ours is padded to 1024 bytes, which every reader skips and no other program writes. Angle
+files belong to the stack next to them.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ _PAGE_HEAD = 1000
 
 
 def signature() -> str:
-    """The mark with the version: ``noiseflow 0.1.0``."""
+    """The mark with the version, such as ``noiseflow 0.1.0``."""
     return f"{MARK} {version('noiseflow')}"
 
 
 def require_own(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file that this program did not write.
+    """Check that an output does not replace a file that this program did not write.
 
     Args:
-        path: an output; one that does not exist, or is empty, is free.
-        overwrite: replace it nevertheless.
+        path: an output; missing and empty files are accepted.
+        overwrite: accept any file.
 
     Raises:
-        FileExistsError: the file is not ours.
+        FileExistsError: the file exists and this program did not write it.
     """
-    # Whether it exists is asked last: a file that is deleted while it is looked at is gone, and not another's.
+    # existence is checked last, in case the file is deleted in the meantime
     if not overwrite and not is_own(path) and path.exists():
         raise FileExistsError(
             f"{path} exists and was not written by noiseflow; name another output, or replace it with --overwrite"
@@ -73,7 +73,7 @@ def is_own(path: Path) -> bool:
 
 
 def npy_start() -> bytes:
-    """The first bytes of our ``.npy`` files: NumPy's magic, version 1.0 and the length of the header."""
+    """The first bytes of our ``.npy`` files: magic string, version 1.0 and header length."""
     return b"\x93NUMPY\x01\x00" + (NPY_HEADER_BYTES - 10).to_bytes(2, "little")
 
 
@@ -91,7 +91,7 @@ def _tiff_is_own(path: Path) -> bool:
 
 
 def tensors_format(path: Path) -> str | None:
-    """The format's name in the metadata of a safetensors file; None where there is no such file, or no name."""
+    """The format name in the metadata of a safetensors file; None if there is no such file or no name."""
     try:
         with path.open("rb") as stream:
             length = int.from_bytes(stream.read(8), "little")

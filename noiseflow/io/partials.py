@@ -1,4 +1,4 @@
-"""Names of temporary folders tell whose they are: what a killed program left is cleared away when the next writes the same."""
+"""Temporary folders for outputs. Their names identify the process, so that leftovers of killed runs can be removed."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from pathlib import Path
 _LONGEST = 40
 _ENDING = ".part"
 REPLACED = "replaced"
-"""Name, within a temporary folder, of the folder that is being replaced."""
+"""Name of the replaced folder within a temporary folder."""
 _IN_USE: dict[Path, Path] = {}
 
 
 def link_target(path: str | Path) -> Path:
-    """What a symbolic link points to, or the path itself: a link that is written stays a link."""
+    """The target of a symbolic link, or the path itself, so that a link that is written remains a link."""
     path = Path(path)
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 @contextlib.contextmanager
 def partial_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder beside an output, gone when the block ends; a killed run's is cleared by the next one.
+    """Yield a temporary folder next to an output, removed at the end of the block; the next run removes that of a killed run.
 
-    Whatever libraries leave beside the files they write lies in it, too.
+    The folder also contains any auxiliary files that libraries write.
 
     Raises:
-        FileNotFoundError: the output's folder is gone.
+        FileNotFoundError: the folder of the output no longer exists.
     """
     path = link_target(path)
     clear_leftovers(path)
@@ -53,15 +53,15 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
 
 
 def clear_unfinished() -> None:
-    """Remove the temporary folders of this program: an interrupt may come while one is made or removed, at any line."""
+    """Remove the temporary folders of this process, in case an interrupt arrived while one was created or removed."""
     for folder, path in list(_IN_USE.items()):
-        if f"-{os.getpid()}-" in folder.name:  # not a folder of the process that forked this one
+        if f"-{os.getpid()}-" in folder.name:  # skip folders of the process that forked this one
             _remove(folder, path)
             _IN_USE.pop(folder, None)
 
 
 def _remove(folder: Path, path: Path | None) -> None:
-    """Remove a temporary folder; what it was replacing is put back first, where nothing has taken its place."""
+    """Remove a temporary folder; first restore the folder that it was replacing, unless there is a new one."""
     replaced = folder / REPLACED
     if path is not None and replaced.exists() and not path.exists():
         replaced.rename(path)
@@ -70,19 +70,19 @@ def _remove(folder: Path, path: Path | None) -> None:
 
 
 def _gone(folder: Path) -> FileNotFoundError:
-    return FileNotFoundError(errno.ENOENT, "the output folder does not exist any more", str(folder))
+    return FileNotFoundError(errno.ENOENT, "the output folder no longer exists", str(folder))
 
 
 def clear_leftovers(path: Path) -> None:
-    """Remove what programs that no longer run left of an output; a folder that one of them was replacing is put back.
+    """Remove the leftovers that terminated processes left for an output; restore a folder that one of them was replacing.
 
-    Files of other machines, of running programs and of other names stay.
+    Files of other machines, of running processes and of other outputs are kept.
     """
     _clear(path.parent, rf"\.{re.escape(path.stem[:_LONGEST])}", re.escape(path.suffix), path)
 
 
 def clear_all_leftovers(folder: Path) -> None:
-    """Remove what programs that no longer run left of any output in a folder of ours; all else stays, as above."""
+    """As `clear_leftovers`, for all outputs in a folder of this program."""
     _clear(folder, r"\..*", r"(?:\.\w+)?", None)
 
 
@@ -102,7 +102,7 @@ def _prefix(stem: str) -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Eight digits for this machine and its numbering of processes: containers that share a disk do not share that."""
+    """Eight digits that identify this machine and its process namespace, which differs between containers on one disk."""
     numbering = ""
     with contextlib.suppress(OSError):
         numbering = os.readlink("/proc/self/ns/pid")
@@ -110,7 +110,7 @@ def _machine() -> str:
 
 
 def _runs(process: int) -> bool:
-    if os.name == "nt":  # where asking would end it
+    if os.name == "nt":  # on Windows, os.kill would terminate the process
         return True
     try:
         os.kill(process, 0)

@@ -1,4 +1,4 @@
-"""PNG files of one grey image."""
+"""PNG files with one grey image."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile
 
 _GREY = {"L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
-"""Number types of Pillow's grey modes; which of them stands for 16 bits depends on its version."""
+"""Data types of Pillow's grey modes; the mode of 16-bit images depends on its version."""
 
 
 def read(path: Path) -> ImageFile:
-    """Read one grey image of 8 or 16 bits."""
+    """Read a grey image of 8 or 16 bits."""
     from PIL import Image
 
     with Image.open(path, formats=["PNG"]) as image:

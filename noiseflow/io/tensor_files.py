@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, each written whole or not at all."""
+"""Tensors in safetensors files, written atomically."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a file, or leave what was there.
+    """Write a file; if writing fails, an existing file is kept.
 
     Args:
         path: target.
-        tensors: on the CPU and contiguous, none sharing memory with another.
+        tensors: contiguous CPU tensors that do not share memory.
         metadata: texts by name.
 
     Raises:
-        OSError: the disk is full, the folder is gone, or the like.
+        OSError: the file cannot be written, for example because the disk is full.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -31,7 +31,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, 
     with atomic_path(path) as partial:
         try:
             save_file(tensors, partial, metadata=dict(metadata))
-        except SafetensorError as error:  # it tells the system's errors in words only
+        except SafetensorError as error:  # system errors are only part of its message
             found = re.search(r"os error (\d+)", str(error))
             if found is None:
                 raise

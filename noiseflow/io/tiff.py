@@ -1,4 +1,4 @@
-"""TIFF files: plain, ImageJ and OME, with their voxel sizes; and folders of single images."""
+"""TIFF files: plain, ImageJ and OME, with voxel sizes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _IMAGEJ_BYTES = 2**32 - 2**20
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the first series of a TIFF file; `mapped`, leave its pixels there, or in a temporary file, if compressed."""
+    """Read the first series of a TIFF file. If `mapped`, memory-map it, or a temporary copy if it is compressed."""
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
@@ -40,7 +40,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
-    """Write any real type as it is: as ImageJ's TIFF where that can say the voxel size, else as OME-TIFF.
+    """Write any real data type unchanged: as ImageJ TIFF if that can store the voxel size, otherwise as OME-TIFF.
 
     Returns:
         The pixels as stored.
@@ -50,7 +50,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     if voxel_size is None:
         tifffile.imwrite(
             path, data, photometric="minisblack", software=signature()
-        )  # or a stack of three would be stored as colour
+        )  # otherwise a stack of three would be stored as colour
         return data
     z, y, x = voxel_size
     if data.dtype in _OUTSIDE_OME:
@@ -73,7 +73,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
 
 def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
-    """The pixels of a stack where they are, if they lie there in one piece and in the machine's byte order."""
+    """Memory-map the pixels of a stack if they are contiguous and in native byte order."""
     begin, native = series.dataoffset, series.dtype.newbyteorder("=")
     kind = series.dtype.newbyteorder(series.parent.byteorder)
     if begin is not None and kind == native:
@@ -87,7 +87,7 @@ def _pages(tiff: TiffFile) -> list[Any]:
     pages: dict[int, Any] = {}
     for page in tiff.pages:
         if page.offset in pages:
-            raise ValueError("its list of pages runs in a circle")
+            raise ValueError("its list of pages is circular")
         pages[page.offset] = page
     return list(pages.values())
 

@@ -1,4 +1,4 @@
-"""The direction of the tilt axis in the images, as files state it: degrees from y towards −x (IMOD's rotation angle)."""
+"""Direction of the tilt axis in the images, from file metadata: degrees from y towards −x (IMOD's rotation angle)."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _TITLE = re.compile(
 _ROTATION = re.compile(r"\s*RotationAngle\s*=\s*([-+]?\d+(?:\.\d*)?)")
 _FIELD = re.compile(r"tilt.?axis.?(angle|rotation|orientation|direction)?[^/]*$", re.IGNORECASE)
 _ROTATION_OF_Y_AXIS = 90.0
-"""SerialEM's RotationAngle is that of the stage's other axis: its own titles state an axis angle smaller by 90°."""
+"""Degrees to add to SerialEM's RotationAngle, which refers to the other stage axis: its titles state an angle 90° smaller."""
 
 
 def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
-    """The tilt axis that the ``.mdoc`` beside a stack, the stack itself, or the microscope's log beside it states.
+    """The tilt axis from the ``.mdoc`` next to a stack, from the stack itself, or from the microscope log next to it.
 
     Args:
         stack: the file the stack was read from.
-        image: what was read.
+        image: the image file that was read.
 
     Returns:
-        Degrees, or None where nothing states it.
+        Degrees, or None if no file states it.
     """
     files = beside(Path(str(stack).partition("::")[0]))
     for file in files:
@@ -39,12 +39,12 @@ def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
 
 
 def axis_in_titles(lines: Iterable[str]) -> float | None:
-    """The angle of the first line that reads like ``Tilt axis angle = 84.3``."""
+    """The angle in the first line of the form ``Tilt axis angle = 84.3``."""
     return next((float(found[1]) for line in lines if (found := _TITLE.search(line))), None)
 
 
 def recorded_axis(leaves: Iterable[tuple[str, list[float]]]) -> float | None:
-    """The first plausible number of metadata, (name, numbers), under a name like ``Tilt axis angle``; zero is an unset field."""
+    """The first plausible number in metadata (name, numbers) under a name like ``Tilt axis angle``; zero means unset."""
     return next((v[0] for name, v in leaves if _FIELD.search(name) and len(v) == 1 and 0 < abs(v[0]) <= 360), None)
 
 
@@ -53,7 +53,7 @@ def _axis_in(file: Path) -> float | None:
         return None
     try:
         lines = text_lines(file, "log", holds="plain text")
-    except (OSError, ValueError):  # a file of this name that is something else
+    except (OSError, ValueError):  # an unrelated file of this name
         return None
     stated = axis_in_titles(lines)
     rotations = (float(found[1]) for line in lines if (found := _ROTATION.fullmatch(line.rstrip())))

@@ -1,4 +1,4 @@
-"""Units of length, as the formats spell them."""
+"""Units of length in file formats."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ _ANGSTROM = {
 
 
 def in_angstrom(unit: object) -> float | None:
-    """How many Å one unit is, by its name or symbol; None for what is no unit of length."""
+    """Å per unit, by its name or symbol; None if it is not a unit of length."""
     return _ANGSTROM.get(str(unit).strip().lower())

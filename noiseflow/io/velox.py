@@ -1,4 +1,4 @@
-"""Tilt angles in Velox's EMD files: every frame has its own JSON text of metadata, of which other readers look at the first."""
+"""Tilt angles in Velox EMD files, from the JSON metadata of every frame (other readers use only the first frame)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from noiseflow.io.checks import require_room
 
 
 def stage_angles(path: Path, count: int) -> NDArray[np.float64] | None:
-    """The stage's alpha tilt of every frame, degrees; None where the file does not tell so many, or it stood still."""
+    """Alpha tilt of the stage for every frame, degrees; None if the number differs from `count` or the stage did not move."""
     import h5py
 
     with h5py.File(path, "r") as file:

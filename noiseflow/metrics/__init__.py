@@ -1,4 +1,4 @@
-"""How well a noise model fits data it has not seen, and whether its residuals have structure."""
+"""Evaluation of noise models on held-out data, and tests for structure in their residuals."""
 
 import lazy_loader as _lazy
 

@@ -13,7 +13,7 @@ def jensen_shannon(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np
 
 
 def bhattacharyya(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bhattacharyya coefficient Σ√(pq) along the last axis; the distance is −log of it."""
+    """Bhattacharyya coefficient Σ√(pq) along the last axis; the Bhattacharyya distance is its negative logarithm."""
     return np.asarray(np.sqrt(p * q).sum(-1))
 
 

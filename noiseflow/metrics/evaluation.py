@@ -1,7 +1,7 @@
-"""How well a noise model fits data it has not seen: NLL, Jensen–Shannon, Bhattacharyya, PIT, each with its finite-sample floor.
+"""Evaluation of a noise model on held-out data: NLL, Jensen–Shannon, Bhattacharyya and PIT, with finite-sample floors.
 
-Divergences compare a histogram of residuals with the model's *exact* bin masses. They are biased: even under the true model they
-are not zero, so each is returned beside its floor, the mean it takes when the data really come from the model.
+Divergences compare a histogram of residuals with the *exact* bin probabilities of the model. They are biased: even under the true
+model they are not zero. Each is therefore returned with its floor, its mean if the data come from the model.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from noiseflow.metrics.judged import judged_pixels
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
 _SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
-_GROUPS_OF_A_BIN = 64  # of signals of one bin out of sixteen: still four times as fine as those of all
+_GROUPS_OF_A_BIN = 64  # groups of signals in one of sixteen bins: four times finer than the groups for all signals
 _SHIFT_WITHIN_GROUP = 1 / 16
 
 
@@ -37,12 +37,12 @@ class Divergence:
 
     Attributes:
         jsd: Jensen–Shannon divergence.
-        jsd_floor: its mean under the model.
-        jsd_interval: bootstrap interval of 90 %.
+        jsd_floor: mean of `jsd` if the data come from the model.
+        jsd_interval: 90 % bootstrap interval.
         bc: Bhattacharyya coefficient, 1 for equal distributions.
-        bc_floor: its mean under the model.
+        bc_floor: mean of `bc` if the data come from the model.
         bd: Bhattacharyya distance, −log bc.
-        bd_floor: its mean under the model.
+        bd_floor: mean of `bd` if the data come from the model.
     """
 
     jsd: float
@@ -57,17 +57,17 @@ class Divergence:
 @described(nll="nats per pixel", nll_error="nats per pixel")
 @dataclass(frozen=True)
 class Evaluation:
-    """A noise model judged on pixels it has not seen.
+    """The evaluation of a noise model on held-out pixels.
 
     Attributes:
-        nll: mean negative log-likelihood, nats per pixel; of a digitised model, per level.
+        nll: mean negative log-likelihood, nats per pixel; of level probabilities if the model is digitised.
         nll_error: its standard error.
         overall: divergence of the residuals of all pixels.
         per_signal: divergence of the residuals within each signal bin.
-        pit: (20,) histogram of the probability integral transform, density 1 where the model is calibrated.
-        ks: Kolmogorov–Smirnov distance of the PIT from uniform.
-        ks_floor: the distance that 5 % of true models exceed.
-        num_pixels: pixels judged.
+        pit: (20,) histogram of the probability integral transform; its density is 1 if the model is calibrated.
+        ks: Kolmogorov–Smirnov distance of the PIT from the uniform distribution.
+        ks_floor: distance that the true model exceeds with a probability of 5 %.
+        num_pixels: number of pixels used.
     """
 
     nll: float
@@ -81,12 +81,12 @@ class Evaluation:
 
     @property
     def mean_jsd(self) -> float:
-        """Mean over signal bins of the Jensen–Shannon divergence."""
+        """Mean Jensen–Shannon divergence over the signal bins."""
         return float(np.mean([divergence.jsd for divergence in self.per_signal]))
 
     @property
     def mean_jsd_floor(self) -> float:
-        """Mean over signal bins of the floor of the Jensen–Shannon divergence."""
+        """Mean floor of the Jensen–Shannon divergence over the signal bins."""
         return float(np.mean([divergence.jsd_floor for divergence in self.per_signal]))
 
 
@@ -100,19 +100,19 @@ def evaluate(
     skip_non_finite: bool = False,
     seed: int = 0,
 ) -> Evaluation:
-    """Judge a noise model on clean signals and observations that it was not fitted to.
+    """Evaluate a noise model on clean signals and observations that it was not fitted to.
 
     Args:
-        noise_model: the model.
-        signal, observation: tensors or arrays of any shape, equal; detector units. Masked pixels are left out. Dask arrays are
-            computed block by block, and of more than 10⁷ pixels an even random share of that size is judged.
-        num_bins: bins of the residual histograms.
-        num_signal_bins: bins of equal population along the signal.
-        skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
-        seed: of the bootstrap, of the randomised PIT and of the pixels taken from large Dask arrays.
+        noise_model: the noise model.
+        signal, observation: tensors or arrays of equal shape, detector units. Masked pixels are excluded. Dask arrays are
+            computed block by block; if they have more than 10⁷ pixels, a random sample of that size is used.
+        num_bins: number of bins of the residual histograms.
+        num_signal_bins: number of equally populated bins along the signal.
+        skip_non_finite: exclude pixels whose signal or observation is NaN or infinite, instead of raising an error.
+        seed: seed of the bootstrap, of the randomised PIT and of the sample of large Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, or there are none.
+        ValueError: shapes differ, pixels are not finite, or there are no pixels.
     """
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
     random = np.random.default_rng(seed)
@@ -139,7 +139,7 @@ def evaluate(
 
 @torch.no_grad()
 def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) -> Given:
-    """Log-likelihood of each pixel, float64, (N,), computed piece by piece; of Dask arrays, a Dask array."""
+    """Log-likelihood of each pixel, float64, (N,), computed in pieces; a Dask array for Dask arrays."""
     if is_lazy(signal) or is_lazy(observation):
         lazy = noise_model(signal if is_lazy(signal) else observation * 0 + signal)
         found: Given = lazy.log_prob(observation).astype(float)
@@ -159,15 +159,15 @@ def divergence(
     num_groups: int = _SIGNAL_GROUPS,
     random: np.random.Generator | None = None,
 ) -> Divergence:
-    """Divergence between the residuals observation − signal and the model's exact masses in the same bins; both (N,).
+    """Divergence between the residuals observation − signal, (N,) each, and the model's exact probabilities in the same bins.
 
-    `num_groups` signals, at least, stand for all.
+    The (N,) signals are represented by at least `num_groups` signals.
     """
     signal, observation = floating(signal), floating(observation)
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
     low, high = np.quantile(residual, (0.001, 0.999))
-    if not high > low:  # nearly all residuals are equal, as of counts: bins of a few hundredths of a count
+    if not high > low:  # nearly all residuals are equal, as for low counts: use bins of a few hundredths of a count
         low, high = low - 1.0, low + 2.0
     edges = np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]])
     counts = np.histogram(residual, edges)[0]
@@ -183,9 +183,9 @@ def residual_masses(
     *,
     num_groups: int = _SIGNAL_GROUPS,
 ) -> NDArray[np.float64]:
-    """Probability of each residual bin, averaged over the given (N,) signals, from the model's CDF; (K,) for (K+1,) edges.
+    """Probability of each residual bin from the model's CDF, averaged over (N,) signals; (K,) for (K+1,) edges.
 
-    `num_groups` signals, at least, stand for all.
+    The (N,) signals are represented by at least `num_groups` signals.
     """
     signal, edges = floating(signal), as_tensor(edges)
     order = torch.argsort(signal)
@@ -202,7 +202,7 @@ def residual_masses(
 
 
 def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int) -> int:
-    """How many signals stand for all: single pixel values that have mass must not move across bins within a group."""
+    """Number of signals that represent all: discrete pixel values must not cross bin edges within a group."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
@@ -216,13 +216,13 @@ def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: in
 def compare_histogram(
     counts: NDArray[np.int64], masses: NDArray[np.float64], random: np.random.Generator
 ) -> Divergence:
-    """Divergence between counts (K,) and exact masses (K,), with floors from draws of the model and a bootstrap interval."""
+    """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval."""
     total = int(counts.sum())
     frequencies = counts / total
     under_model = random.multinomial(total, masses, size=_NUM_RESAMPLES) / total
     resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
     floor, spread = jensen_shannon(under_model, masses), jensen_shannon(resampled, masses)
-    # a resample of the histogram is twice as far from the truth as the histogram: take its extra bias off
+    # resampling the histogram doubles its bias: subtract the extra bias
     shift = float(spread.mean() - jensen_shannon(frequencies, masses))
     interval = np.quantile(spread - shift, (0.05, 0.95))
     bc, bc_floor = float(bhattacharyya(frequencies, masses)), float(bhattacharyya(under_model, masses).mean())
@@ -244,7 +244,7 @@ def probability_integral_transform(
     observation: Tensor | NDArray[Any],
     random: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """F(observation | signal) of (N,) pixels, uniform under the true model; jumps of F are filled at random."""
+    """F(observation | signal) of (N,) pixels, uniform under the true model; randomised within jumps of F."""
     values = []
     pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
     for s, o in pieces:
@@ -296,13 +296,13 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
 def kl_divergence(
     truth: nn.Module, noise_model: nn.Module, signal: Tensor | NDArray[Any], *, seed: int = 0
 ) -> tuple[float, float]:
-    """Kullback–Leibler divergence from a known truth, E[log p_true − log p_model] in nats per pixel, and its standard error.
+    """Kullback–Leibler divergence from a known truth, E[log p_true − log p_model], and its standard error, nats per pixel.
 
     Args:
-        truth: the noise model that the data really follow.
-        noise_model: the model to judge.
-        signal: (N,) signals; one observation is drawn at each.
-        seed: of the draws.
+        truth: the true noise model of the data.
+        noise_model: the model to evaluate.
+        signal: (N,) signals; one observation is drawn for each.
+        seed: seed of the draws.
     """
     signal = floating(signal)
     generator = torch.Generator(signal.device).manual_seed(seed)

@@ -1,4 +1,4 @@
-"""The pixels that a noise model is judged on: flat, finite, without masked ones; of Dask arrays, in bounded memory."""
+"""Pixels for the evaluation of a noise model: flat, finite and unmasked; from Dask arrays in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from torch import Tensor
 from noiseflow.arrays import floating, is_lazy, unmasked
 
 MOST_LAZY = 10**7
-"""Pixels judged of Dask arrays. What is kept of each takes some 50 bytes, so half a GB; the standard error of the mean
-log-likelihood is then below a thousandth of its spread."""
+"""Number of pixels used from Dask arrays: about 50 bytes each, half a GB. The standard error of the mean log-likelihood is then
+less than a thousandth of its standard deviation."""
 
 
 def judged_pixels(
     signal: Any, observation: Any, *, skip_non_finite: bool = False, seed: int = 0, most: int = MOST_LAZY
 ) -> tuple[Tensor, Tensor]:
-    """Signals and observations to judge, (N,) each.
+    """Signals and observations for the evaluation, (N,) each.
 
     Args:
-        signal, observation: tensors or arrays of any shape, equal; masked pixels are left out.
-        skip_non_finite: leave pixels out whose signal or observation is NaN or infinite, instead of refusing them.
-        seed: of the choice of pixels, where Dask arrays have more than `most`.
-        most: pixels taken of Dask arrays.
+        signal, observation: tensors or arrays of equal shape; masked pixels are excluded.
+        skip_non_finite: exclude pixels whose signal or observation is NaN or infinite, instead of raising an error.
+        seed: seed of the sample if Dask arrays have more than `most` pixels.
+        most: largest number of pixels taken from Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, or there are none.
+        ValueError: shapes differ, pixels are not finite, or there are no pixels.
     """
     if is_lazy(signal) or is_lazy(observation):
         return _of_blocks(signal, observation, skip_non_finite, np.random.default_rng(seed), most)
@@ -52,7 +52,7 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     if not (skip_non_finite and bool(finite.any())):
         raise ValueError(
             f"{int((~finite).sum())} of {finite.numel()} pixels of signal or observation are NaN or infinite; "
-            "mend them, or leave them out with skip_non_finite=True"
+            "replace them, or exclude them with skip_non_finite=True"
         )
     return signal[finite], observation[finite]
 
@@ -60,7 +60,7 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
 def _of_blocks(
     signal: Any, observation: Any, skip_non_finite: bool, random: np.random.Generator, most: int
 ) -> tuple[Tensor, Tensor]:
-    """Block by block; of each an equal share of its pixels, all of them where there are few enough."""
+    """Collect pixels block by block: the same share of every block, or all pixels if they are few enough."""
     dask, array = import_module("dask"), import_module("dask.array")
     lazy = [array.asanyarray(getattr(each, "data", each) if is_lazy(each) else each) for each in (signal, observation)]
     if lazy[0].shape != lazy[1].shape or not lazy[0].size:
@@ -76,7 +76,7 @@ def _of_blocks(
         parts.append(pair[:, _share(pair.shape[1], most / lazy[0].size, random)])
     both = torch.cat(parts, 1)
     if not both.numel():
-        raise ValueError("all pixels of signal or observation are masked; unmask those to judge")
+        raise ValueError("all pixels of signal or observation are masked; unmask the pixels to evaluate")
     return _finite(both[0], both[1], skip_non_finite)
 
 

@@ -1,4 +1,4 @@
-"""Structure that a per-pixel noise model cannot have: row, column and neighbour correlation of its residuals."""
+"""Spatial structure in residuals that a per-pixel noise model cannot describe: row, column and neighbour correlation."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from noiseflow.models.scan_noise import ScanDistribution
 @described()
 @dataclass(frozen=True)
 class SpatialStructure:
-    """Correlations that a per-pixel noise model cannot have, of standardised residuals of an image.
+    """Correlations of the standardised residuals of an image, which a per-pixel noise model cannot describe.
 
     Attributes:
-        rows, columns: variance of row and column means over what independent pixels would give; 1 where there is no structure.
+        rows, columns: variance of row and column means relative to that of independent pixels; 1 without structure.
         horizontal, vertical: correlation of neighbouring pixels.
-        pattern: correlation of equal pixels of different images of a stack; 0 for a single image.
+        pattern: correlation of the same pixel in different images of a stack; 0 for a single image.
         error: standard error of the correlations under independence.
-        suffices: whether the model suffices: nothing stands out by over four standard errors.
-        remedies: what would describe what stands out, most telling first.
+        suffices: whether the model suffices: no value deviates by more than four standard errors.
+        remedies: model terms that would describe the deviations, most significant first.
     """
 
     rows: float
@@ -43,13 +43,13 @@ class SpatialStructure:
     remedies: tuple[str, ...] = ()
 
     def in_words(self) -> str:
-        """One line for people."""
+        """One-line summary."""
         figures = (
-            f"neighbours correlate by {self.horizontal:+.3f} along x and {self.vertical:+.3f} along y (± {self.error:.3f}), "
-            f"row means vary {self.rows:.2f} and column means {self.columns:.2f} times as much as independent pixels' would"
+            f"correlation of neighbours {self.horizontal:+.3f} along x and {self.vertical:+.3f} along y (± {self.error:.3f}); "
+            f"variance of row means {self.rows:.2f} and of column means {self.columns:.2f} times that of independent pixels"
         )
         if self.pattern:
-            figures += f", equal pixels of different images correlate by {self.pattern:+.3f}"
+            figures += f"; correlation of the same pixel in different images {self.pattern:+.3f}"
         if self.suffices:
             return figures + "; a per-pixel model suffices"
         return figures + "; a per-pixel model does not suffice: " + "; ".join(self.remedies)
@@ -59,9 +59,9 @@ class SpatialStructure:
 def spatial_structure(
     noise_model: nn.Module, signal: Tensor | NDArray[Any], observation: Tensor | NDArray[Any]
 ) -> SpatialStructure:
-    """Residual row, column, neighbour and fixed-pattern correlation of (y, x) images, or stacks of them, under a noise model.
+    """Row, column, neighbour and fixed-pattern correlation of the residuals of images (y, x), or stacks, under a noise model.
 
-    NaN and infinite pixels are left out: their residuals count as 0.
+    NaN and infinite pixels are excluded (their residuals are set to 0).
     """
     z = _latent(noise_model, floating(signal), floating(observation))
     height, width = z.shape[-2:]
@@ -73,10 +73,10 @@ def spatial_structure(
     shared = _shared(z), _shared(z.swapaxes(-1, -2))
     neighbours = max(abs(horizontal - shared[0]), abs(vertical - shared[1]))
     excess = {
-        "ScanNoise(model) adds an offset of each row": shared[0] * math.sqrt(z.size * width) / 2,
-        'ScanNoise(model, along="column") adds an offset of each column': shared[1] * math.sqrt(z.size * height) / 2,
-        "WithMaps(model, gain, offset) gives pixels a gain and an offset of their own": pattern / error,
-        "no term of the library describes correlated neighbours; bin the image, or fit every second pixel": neighbours
+        "ScanNoise(model) adds an offset to each row": shared[0] * math.sqrt(z.size * width) / 2,
+        'ScanNoise(model, along="column") adds an offset to each column': shared[1] * math.sqrt(z.size * height) / 2,
+        "WithMaps(model, gain, offset) gives every pixel its own gain and offset": pattern / error,
+        "no model of the library describes correlated neighbours; bin the image, or fit every second pixel": neighbours
         / error,
     }
     remedies = sorted((name for name in excess if excess[name] > 4), key=lambda name: -excess[name])
@@ -84,7 +84,7 @@ def spatial_structure(
 
 
 def _shared(z: NDArray[np.float64]) -> float:
-    """Variance that all pixels of a row share: the covariance of its halves, which neighbours hardly touch."""
+    """Variance shared by all pixels of a row: the covariance of its halves, hardly affected by neighbour correlation."""
     half = z.shape[-1] // 2
     if half == 0:
         return 0.0

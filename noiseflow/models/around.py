@@ -1,4 +1,4 @@
-"""Noise models around other noise models, and modules of other libraries as noise models."""
+"""Noise models that wrap other noise models, and modules of other libraries as noise models."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _HALF = (torch.float16, torch.bfloat16)
 
 
 class ModelAround(NoiseModelBase):
-    """A noise model with another one inside, whose traits it shares where it does not say otherwise.
+    """Base class of noise models that wrap another one. Properties are taken from the inner model unless overridden.
 
     Args:
-        model: the noise model inside.
+        model: the inner noise model.
 
     Raises:
         TypeError: `model` is not a module.
@@ -91,13 +91,13 @@ class ModelAround(NoiseModelBase):
 
 
 class ForeignModel(NoiseModelBase):
-    """Any module that returns a distribution for signals, with the traits of a noise model at their defaults.
+    """Any module that returns a distribution for signals, as a noise model with default properties.
 
-    Signals in half precision reach it in single precision, unless its own parameters are in half precision, and infinite ones
-    as NaN.
+    Half-precision signals are passed in single precision, unless the parameters of the module are in half precision. Infinite
+    signals are passed as NaN.
 
     Args:
-        module: called with signals; returns a distribution of one observation for each.
+        module: called with signals; returns a distribution of one observation per signal.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -114,20 +114,20 @@ class ForeignModel(NoiseModelBase):
         return as_noise_distribution(self.module(working), like=values)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """That of the module, where it has one of its own."""
+        """Call ``standardise`` of the module if it has one."""
         own: Callable[..., Any] | None = getattr(self.module, "standardise", None)
         if own is not None:
             own(values_of(signal), observation)
 
 
 def as_noise_model(module: nn.Module) -> NoiseModelBase:
-    """The module itself where it is a noise model, or else a `ForeignModel` around it.
+    """Return the module if it is a noise model, otherwise wrap it in `ForeignModel`.
 
     Raises:
-        TypeError: not a module.
+        TypeError: the argument is not a module.
     """
     if not isinstance(module, nn.Module):
         raise TypeError(
-            f"a noise model is a torch module, and this is {type(module).__name__}; derive it from noiseflow.NoiseModelBase"
+            f"a noise model must be a torch module, not {type(module).__name__}; derive it from noiseflow.NoiseModelBase"
         )
     return module if isinstance(module, NoiseModelBase) else ForeignModel(module)

@@ -1,4 +1,4 @@
-"""Noise models of a detector that adds a large constant, computed without it: float32 has no digits to spare."""
+"""Noise models of detectors that add a large constant, evaluated without it to preserve float32 precision."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from noiseflow.models.digitised import Digitised
 class AtLevel(ModelAround):
     """A noise model of signals and observations above a constant level.
 
-    The observation of a signal s is that of the model inside at s − level, plus the level.
+    The observation at a signal s is that of the inner model at s − level, plus the level.
 
     Args:
-        model: the noise model of values above the level, of single pixels, neither rounding nor clipping; see `at_level`.
-        level: detector units.
+        model: single-pixel noise model of values above the level, without rounding and clipping; see `at_level`.
+        level: constant level, detector units.
 
     Raises:
-        ValueError: a model that needs images, or that rounds or clips.
+        ValueError: the model needs images, or rounds or clips.
 
     Example:
         >>> import noiseflow, torch
@@ -37,7 +37,7 @@ class AtLevel(ModelAround):
         super().__init__(model)
         if self.model.needs_image or self.model.describes_single_readings:
             raise ValueError(
-                "a level belongs inside: put rounding, clipping and image terms around AtLevel(model, level)"
+                "AtLevel must be the innermost model: put rounding, clipping and image terms around AtLevel(model, level)"
             )
         self.level = float(level)
 
@@ -47,7 +47,7 @@ class AtLevel(ModelAround):
         return base.rescaled(torch.ones_like(values), torch.full_like(values, self.level))
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """Standardise the model inside on values above the level."""
+        """Standardise the inner model on values above the level."""
         self.model.standardise(given_to(self.model, values_of(signal) - self.level), observation - self.level)
 
     @property
@@ -68,11 +68,13 @@ class AtLevel(ModelAround):
 
 
 def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
-    """A noise model that was fitted to values above a level, for the values themselves; rounding and clipping stay outside.
+    """Convert a noise model that was fitted to values above a level to one of the values themselves.
+
+    Rounding and clipping remain the outermost terms.
 
     Args:
-        model: of single pixels.
-        level: detector units.
+        model: single-pixel noise model.
+        level: constant level, detector units.
     """
     if isinstance(model, Digitised):
         return Digitised(at_level(model.model, level), model.step, model.low + level, model.high + level)

@@ -1,4 +1,4 @@
-"""What a noise model is: `NoiseModelBase`, one abstract method and every other trait with its default."""
+"""`NoiseModelBase`, the base class of noise models: one abstract method, and defaults for everything else."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from noiseflow.distributions.numerical import as_noise_distribution
 
 
 class Described(nn.Module):
-    """A module whose repr is one line: its settings, the described modules inside, and its units.
+    """A module with a one-line repr: its settings, its described submodules and its units.
 
     Attributes:
-        measured_in: units of what the module takes or gives.
+        measured_in: units of the inputs and outputs of the module.
     """
 
     measured_in: str = "detector units"
 
     def summary(self) -> str:
-        """The settings, then the described modules inside, then how many parameters there are."""
+        """The settings, the described submodules, and the number of parameters."""
         inside = [repr_without_units(child) for child in self.children() if isinstance(child, Described)]
         count = sum(parameter.numel() for parameter in self.parameters())
         parts = [self.extra_repr(), *inside, f"{count} parameters" if count > 8 else ""]
@@ -36,15 +36,16 @@ class Described(nn.Module):
 
 
 def repr_without_units(module: Described) -> str:
-    """A module inside another one, whose units are those of the whole."""
+    """The repr of a submodule, without the units, which are those of the whole model."""
     return f"{type(module).__name__}({module.summary()})"
 
 
 class NoiseModelBase(Described, ABC):
-    """A conditional density p(observation | signal): the contract of every noise model.
+    """Base class of noise models, conditional densities p(observation | signal).
 
-    A model defines `forward`. Everything else has a default that serves any model; override what is known better, a property by
-    a class attribute of the same name. What a property says holds for the model as a whole, models inside it included.
+    A subclass must define `forward`. All other methods and properties have defaults that are valid for any model and can be
+    overridden, properties also by a class attribute of the same name. A property describes the whole model, including inner
+    models.
 
     Example:
         >>> import noiseflow, torch
@@ -60,200 +61,200 @@ class NoiseModelBase(Described, ABC):
 
     @abstractmethod
     def forward(self, signal: Any) -> NoiseDistribution:
-        """The distribution of the observations of pixels with the given signals.
+        """Return the distribution of the observations, given the signals of the pixels.
 
         Args:
-            signal: clean signals, any shape, detector units; for a model that `needs_image`, images (..., y, x) or a
-                `PickedSignal`.
+            signal: clean signals, any shape, detector units; images (..., y, x) or a `PickedSignal` if the model
+                `needs_image`.
 
         Returns:
             A distribution with ``batch_shape == signal.shape`` and ``event_shape == ()``.
         """
 
     def __call__(self, signal: Any) -> Any:
-        """As `forward`; numbers and arrays of any library are taken too, and the distribution then takes and gives arrays."""
+        """As `forward`, but also accepts numbers and arrays of any library; the distribution then takes and returns arrays."""
         if is_array(signal):
             return distribution_of_array(self, signal, needs_image=self.needs_image)
         return as_noise_distribution(super().__call__(signal))
 
-    # What the model looks at
+    # Input of the model
 
     @property
     def needs_image(self) -> bool:
-        """Whether the model looks beyond single pixels, so that it takes images (..., y, x); False."""
+        """Whether the model depends on more than single pixels and takes images (..., y, x). Default: False."""
         return False
 
     @property
     def neighbourhood(self) -> int:
-        """Side, odd, of the window of clean signals around each pixel that the model looks at; 1."""
+        """Side (odd) of the window of clean signals around each pixel that the model uses. Default: 1."""
         return 1
 
     @property
     def shared_axis(self) -> int | None:
-        """The axis of an image, −1 or −2, along which pixels share a random offset; None where pixels are independent."""
+        """Image axis, −1 or −2, along which pixels share a random offset; None if pixels are independent (default)."""
         return None
 
     def at_read_noise(self, signal: Any, read_noise: Tensor) -> NoiseDistribution:
-        """As `forward`, of pixels that have a read noise of their own in place of the model's.
+        """As `forward`, with a separate read noise for each pixel instead of that of the model.
 
         Args:
             signal: as in `forward`.
-            read_noise: of each pixel, detector units rms, shape of the signal.
+            read_noise: read noise of each pixel, detector units rms, shape of the signal.
 
         Raises:
-            ValueError: the model has no read noise of single pixels.
+            ValueError: the model has no read noise.
         """
         raise ValueError(
-            f"{type(self).__name__} has no read noise that pixels could have of their own; use a PoissonGaussian, or leave "
-            "the map of variance out"
+            f"{type(self).__name__} has no read noise that a variance map could replace; use a PoissonGaussian, or remove "
+            "the variance map"
         )
 
     # Rounding and clipping
 
     @property
     def describes_single_readings(self) -> bool:
-        """Whether single pixel values have a mass, as rounded or counted ones do; False: the model is a density.
+        """Whether pixel values are discrete and have probabilities, as for rounding or counting. Default: False (a density).
 
-        `fit` puts rounding and clipping around a model that is a density.
+        `fit` wraps continuous models in `Digitised` if the data are rounded or clipped.
         """
         return False
 
     @property
     def step(self) -> float:
-        """Rounding step, detector units; 0 where pixel values are not rounded."""
+        """Rounding step, detector units; 0 if pixel values are not rounded (default)."""
         return 0.0
 
     @property
     def low(self) -> float:
-        """Lower clipping limit, detector units; −∞ where there is none."""
+        """Lower clipping limit, detector units; −∞ if there is none (default)."""
         return -float("inf")
 
     @property
     def high(self) -> float:
-        """Upper clipping limit, detector units; ∞ where there is none."""
+        """Upper clipping limit, detector units; ∞ if there is none (default)."""
         return float("inf")
 
     def without_rails(self) -> NoiseModelBase:
-        """The same model, rounding as it does but never clipping; itself."""
+        """The same model with rounding but without clipping. Default: the model itself."""
         return self
 
     @property
     def one_pixel(self) -> NoiseModelBase:
-        """The model of a pixel by itself, before rounding, clipping and what its place in an image adds; itself."""
+        """The model of a single pixel, before rounding, clipping and position-dependent terms. Default: the model itself."""
         return self
 
     def without_converter(self) -> NoiseModelBase:
-        """The model before rounding, clipping and the gains and offsets of single pixels; itself."""
+        """The model before rounding, clipping and per-pixel gains and offsets. Default: the model itself."""
         return self
 
     def behind(self, converter: Callable[[NoiseModelBase], NoiseModelBase]) -> NoiseModelBase:
-        """This model with a converter, such as `Digitised`, put where it belongs; around the whole.
+        """This model with a converter such as `Digitised` at the correct position. Default: around the whole model.
 
         Args:
-            converter: takes a noise model and returns that model behind the converter.
+            converter: function from a noise model to that model wrapped in the converter.
         """
         return converter(self)
 
-    # Where a fit starts, and how it goes on
+    # Initialisation and settings of a fit
 
     def standardise(self, signal: Any, observation: Tensor) -> None:
-        """Measure the scaling of (N,) signals and observations, detector units, so that a fit starts near the data; nothing.
+        """Measure the scaling of (N,) signals and observations, detector units, to start a fit near the data. Default: no effect.
 
-        A model with `standardises_by_level` takes the argument ``span`` too, the range (low, high) of signals to cover.
+        A model with `standardises_by_level` also takes the argument ``span``, the range (low, high) of signals to cover.
         """
         return
 
     @property
     def standardises_by_level(self) -> bool:
-        """Whether `standardise` takes centre and width of the residuals at each signal level, and ``span``; False.
+        """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
 
-        Residuals mirrored about the signal serve such a model where clipping hides one side.
+        For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
         """
         return False
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Move to the most likely parameters, after `standardise`, where the model can find them directly; nothing.
+        """Set the maximum-likelihood parameters after `standardise`, if the model can find them directly. Default: no effect.
 
         Args:
             signal, observation: (N,), detector units.
-            behind: puts the model behind what stands in front of its values, such as rounding and clipping.
+            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
         """
         return
 
     @property
     def starts_most_likely(self) -> bool:
-        """Whether `standardise` leaves little to learn, so that a few steps suffice; False."""
+        """Whether `standardise` reaches nearly the maximum of the likelihood, so that few steps suffice. Default: False."""
         return False
 
     @property
     def learning_rate(self) -> float:
-        """Starting rate of a fit of the model to known signals; 0.01, for a model that starts near the data."""
+        """Initial learning rate of a fit to known signals. Default: 0.01, for a model that starts near the data."""
         return 1e-2
 
     @property
     def num_steps(self) -> int:
-        """Steps that a fit to known signals takes; 500."""
+        """Number of steps of a fit to known signals. Default: 500."""
         return 500
 
     @property
     def joint_learning_rate(self) -> float:
-        """Starting rate in a joint fit, in which the noise must keep up with the signal; 0.03."""
+        """Initial learning rate in a joint fit, in which the noise must follow the signal. Default: 0.03."""
         return 3e-2
 
     @property
     def most_joint_steps(self) -> int | None:
-        """Most steps of a fit to a signal that is itself an estimate; None for as many as asked for."""
+        """Largest number of steps of a fit to an estimated signal; None for no limit (default)."""
         return None
 
     @property
     def starts_anew(self) -> bool:
-        """Whether the model had better be standardised again whenever its signal has improved; False."""
+        """Whether the model should be standardised again whenever its signal has improved. Default: False."""
         return False
 
     @property
     def learns(self) -> bool:
-        """Whether anything of the model is trainable."""
+        """Whether the model has trainable parameters."""
         return any(parameter.requires_grad for parameter in self.parameters())
 
     @property
     def fitted_range(self) -> tuple[float, float] | None:
-        """Least and greatest signal of the last fit, detector units; None where the model does not keep them."""
+        """Smallest and largest signal of the last fit, detector units; None if the model does not store them (default)."""
         return None
 
-    # How its likelihood is computed
+    # Computation of the likelihood
 
     tabulate: bool = True
-    """Whether likelihoods and samples of large inputs may be looked up in tables; set it to False for exact ones at any size."""
+    """Whether likelihoods and samples of large inputs may be looked up in tables; set it to False for exact values."""
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
-        """What of the likelihood of (N,) pixels does not change while the model learns, (N, K); None where everything may."""
+        """The part of the likelihood of (N,) pixels that training does not change, (N, K); None if there is none (default)."""
         return None
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of (N,) pixels by their `fixed_part`, which decides whether this is called."""
-        raise NotImplementedError(f"{type(self).__name__} has a fixed_part, so it needs log_prob_from too")
+        """Log-likelihood of (N,) pixels from their `fixed_part`; called only if that is not None."""
+        raise NotImplementedError(f"{type(self).__name__} defines fixed_part; it must define log_prob_from too")
 
     def fixed_interval_part(self, signal: Tensor, low: Tensor, high: Tensor) -> Tensor | None:
-        """As `fixed_part`, of the likelihood of intervals (low, high]."""
+        """As `fixed_part`, for the likelihood of intervals (low, high]."""
         return None
 
     def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of (N,) intervals by their `fixed_interval_part`, which decides whether this is called."""
+        """Log-likelihood of (N,) intervals from their `fixed_interval_part`; called only if that is not None."""
         raise NotImplementedError(
-            f"{type(self).__name__} has a fixed_interval_part: it needs log_interval_prob_from too"
+            f"{type(self).__name__} defines fixed_interval_part; it must define log_interval_prob_from too"
         )
 
-    # Files and places
+    # Files and devices
 
     def config(self) -> dict[str, Any]:
-        """The arguments, JSON can hold them, that make this model again besides its parameters and the models inside; none."""
+        """JSON-serialisable arguments that recreate the model, without its parameters and inner models. Default: none."""
         return {}
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters and buffers are; the CPU for a model without any."""
+        """Device of the parameters and buffers; the CPU for a model without any."""
         tensors = (tensor for group in (self.parameters(), self.buffers()) for tensor in group)
         return next((tensor.device for tensor in tensors), torch.device("cpu"))
 

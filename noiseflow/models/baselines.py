@@ -1,4 +1,4 @@
-"""The textbook noise models that the flows are judged against: Gaussian and Poisson."""
+"""Baseline noise models: Gaussian and Poisson."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from noiseflow.distributions.textbook import PoissonDistribution as PoissonDistr
 from noiseflow.distributions.textbook import SpreadPoissonDistribution
 from noiseflow.models.base import NoiseModelBase
 
-_NEAR_STEP = 0.2  # of a rounding step: a gain so near to it may be the step itself, as where single events are counted
+_NEAR_STEP = 0.2  # of the rounding step: a gain this close to the step may be the step itself, as in event counting
 
 
 class Gaussian(NoiseModelBase):
-    """Gaussian noise of one standard deviation around the signal.
+    """Gaussian noise with the same standard deviation at all signals.
 
     Args:
         scale: standard deviation, detector units.
@@ -39,7 +39,7 @@ class Gaussian(NoiseModelBase):
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the root-mean-square residual of (N,) signals and observations."""
+        """Set the scale to the root-mean-square residual of (N,) signals and observations."""
         self.log_scale.copy_(torch.log((observation.double() - signal.double()).square().mean().sqrt()))
 
     def extra_repr(self) -> str:
@@ -49,13 +49,13 @@ class Gaussian(NoiseModelBase):
 class Poisson(NoiseModelBase):
     """Shot noise: observation = gain·k + offset with k Poisson of rate (signal − offset)/gain.
 
-    Observations lie on a grid of spacing ``gain``. ``log_prob`` spreads each grid point's mass evenly over its cell: it
-    is a density per detector unit like that of the other models, for observations between grid points too.
+    Observations are on a grid of spacing ``gain``. ``log_prob`` spreads the probability of each grid point evenly over its cell.
+    It is a density per detector unit, as for the other models, and also defined between grid points.
 
     Args:
         gain: counts per electron.
         offset: counts at zero dose.
-        spread: draw from that density too, evenly within the cells. Behind a converter whose steps are finer than the gain,
+        spread: also draw from that density, evenly within the cells. With a converter whose steps are finer than the gain,
             pixel values between the grid points are then possible.
 
     Example:
@@ -73,7 +73,7 @@ class Poisson(NoiseModelBase):
 
     @property
     def describes_single_readings(self) -> bool:
-        """Whether pixel values lie on the grid: not where the masses are spread."""
+        """Whether pixel values are on the grid: False if the probabilities are spread."""
         return not self.spread
 
     def forward(self, signal: Tensor) -> PoissonDistribution:
@@ -83,8 +83,8 @@ class Poisson(NoiseModelBase):
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the straight line of variance against (N,) signal, and stay there: the likelihood of a grid of unknown
-        spacing has no useful gradient."""
+        """Set gain and offset from a straight line of variance against (N,) signals. They are not trained, because the
+        likelihood of a grid of unknown spacing has no useful gradient."""
         gain, offset = photon_line(signal, observation)
         self.log_gain.copy_(torch.log(gain))
         self.offset.copy_(offset)
@@ -94,10 +94,10 @@ class Poisson(NoiseModelBase):
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Choose how the grid lies on the steps of a converter: likelihood decides, for (N,) signals and observations.
+        """Choose the position of the grid on the levels of a converter, by the likelihood of (N,) signals and observations.
 
-        Where the gain is a step, as of a counter of single events, grid and levels may be one. A coarser grid of unknown spacing
-        would call levels impossible, so its masses are spread.
+        If the gain is one step, as for a counter of single events, grid and levels may coincide. With a coarser grid of unknown
+        spacing some levels would be impossible, so its probabilities are spread.
         """
         step = 0.0 if behind is None else behind(self).step
         if behind is None or not step > 0:
@@ -120,7 +120,7 @@ class Poisson(NoiseModelBase):
         self.spread = spread
 
     def config(self) -> dict[str, Any]:
-        """Whether the masses are spread."""
+        """Whether the probabilities are spread."""
         return {"spread": True} if self.spread else {}
 
     def extra_repr(self) -> str:
@@ -131,8 +131,8 @@ class Poisson(NoiseModelBase):
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
     """Gain and offset of pure shot noise, ``variance = gain·(signal − offset)``, for (N,) signals and observations.
 
-    Least squares of squared residual on signal gives the line. Where it makes pixel values impossible (shot noise never
-    falls below the offset), the offset moves one count below the lowest pixel value and the gain keeps the mean variance.
+    The line is fitted by least squares of squared residuals against signals. If it makes pixel values impossible (shot noise is
+    never below the offset), the offset is set to one count below the lowest pixel value and the gain keeps the mean variance.
     """
     signal, observation = signal.double(), observation.double()
     squared = (observation - signal) ** 2

@@ -1,4 +1,4 @@
-"""Counting detectors, which are blind for a dead time after each event."""
+"""Counting detectors with dead time."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from noiseflow.models.base import NoiseModelBase
 
 
 class DeadTimeCounter(NoiseModelBase):
-    """Counts of single events by a detector that is blind for a fixed time after each (not prolonged by further events).
+    """Counts of single events by a detector with a fixed dead time after each count (non-paralysable).
 
-    The signal is the expected *count*; events come at the higher rate signal/(1 − signal·dead_time). The variance is about
-    signal·(1 − signal·dead_time)², below that of Poisson counts.
+    The signal is the expected *count*; the event rate signal/(1 − signal·dead_time) is higher. The variance is about
+    signal·(1 − signal·dead_time)², less than that of Poisson counts.
 
     Args:
-        dead_time: as a share of the exposure, above 0 and below 1.
+        dead_time: dead time as a share of the exposure, above 0 and below 1.
 
     Raises:
-        ValueError: `dead_time` outside this range.
+        ValueError: `dead_time` is outside this range.
 
     Example:
         >>> import noiseflow, torch
@@ -39,16 +39,16 @@ class DeadTimeCounter(NoiseModelBase):
 
     @property
     def dead_time(self) -> Tensor:
-        """Share of the exposure."""
+        """Dead time as a share of the exposure."""
         return torch.sigmoid(self.raw_dead_time)
 
     def forward(self, signal: Tensor) -> DeadTimeDistribution:
-        """The distribution of counts of pixels with the given expected counts, any shape."""
+        """The distribution of the counts, given the expected counts, any shape."""
         return DeadTimeDistribution(signal, self.dead_time)
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the dead time that (N,) signals and counts show by their variance, signal·(1 − signal·dead_time)²."""
+        """Set the dead time from the variance of (N,) signals and counts, signal·(1 − signal·dead_time)²."""
         signal, observation = signal.double(), observation.double()
         lack = signal - (observation - signal) ** 2  # its expectation is 2·signal²·dead_time, to first order
         weight = 1 / signal.clamp(min=1e-3)

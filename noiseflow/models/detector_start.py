@@ -1,4 +1,4 @@
-"""Where to climb the likelihood of a shot-plus-read-noise detector from: its maxima are many when electrons are resolved."""
+"""Starting points for the maximum-likelihood fit of shot plus read noise, which has many maxima if electrons are resolved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NUM_LEVELS = 32
 _SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
 _NUM_CLIMBS = 3
 _SETTLED, _SETTLED_BEHIND, _SETTLING_STEPS = 49152, 16384, 12
-_SHARP = 0.4  # electrons; beyond, the noise hardly tells one electron's shift
+_SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
 _FLATTEST = 0.04
 
 
@@ -30,10 +30,10 @@ class Detector(NamedTuple):
 
 
 def find_detector(signal: Tensor, observation: Tensor) -> Detector:
-    """The most likely detector for (N,) signals and observations: many starts are scored, the best are climbed.
+    """Maximum-likelihood detector for (N,) signals and observations, from the best of many starting points.
 
-    Starts with the measured variances come from a straight line of variance against signal; starts with a comb of electrons from
-    the strongest frequencies of the pixel values, which give the comb's spacing, phase and sharpness.
+    Starting points come from a straight line of variance against signal and, if electrons are resolved, from the strongest
+    frequencies of the pixel values, which give spacing, phase and sharpness of the peaks.
 
     Raises:
         ValueError: the observations equal the signals.
@@ -42,7 +42,7 @@ def find_detector(signal: Tensor, observation: Tensor) -> Detector:
     variance = float((observation - signal).square().mean())
     if not variance > 0:
         raise ValueError(
-            "observation − signal is 0 everywhere: there is no noise to learn; check that the two images differ"
+            "observation − signal is 0 everywhere: there is no noise to fit; check that the two images differ"
         )
     gain = _slope(signal, observation)
     starts = [*_smooth_starts(signal, variance, gain), *_comb_starts(signal, observation, variance, gain)]
@@ -54,9 +54,9 @@ def find_detector(signal: Tensor, observation: Tensor) -> Detector:
 
 
 def likelihood_axes(detector: Detector, signal: Tensor, observation: Tensor) -> Tensor:
-    """(3, 3) steps of (log gain, offset, log read noise), in columns, that each cost about half a nat per pixel.
+    """(3, 3) steps of (log gain, offset, log read noise), in columns; each changes the likelihood by about half a nat per pixel.
 
-    The inverse square root of the likelihood's curvature; directions in which it is flat get a step of five natural units.
+    This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units.
     """
     signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
     part = _part(signal, _SCORED)
@@ -86,7 +86,7 @@ def _part(signal: Tensor, count: int) -> Tensor:
 
 
 def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixel values of few levels are spread over their cells: a density could otherwise grow without bound at the levels."""
+    """Spread pixel values with few levels over their cells; otherwise a density could become unbounded at the levels."""
     levels = torch.unique(observation)
     if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
         return signal, observation
@@ -96,7 +96,7 @@ def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor
 
 
 def _slope(signal: Tensor, observation: Tensor) -> float:
-    """Slope of variance against signal, by weighted least squares over levels; at least 1e-3 standard deviations."""
+    """Slope of the variance against the signal, by weighted least squares over levels; at least 1e-3 standard deviations."""
     order = torch.argsort(signal)
     levels = [part for part in torch.tensor_split(order, _NUM_LEVELS) if part.numel() > 1]
     mean = torch.stack([signal[part].mean() for part in levels])
@@ -125,7 +125,7 @@ def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detect
 
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[Detector]:
-    """Detectors whose electrons stand at the crests of the strongest frequencies near one per gain."""
+    """Detectors whose electron peaks match the strongest frequencies of the pixel values near one per gain."""
     readings = observation[_part(signal, _COMB)]
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
     if not 0 < reach < 400 * slope:
@@ -148,13 +148,13 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
 
 
 def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
-    """Climb the likelihood of (N,) pixels under `noise_model` in ``detector.change``; the detector is part of that model.
+    """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model.
 
-    Detectors one electron further up or down tell themselves apart by little, and a maximum of some pixels may be one off: all
-    three are climbed with many pixels.
+    Offsets that differ by one electron have similar likelihoods, and a maximum found with few pixels may be off by one. All three
+    offsets are therefore optimised with many pixels.
     """
     change = detector.change
-    part = _part(signal, _SETTLED if noise_model is detector else _SETTLED_BEHIND)  # intervals cost more
+    part = _part(signal, _SETTLED if noise_model is detector else _SETTLED_BEHIND)  # intervals are slower
     signal, observation = signal[part], observation[part]
     start, learns = change.detach().clone(), change.requires_grad
 
@@ -174,7 +174,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:
-    """Climb from `start`, in place; the loss reached, never above that of the start."""
+    """Minimise the loss from `start`, in place. Return the final loss, never above the initial one."""
     with torch.no_grad():
         change.copy_(start)
         first = float(loss())
@@ -198,7 +198,7 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float
 
 
 def _distinct(ranked: list[Detector]) -> list[Detector]:
-    """The first few that differ by more than a climb would: in gain, or by half an electron."""
+    """The first few detectors that differ in gain or by half an electron, more than an optimisation would change."""
     kept: list[Detector] = []
     for start in ranked:
         near = any(
@@ -222,7 +222,7 @@ def _score(detector: Detector, signal: Tensor, observation: Tensor) -> float:
 
 
 def _climb(start: Detector, signal: Tensor, observation: Tensor) -> Detector:
-    """Maximum likelihood by a quasi-Newton method from one start."""
+    """Maximum likelihood by a quasi-Newton method from one starting point."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     optimiser = lbfgs([change], max_iter=40, history_size=10)
 

@@ -1,4 +1,4 @@
-"""What a set of pixel values shows of the converter that made them: its rounding step and clipping limits."""
+"""Detection of the rounding step and clipping limits of a detector from its pixel values."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Digitisation(NamedTuple):
     """Rounding and clipping of a detector.
 
     Attributes:
-        step: rounding step, detector units; 0 where pixel values are not rounded.
-        low, high: clipping limits, detector units; infinite where there is none.
+        step: rounding step, detector units; 0 if pixel values are not rounded.
+        low, high: clipping limits, detector units; infinite if there is none.
 
     Example:
         >>> import noiseflow
@@ -35,28 +35,28 @@ class Digitisation(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether there is any rounding or clipping limit."""
+        """Whether there is a rounding step or a clipping limit."""
         return self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
 
     def in_words(self) -> str:
-        """One phrase for people."""
+        """A short description."""
         parts = [f"rounded to steps of {self.step:g}"] if self.step > 0 else []
         rails = [f"{rail:g}" for rail in (self.low, self.high) if math.isfinite(rail)]
         return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
 
 
 def detect_digitisation(readings: ArrayLike) -> Digitisation:
-    """The rounding and the clipping limits that pixel values show.
+    """Detect the rounding step and the clipping limits of pixel values.
 
-    Pixel values are rounded where all of them are whole multiples of a step, counted from the least one: integers always are, and
-    other numbers where they repeat. What the number format itself rounds does not count.
+    Pixel values are rounded if all of them are integer multiples of a step from the smallest one. Integers always are; other
+    numbers must repeat. Rounding by the number format itself is ignored.
 
-    A clipping limit is an extreme pixel value that piles up: at least ten pixels share it, and more than the two levels beside it
-    foretell if the histogram is log-concave there, as the tails of noise and the counts of electrons are. The largest value of
-    an integer type is one wherever it is reached. That values end at 0 makes no clipping limit: counts do so too.
+    A clipping limit is an extreme value with too many pixels: at least ten, and more than expected from the two levels next to it
+    if the histogram is log-concave there, as noise tails and electron counts are. The largest value of an integer type is always
+    a limit if it occurs. A smallest value of 0 alone is not a clipping limit, because counts end there too.
 
     Args:
-        readings: any shape and real type, detector units; NaN and infinite ones are left out.
+        readings: pixel values of any shape and real type, detector units; NaN and infinite values are ignored.
 
     Example:
         >>> import noiseflow, numpy as np
@@ -98,10 +98,10 @@ def _are_whole(levels: NDArray[Any]) -> bool:
 
 
 def _spacing(levels: NDArray[np.float64]) -> float:
-    """The common spacing of sorted levels, or 0 where there is none."""
+    """The common spacing of sorted levels, or 0 if there is none."""
     gaps = np.diff(levels)
     least = np.median(gaps[gaps < 1.5 * gaps.min()])
-    # a gap carries the rounding error of two pixel values; the whole span carries it only once
+    # a gap has the rounding error of two pixel values; the whole span has it only once
     step = float((levels[-1] - levels[0]) / np.round(gaps / least).sum())
     steps = (levels - levels[0]) / step
     return step if float(np.abs(steps - np.round(steps)).max()) < 0.02 else 0.0

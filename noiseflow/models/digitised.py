@@ -1,4 +1,4 @@
-"""Rounding and saturation around any noise model: the likelihood of an interval instead of a density at a point."""
+"""Rounding and clipping for any noise model: the likelihood is the probability of an interval, not a density."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _LEAST_KEPT, _RAILED = 256, 0.02
 
 
 class Digitised(ModelAround):
-    """A detector that rounds to steps and clips at limits, in front of any noise model.
+    """A noise model followed by a converter that rounds to steps and clips at limits.
 
-    An observation k stands for every pixel value in (k − step/2, k + step/2]; the limits stand for everything beyond.
+    An observation k represents all values in (k − step/2, k + step/2]; a clipping limit represents all values beyond it.
 
     Args:
         model: the noise model before digitisation.
         step: rounding step, detector units; 0 for pixel values that are clipped but not rounded.
-        low, high: clipping limits, detector units; infinite where there is none.
+        low, high: clipping limits, detector units; infinite if there is none.
 
     Raises:
-        ValueError: negative step, or clipping limits in the wrong order, or a model with offsets of rows or columns.
+        ValueError: the step is negative, the limits are in the wrong order, or the model has row or column offsets.
 
     Example:
         >>> import noiseflow, torch
@@ -38,7 +38,7 @@ class Digitised(ModelAround):
     """
 
     describes_single_readings = True
-    step: float = math.nan  # set when a model is made; here they hide the inner model's
+    step: float = math.nan  # set by __init__; these attributes hide those of the inner model
     low: float = math.nan
     high: float = math.nan
 
@@ -47,7 +47,7 @@ class Digitised(ModelAround):
         if step < 0:
             raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
         if not low < high:
-            raise ValueError(f"low is {low} and high is {high}; the low clipping limit must lie below the high one")
+            raise ValueError(f"low is {low} and high is {high}; the low clipping limit must be below the high one")
         if self.model.shared_axis is not None:
             raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
         self.step, self.low, self.high = float(step), float(low), float(high)
@@ -59,26 +59,26 @@ class Digitised(ModelAround):
         return DigitisedDistribution(self, self.model.at_read_noise(given_to(self.model, signal), read_noise))
 
     def without_rails(self) -> Digitised:
-        """The same detector with the same model inside, rounding but never clipping."""
+        """The same detector and inner model, with rounding but without clipping."""
         return Digitised(self.model, step=self.step)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """Standardise the model inside, on what of the (N,) pixels clipping leaves as it was, where that is enough."""
+        """Standardise the inner model on those of the (N,) pixels that clipping does not affect, if they suffice."""
         values, by_level = values_of(signal), self.model.standardises_by_level
         kept, seen = self._before_rails(values, observation, mirror=by_level)
         if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
             kept, seen = torch.ones_like(kept), observation
         span = {"span": (float(values.min()), float(values.max()))} if by_level else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)
-        if not self.model.needs_image:  # the converter spoils what it was standardised on; now its part is known
+        if not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
             self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
-        """Which pixels the clipping limits leave as they were, boolean, and their pixel values.
+        """Boolean mask of pixels that clipping does not affect, and their pixel values.
 
-        Of 64 equally populated groups by signal, those are kept of which hardly any pixel value is clipped. Where one
-        clipping limit clips, `mirror` keeps what lies on the other side of the signal, half of it mirrored: it is as wide as
-        the noise was.
+        The pixels are divided into 64 equally populated groups by signal; groups with hardly any clipped value are kept. If one
+        limit clips, `mirror` keeps the residuals on the other side of the signal and mirrors half of them, so that their width
+        is that of the noise.
         """
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
@@ -96,16 +96,16 @@ class Digitised(ModelAround):
         return kept, seen
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
-        """What of the likelihood of (N,) pixels does not change while the model inside learns; None where everything may."""
+        """The part of the likelihood of (N,) pixels that training does not change; None if there is none."""
         on_low, on_high = observation <= self.low, observation >= self.high
         below, above = (observation - self.step / 2, observation + self.step / 2)
-        # a high limit between two levels has only what rounds to the level above it
+        # a high limit between two levels gets only values that round to the level above it
         edge = self.forward(signal[:0]).edges[1]
         below = torch.where(on_high, edge, below) if math.isfinite(edge) else below
         low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
         if self.step > 0:
             return self.model.fixed_interval_part(signal, low, high)
-        # pixel values between the clipping limits have a density: their interval is the whole line, and is not used
+        # pixel values between the limits have a density; their interval (the whole line) is not used
         on_rail = on_low | on_high
         low, high = torch.where(on_rail, low, -math.inf), torch.where(on_rail, high, math.inf)
         interval, density = (
@@ -117,7 +117,7 @@ class Digitised(ModelAround):
         return torch.cat([interval, density, on_rail[:, None].to(interval.dtype)], -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of pixels by their `fixed_part`."""
+        """Log-likelihood of pixels from their `fixed_part`."""
         found = self.model.log_interval_prob_from(signal, fixed_part[:, :3])
         if self.step > 0:
             return found
@@ -128,7 +128,7 @@ class Digitised(ModelAround):
         return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again, besides the model inside."""
+        """Arguments that recreate this model, without the inner model."""
         rails = {"low": self.low, "high": self.high}
         return {"step": self.step} | {name: rail for name, rail in rails.items() if math.isfinite(rail)}
 

@@ -1,4 +1,4 @@
-"""Detectors that multiply electrons by a random gain: EMCCD registers, photomultipliers, direct detectors with straggling."""
+"""Detectors with random electron multiplication: EMCCDs, photomultipliers, direct detectors with straggling."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
 _NODES, _CELLS = 96, 4096
-_WIDTH = 0.0125  # standard deviations of a cell: interpolation then errs by 2e-5 nats
+_WIDTH = 0.0125  # width of a cell in standard deviations; the interpolation error is then 2e-5 nats
 _BELOW = (
     0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
 )
-_LEAST = 1e-14  # density, per standard deviation, under which the transform's rounding errors rule
+_LEAST = 1e-14  # density per standard deviation below which rounding errors of the transform dominate
 _FITTED, _ITERATIONS = 16384, 60
 
 
 class ExcessNoise(ElectronCounter):
-    """Shot noise whose electrons are multiplied at random, plus read noise.
+    """Shot noise with random electron multiplication, plus read noise.
 
     observation = offset + gain·(Σ of k pulses + read_noise·n), k Poisson, n standard normal, each pulse gamma-distributed with
-    mean 1 and variance F² − 1. F² = 2 is the exponential law of a long multiplication register (EMCCD,
-    doi:10.1109/TED.2003.813462); F² near 1 is a Poisson-Gaussian detector; between lie photomultipliers (Polya law) and direct
-    detectors (straggling).
+    mean 1 and variance F² − 1. F² = 2 is the exponential distribution of a long multiplication register (EMCCD,
+    doi:10.1109/TED.2003.813462); F² near 1 is a Poisson–Gaussian detector; photomultipliers (Polya distribution) and direct
+    detectors (straggling) are in between.
 
-    The variance, F²·gain·(signal − offset) + (gain·read_noise)², identifies F²·gain; the shape of the noise tells them apart.
-    Clock-induced charge counts as signal.
+    The variance, F²·gain·(signal − offset) + (gain·read_noise)², determines only the product F²·gain; the shape of the noise
+    separates the two factors. Clock-induced charge is part of the signal.
 
     Args:
         gain: counts per electron, the mean of a pulse.
         offset: counts without electrons.
         read_noise: electrons rms before multiplication.
-        excess_factor: F², above 1.
+        excess_factor: excess noise factor F², above 1.
 
     Raises:
-        ValueError: gain or read noise not positive, or F² not above 1.
+        ValueError: gain or read noise is not positive, or F² is not above 1.
 
     Example:
         >>> import noiseflow, torch
@@ -73,20 +73,20 @@ class ExcessNoise(ElectronCounter):
 
     @property
     def excess_factor(self) -> Tensor:
-        """F², variance with multiplication over that without."""
+        """Excess noise factor F²: variance with multiplication relative to that without."""
         return 1 + self._parameters_now()[3]
 
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        """The distribution of the observations, given signals of any shape, detector units."""
         return ExcessNoiseDistribution(signal, *self._parameters_now())
 
     @property
     def starts_most_likely(self) -> bool:
-        """Whether `standardise` leaves little to learn: it climbs to the maximum."""
+        """True, because `standardise` finds the maximum of the likelihood."""
         return True
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the detector whose second and third moments, level by level, are those of (N,) signals and observations."""
+        """Set the parameters from the second and third moments of (N,) observations at each signal level."""
         s, residual = signal.double(), observation.double() - signal.double()
         groups = torch.tensor_split(torch.argsort(s), max(4, min(32, s.numel() // 200)))
         mean = torch.stack([s[group].mean() for group in groups])
@@ -107,11 +107,11 @@ class ExcessNoise(ElectronCounter):
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
+        """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
 
         Args:
             signal, observation: detector units.
-            behind: puts the detector behind what stands in front of the pixel values, such as rounding and clipping.
+            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
         """
         every = max(1, signal.numel() // _FITTED)
         seen, values = signal[::every].double(), observation[::every].double()
@@ -149,9 +149,9 @@ def _line(mean: Tensor, value: Tensor, variance: Tensor) -> tuple[float, float]:
 class ExcessNoiseDistribution(NoiseDistribution):
     """Distribution of offset + gain·(compound Poisson of gamma pulses + read noise).
 
-    Its characteristic function is exact. The Fourier transform gives distribution functions on grids of standardised values at
-    `_NODES` signals between the least and the largest, evenly spaced in their square root; between these they are interpolated
-    (to 1e-4 nats where the noise is smooth).
+    The characteristic function is exact. Its Fourier transform gives CDFs on grids of standardised values at `_NODES` signals
+    between the smallest and the largest, evenly spaced in their square root. CDFs at other signals are interpolated (error
+    1e-4 nats if the noise is smooth).
 
     Args:
         signal: clean pixel values, detector units.
@@ -168,7 +168,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         self._kept: tuple[Tensor, Tensor, Tensor, float, float] | None = None
 
     def _tables(self) -> tuple[Tensor, Tensor, Tensor, float, float]:
-        """Density and distribution function, (node, cell), of electrons standardised at each node; and the nodes' roots."""
+        """Density and CDF, (node, cell), of electrons standardised at each node; and the square roots of the nodes."""
         if self._kept is None:
             low, high = (float(end) for end in torch.aminmax(self.rate.detach().sqrt()))
             roots = torch.linspace(low, max(high, low + 1e-3), _NODES, dtype=torch.float64, device=self.rate.device)
@@ -193,7 +193,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         return self._kept
 
     def _at(self, value: Tensor, log_density: bool) -> Tensor:
-        """Log-density or distribution function at values, interpolated between nodes and cells."""
+        """Log-density or CDF at values, interpolated between nodes and cells."""
         density, below, roots, start, width = self._tables()
         table = density.log() if log_density else below
         root = torch.sqrt(self.rate.clamp(min=1e-12)).expand(value.shape)
@@ -209,7 +209,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         found = (1 - a) * ((1 - b) * corner[0] + b * corner[1]) + a * ((1 - b) * corner[2] + b * corner[3])
         if not log_density:
             return found
-        beyond = (place - cell).abs() * width * deviation  # electrons; there the tail falls as that of one pulse does
+        beyond = (place - cell).abs() * width * deviation  # electrons; there the tail decreases like that of one pulse
         return found - deviation.log() - beyond / self.pulse_variance
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -219,7 +219,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         return self._as(value, self._at(value, False))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        """Log-probability of (low, high]: the distribution function's difference; in the far tails density times width."""
+        """Log-probability of (low, high]: the difference of the CDF; in far tails density times width."""
         ends = []
         for value, empty in ((low, 0.0), (high, 1.0)):
             finite = torch.isfinite(value)

@@ -1,4 +1,4 @@
-"""Conditional normalizing flows in one dimension: p(observation | signal) as a stack of monotone maps to a standard normal."""
+"""Conditional normalizing flows in one dimension: p(observation | signal) as a sequence of monotone maps to a standard normal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
-    """A small network of features of the signal; its outputs start at zero, and its weights at the same numbers always."""
+    """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values."""
     generator = torch.Generator().manual_seed(0)
     first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
     with torch.no_grad():
@@ -45,32 +45,32 @@ def conditioning_features(coordinate: Tensor) -> Tensor:
 
 
 def signal_nodes(like: Tensor) -> Tensor:
-    """The (257,) signal coordinates at which networks run; in between, what they give is interpolated linearly."""
+    """The (257,) signal coordinates at which networks are evaluated; outputs are interpolated linearly in between."""
     return torch.linspace(0, 1, _NUM_NODES, dtype=like.dtype, device=like.device)
 
 
 def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Number of the node below each signal coordinate, and the weight of the node above."""
+    """Index of the node below each signal coordinate, and the weight of the node above."""
     position = coordinate * (_NUM_NODES - 1)
     row = torch.nan_to_num(position.detach()).floor().clamp(0, _NUM_NODES - 2).long()
     return row, (position - row).to(dtype)
 
 
 class ConditionalFlow(NoiseModelBase):
-    """A noise model made of layers, the first one next to the data; the last one gives the standard normal latent.
+    """A noise model built from layers that map an observation to a standard normal latent.
 
     Args:
-        layers: the maps, in the order in which they turn an observation into the latent.
+        layers: the maps, in order from the observation to the latent.
         mean_preserving: shift the noise so that E[observation | signal] = signal (before any digitisation). A joint fit
-            needs it: otherwise an offset of the signal cannot be distinguished from a mean of the noise.
-        width: hidden units of the network that turns a signal into the parameters of the conditional layers.
-        neighbourhood: side, odd, of the window of clean signals around each pixel that moves and widens its noise. Off (1) by
-            default: a model that sees the scene around a pixel can learn the scene's structure in place of the noise's.
-            With it, signals are images (..., y, x).
+            requires it; otherwise an offset of the signal cannot be distinguished from a mean of the noise.
+        width: hidden units of the network that computes the parameters of the conditional layers from the signal.
+        neighbourhood: side (odd) of the window of clean signals around each pixel that affects location and scale of its
+            noise. Off (1) by default, because such a model can learn the structure of the scene instead of the noise. If it
+            is larger, signals must be images (..., y, x).
 
     Attributes:
-        tabulate: look likelihoods and samples of large inputs up in tables (interpolation error below 1e-3 nats and 1e-3
-            standard deviations in the mean); set it to False for the exact values at any size.
+        tabulate: look likelihoods and samples of large inputs up in tables (mean interpolation error below 1e-3 nats and
+            1e-3 standard deviations); set it to False for exact values.
     """
 
     standardises_by_level = True
@@ -81,7 +81,7 @@ class ConditionalFlow(NoiseModelBase):
     ) -> None:
         super().__init__()
         if neighbourhood < 1 or neighbourhood % 2 == 0:
-            raise ValueError(f"neighbourhood is {neighbourhood}; a window around a pixel has an odd side: 3, 5, …")
+            raise ValueError(f"neighbourhood is {neighbourhood}; give the odd side of a window: 1, 3, 5, …")
         self.layers, self.neighbourhood = tuple(layers), neighbourhood
         self.mean_preserving = mean_preserving
         self.width = width
@@ -94,7 +94,7 @@ class ConditionalFlow(NoiseModelBase):
 
     @property
     def needs_image(self) -> bool:
-        """Whether the model looks beyond single pixels."""
+        """Whether the model uses a neighbourhood and needs images."""
         return self.neighbourhood > 1
 
     @property
@@ -102,14 +102,14 @@ class ConditionalFlow(NoiseModelBase):
         return self.standardisation.fitted_range
 
     def forward(self, signal: Signal) -> FlowDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units.
+        """The distribution of the observations, given signals of any shape, detector units.
 
         Raises:
-            ValueError: a flat signal where the model looks at a neighbourhood.
+            ValueError: the signal is flat, but the model uses a neighbourhood.
         """
         if not self.needs_image:
             return FlowDistribution(self, values_of(signal))
-        require_image(signal, f"this model looks at {self.neighbourhood} x {self.neighbourhood} pixels around each")
+        require_image(signal, f"this model uses {self.neighbourhood} x {self.neighbourhood} pixels around each pixel")
         return FlowDistribution(self, values_of(signal), windows_of(signal, self.neighbourhood))
 
     def standardise(self, signal: Signal, observation: Tensor, span: tuple[float, float] | None = None) -> None:
@@ -117,7 +117,7 @@ class ConditionalFlow(NoiseModelBase):
         self.standardisation.set_from(values_of(signal), observation, span)
 
     def parameters_at(self, signal: Tensor, windows: Tensor | None = None) -> tuple[Tensor, Tensor, list[Transform]]:
-        """Location and log-scale of the noise, detector units, and the maps, at each signal, whatever surrounds it (..., k²)."""
+        """Location and log-scale of the noise, detector units, and the maps, at each signal with its window (..., k²)."""
         with torch.autocast(signal.device.type, enabled=False):
             coordinate = self.standardisation.coordinate(signal)
             location, log_scale = self.standardisation(coordinate)
@@ -130,7 +130,7 @@ class ConditionalFlow(NoiseModelBase):
             return signal + location, log_scale, self.transforms(coordinate)
 
     def _effect_of_surroundings(self, coordinate: Tensor, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Shift, in standard deviations, and change of the log-scale of the noise."""
+        """Shift (standard deviations) and change of the log-scale of the noise."""
         contrast = self.standardisation.coordinate(windows) - coordinate[..., None]
         middle = self.neighbourhood**2 // 2
         others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
@@ -138,16 +138,16 @@ class ConditionalFlow(NoiseModelBase):
         return bounded(raw[..., 0], 10), bounded(raw[..., 1], 5)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
-        """The maps at each signal coordinate: exact at 257 nodes, their parameters linear in between.
+        """The maps at each signal coordinate: exact at 257 nodes, with parameters interpolated linearly in between.
 
-        The network so runs on the nodes alone, however many pixels there are.
+        The network is therefore evaluated only at the nodes, whatever the number of pixels.
         """
         row, weight = between_nodes(coordinate, self.bias.dtype)
         maps = zip(self.layers, self.transforms_of_network(signal_nodes(coordinate)), strict=True)
         return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]
 
     def transforms_of_network(self, coordinate: Tensor) -> list[Transform]:
-        """The maps that the network gives at each signal coordinate."""
+        """The maps from the network at each signal coordinate, without interpolation."""
         conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
         built, bias_at, conditional_at = [], 0, 0
         for layer in self.layers:
@@ -161,7 +161,7 @@ class ConditionalFlow(NoiseModelBase):
         return built
 
     def _mean_of_standardised(self) -> Tensor:
-        """Mean of the standardised residual on a grid of signal coordinates, by quadrature."""
+        """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
         dtype, device = self.bias.dtype, self.bias.device
         nodes, weights = normal_quadrature(dtype, device, limit=9.0, count=401)
         count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
@@ -177,7 +177,7 @@ class ConditionalFlow(NoiseModelBase):
         )
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
+        """Arguments that recreate this model."""
         window = {"neighbourhood": self.neighbourhood} if self.needs_image else {}
         return {"mean_preserving": self.mean_preserving, "width": self.width} | window
 
@@ -191,7 +191,7 @@ def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, T
 
 
 class FlowDistribution(LatentDistribution):
-    """The distribution that a `ConditionalFlow` returns; its parameters are computed when first needed."""
+    """The distribution that a `ConditionalFlow` returns; its parameters are computed on first use."""
 
     per_pixel = ("_signal", "_windows")
 
@@ -201,7 +201,7 @@ class FlowDistribution(LatentDistribution):
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
-        """The flow and the signal; none where pixels look at their neighbours."""
+        """The flow and the signal; None if the model uses a neighbourhood."""
         return (self._flow, self._signal) if self._windows is None else None
 
     @property
@@ -225,18 +225,18 @@ class FlowDistribution(LatentDistribution):
 class RadialFlow(ConditionalFlow):
     """The noise model of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018), with a normalised density.
 
-    A conditional affine layer, then radial layers of which those next to the data depend on the signal.
+    It has a conditional affine layer followed by radial layers, of which those closest to the data depend on the signal.
 
     Args:
         num_layers: number of radial layers, at most 1000.
-        num_conditional: how many of them depend on the signal, half of them by default; with none, all signals share the shape
-            of the noise and only its location and scale vary.
+        num_conditional: number of radial layers that depend on the signal, half of them by default. With 0, the shape of the
+            noise is the same at all signals and only its location and scale vary.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
 
     Raises:
-        ValueError: too many layers.
+        ValueError: `num_layers` is too large.
 
     Example:
         >>> import noiseflow, torch
@@ -256,7 +256,7 @@ class RadialFlow(ConditionalFlow):
     ) -> None:
         if (
             num_layers > _MOST_LAYERS
-        ):  # each is an object: a file that claims many would cost far more than its own size
+        ):  # each layer is an object: a file that claims many would use far more memory than its size
             raise ValueError(f"num_layers is {num_layers}; a radial flow has at most {_MOST_LAYERS} layers")
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
@@ -273,7 +273,7 @@ class SplineFlow(ConditionalFlow):
     """The default noise model: conditional affine layer, conditional monotone spline, learnt tail weights.
 
     Args:
-        num_bins: bins of the spline.
+        num_bins: number of bins of the spline.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
@@ -285,7 +285,7 @@ class SplineFlow(ConditionalFlow):
         True
     """
 
-    joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
+    joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(
         self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
@@ -299,10 +299,10 @@ class SplineFlow(ConditionalFlow):
 
 
 class SignalDependentGaussian(ConditionalFlow):
-    """Gaussian noise around the signal whose standard deviation is a smooth function of the signal.
+    """Gaussian noise whose standard deviation is a smooth function of the signal.
 
     Args:
-        width: hidden units of the network that gives the standard deviation.
+        width: hidden units of the network for the standard deviation.
         neighbourhood: see `ConditionalFlow`.
 
     Example:
@@ -316,9 +316,7 @@ class SignalDependentGaussian(ConditionalFlow):
         True
     """
 
-    starts_anew = (
-        True  # its width is measured on the residuals; from the width about a worse signal it would hardly move
-    )
+    starts_anew = True  # the width is measured on the residuals; training hardly changes a width from a worse signal
 
     def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
         super().__init__([scale_layer()], mean_preserving=True, width=width, neighbourhood=neighbourhood)

@@ -1,4 +1,4 @@
-"""Keeping the mean of a `PhysicsFlow`: the shift of its latent that undoes what the flow does to the mean of the pixel values."""
+"""Mean preservation of `PhysicsFlow`: the shift of its latent that cancels the effect of the flow on the mean."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _ALL, _FEW = slice(None), slice(None, None, 3)
 
 
 class LatentMean:
-    """Latent shifts at chosen signals, kept from call to call while the detector and the range of signals stay as they are.
+    """Latent shifts at selected signals, cached while the detector and the range of signals do not change.
 
-    With F(o) = Φ(T(z(o) − c)) the mean pixel value is o_last − ∫F do up to the last node; z(o), the detector's latent, is
-    computed once on nodes fine enough for the detector's read noise, and c follows by Newton's method. Signals are dense where
-    the law changes fastest: just above the offset, on a logarithmic scale, and on a scale of the square root of the rate.
+    With F(o) = Φ(T(z(o) − c)) the mean pixel value is o_last − ∫F do up to the last node. The detector's latent z(o) is computed
+    once, on nodes fine enough for the read noise, and c by Newton's method. The signals are dense where the distribution changes
+    fastest: logarithmically spaced just above the offset, and evenly spaced in the square root of the rate.
     """
 
     _shift: Tensor
@@ -35,11 +35,11 @@ class LatentMean:
         self._solved: tuple[Any, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nothing of what was computed: it is known by the parameters' places in memory, and a copy has others."""
+        """Excludes the cache, because its keys are memory addresses of parameters, which differ in a copy."""
         return {"_laid_out": None, "_solved": None}
 
     def __call__(self, signal: Tensor, detector: PoissonGaussian, correction: ConditionalFlow) -> Tensor:
-        """Shifts at signals of any shape, float64; differentiable in them and in the parameters of `correction`."""
+        """Shifts at signals of any shape, float64; differentiable with respect to these and the parameters of `correction`."""
         self._lay_out(detector, correction)
         learning = torch.is_grad_enabled() and correction.bias.requires_grad
         if learning:
@@ -71,7 +71,7 @@ class LatentMean:
         self._laid_out, self._solved = state, None
 
     def _solve(self, correction: ConditionalFlow, part: slice) -> Tensor:
-        """Shifts of all levels by all nodes, or of few by few; the last of Newton's steps carries the gradient."""
+        """Shifts at all levels with all nodes, or at some levels with some nodes; the last Newton step carries the gradient."""
         with torch.no_grad():
             maps = correction.transforms(self._coordinate[part])
             for _ in range(_MAX_STEPS):
@@ -87,7 +87,7 @@ class LatentMean:
         return shift + missing / slope.detach().clamp(min=1e-12)
 
     def _missing(self, maps: list[Transform], part: slice) -> tuple[Tensor, Tensor]:
-        """How far the mean lies above the detector's, electrons, and how it falls with the shift; (G,) each."""
+        """Mean minus that of the detector, electrons, and its decrease with the shift, (G,) each."""
         residual = self._residual[part, part]
         mapped = self._latent[part, part] - self._shift[part, None]
         ladj = torch.zeros_like(mapped)
@@ -100,11 +100,11 @@ class LatentMean:
 
 
 def _levels(fitted: Tensor, root_of_most: Tensor) -> Tensor:
-    """Rates, electrons, at which the shift is found; those below zero are signals below the offset."""
+    """Rates, electrons, at which the shift is computed; negative ones are signals below the offset."""
     device = fitted.device
     dim = torch.logspace(_LEAST_LOG_RATE, 0, 41, dtype=torch.float64, device=device)
     bright = torch.linspace(1, float(root_of_most), _LEVELS, dtype=torch.float64, device=device) ** 2
-    # the flow changes with the signal inside the fitted range alone: there is a corner at either end
+    # the flow depends on the signal only inside the fitted range, which gives a corner at each end
     near = (fitted[-1] - fitted[0]) * torch.tensor([2e-4, 8e-4, 3e-3, 0.01], dtype=torch.float64, device=device)
     corners = [end + side * near for end in (fitted[0], fitted[-1]) for side in (-1, 1)]
     found: Tensor = torch.unique(torch.cat([fitted, fitted.new_zeros(1), dim, bright, *corners]))
@@ -113,7 +113,7 @@ def _levels(fitted: Tensor, root_of_most: Tensor) -> Tensor:
 
 
 def interpolate_unequal(knots: Tensor, table: Tensor, at: Tensor) -> Tensor:
-    """Interpolate (K,) values at increasing knots: by local cubics (four points) where the gaps are alike, else linearly."""
+    """Interpolate (K,) values at increasing knots: by local cubics (four points) where gaps are similar, else linearly."""
     index = torch.searchsorted(knots, at.detach().contiguous()).clamp(2, knots.numel() - 2)
     near = [knots[index + k] for k in (-2, -1, 0, 1)]
     values = [table[index + k] for k in (-2, -1, 0, 1)]
@@ -125,7 +125,9 @@ def interpolate_unequal(knots: Tensor, table: Tensor, at: Tensor) -> Tensor:
         for other in (*near[:i], *near[i + 1 :]):
             term = term * ((at - other) / (own - other))
         cubic = cubic + term
-    start = torch.where(at < near[1], 0, torch.where(at > near[2], 2, 1))  # the outermost gaps have no gap beyond
+    start = torch.where(
+        at < near[1], 0, torch.where(at > near[2], 2, 1)
+    )  # the outermost gaps have no neighbour on one side
     low, high = (torch.stack(near[k : 3 + k]).gather(0, start[None])[0] for k in (0, 1))
     left, right = (torch.stack(values[k : 3 + k]).gather(0, start[None])[0] for k in (0, 1))
     found: Tensor = torch.where(alike & (start == 1), cubic, left + (right - left) * ((at - low) / (high - low)))

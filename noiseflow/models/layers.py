@@ -1,4 +1,4 @@
-"""The maps that flows are made of, with their raw parameters: any real numbers give a valid map."""
+"""Layers of flows: maps with unconstrained parameters. Any real parameters give a valid map."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTa
 
 @dataclass(frozen=True)
 class Layer:
-    """One map of a flow: how many raw parameters it takes, where they start, and how they become a transform.
+    """One map of a flow: initial values of its raw parameters, and how they are converted to a transform.
 
     Args:
-        initial: starting values of the raw parameters.
-        build: raw parameters (..., P) to a transform; any real parameters must give a valid one. A function of a module, for
-            models are pickled.
+        initial: initial values of the raw parameters.
+        build: function from raw parameters (..., P) to a transform; any real parameters must be valid. It must be defined at
+            module level so that models can be pickled.
         conditional: whether the parameters depend on the signal.
     """
 
@@ -76,7 +76,7 @@ def _tail(raw: Tensor) -> Transform:
 
 
 def bounded(raw: Tensor, limit: float) -> Tensor:
-    """Any real number, kept within ±limit."""
+    """Map any real number to the range ±limit."""
     return limit * torch.tanh(raw / limit)
 
 

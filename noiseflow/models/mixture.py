@@ -1,4 +1,4 @@
-"""A mixture of Gaussians whose weights, means and widths, or whose width alone, are smooth functions of the signal."""
+"""A Gaussian mixture whose parameters, or only its location and scale, are smooth functions of the signal."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from noiseflow.models.standardisation import Standardisation
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _BISECTIONS = 60
 _FEW = 4  # components
-_COMPONENT_NODES = 101  # of each Gaussian
-_SHAPE_GAIN = 10  # parameters shared by all signals then learn as fast as a network's outputs, which many weights move
+_COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
+_SHAPE_GAIN = 10  # shared parameters then learn as fast as the outputs of a network, which depend on many weights
 
 
 class Mixture(NoiseModelBase):
@@ -27,12 +27,12 @@ class Mixture(NoiseModelBase):
 
     Args:
         num_components: number of Gaussians.
-        shared_shape: give all signals the same shape of the noise; only its location and scale vary with the signal.
+        shared_shape: use the same shape of the noise at all signals; only its location and scale vary.
         mean_preserving: shift the noise so that E[observation | signal] = signal, in closed form.
-        width: hidden units of the network that turns a signal into the parameters.
+        width: hidden units of the network that computes the parameters from the signal.
 
     Raises:
-        ValueError: fewer than one component.
+        ValueError: `num_components` is less than one.
 
     Example:
         >>> import noiseflow, torch
@@ -42,7 +42,7 @@ class Mixture(NoiseModelBase):
     """
 
     standardises_by_level = True
-    joint_learning_rate = 1e-2  # many parameters overshoot at the rate that few need to keep up with the signal
+    joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Mixture(NoiseModelBase):
         self.num_components, self.shared_shape = num_components, shared_shape
         self.mean_preserving, self.width = mean_preserving, width
         self.standardisation = Standardisation()
-        # apart from the start, or all components would stay equal: means ±½, the outer ones wider
+        # components differ initially, or they would remain equal: means ±½, the outer ones wider
         place = torch.linspace(-0.5, 0.5, num_components) if num_components > 1 else torch.zeros(1)
         start = torch.stack([-place.abs(), place, place.abs() - 0.2])
         self.bias = nn.Parameter(start / _SHAPE_GAIN if shared_shape else start)
@@ -66,7 +66,7 @@ class Mixture(NoiseModelBase):
         self.conditioner = conditioning_network(num_outputs, width)
 
     def forward(self, signal: Tensor) -> MixtureDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        """The distribution of the observations, given signals of any shape, detector units."""
         return MixtureDistribution(signal, self.components_at, model=self)
 
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -97,8 +97,8 @@ class Mixture(NoiseModelBase):
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
         self.standardisation.set_from(signal, observation, span)
 
-    # Eight components fitted to 75 000 pixels of an EMCCD lose 0.0051 nats per pixel to the true law with the usual rate and
-    # steps, 0.0033 with twice the steps, and 0.0027 with twice the rate as well.
+    # Eight components fitted to 75 000 pixels of an EMCCD are 0.0051 nats per pixel worse than the true distribution with the
+    # default rate and steps, 0.0033 with twice the steps, and 0.0027 with twice the rate as well.
     @property
     def learning_rate(self) -> float:
         return 2e-2 if self.num_components > _FEW else 1e-2
@@ -112,7 +112,7 @@ class Mixture(NoiseModelBase):
         return self.standardisation.fitted_range
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
+        """Arguments that recreate this model."""
         names = ("num_components", "shared_shape", "mean_preserving", "width")
         return {name: getattr(self, name) for name in names}
 
@@ -122,12 +122,12 @@ class Mixture(NoiseModelBase):
 
 
 class MixtureDistribution(NoiseDistribution):
-    """A mixture of normal distributions; its components are computed when first needed.
+    """A mixture of normal distributions; its components are computed on first use.
 
     Args:
         signal: clean signals, any shape.
-        components_at: gives log-weights, means and log-scales at signals, (*signal.shape, K) each.
-        model: the noise model it comes from, for the tables of large inputs.
+        components_at: function from signals to log-weights, means and log-scales, (*signal.shape, K) each.
+        model: the noise model, for the tables of large inputs.
     """
 
     per_pixel = ("signal",)
@@ -140,7 +140,7 @@ class MixtureDistribution(NoiseDistribution):
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
-        """The model and the signal, where the model allows tables."""
+        """The model and the signal if the model allows tables, otherwise None."""
         return (self._model, self.signal) if self._model.tabulate else None
 
     @property
@@ -159,7 +159,7 @@ class MixtureDistribution(NoiseDistribution):
 
     @property
     def log_scale(self) -> Tensor:
-        """Logs of the components' standard deviations, (*signal.shape, K)."""
+        """Logarithms of the standard deviations of the components, (*signal.shape, K)."""
         return self._components[2]
 
     def _standard(self, value: Tensor) -> Tensor:
@@ -192,7 +192,7 @@ class MixtureDistribution(NoiseDistribution):
 
     @torch.no_grad()
     def from_latent(self, latent: Tensor) -> Tensor:
-        """The observation of a standard normal latent, by bisection of the tail that it lies in."""
+        """The observation of a standard normal latent, by bisection of the tail probability."""
         upper, tail = latent > 0, torch.special.ndtr(-latent.double().abs())
         low, high = (end.double() + 0 * tail for end in self._ends())
         for _ in range(_BISECTIONS):

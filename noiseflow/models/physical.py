@@ -1,4 +1,4 @@
-"""Noise models from the physics of a detector: shot noise plus read noise, exact at any dose."""
+"""Physical noise models of detectors: shot noise plus read noise, exact at any dose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ElectronCounter(NoiseModelBase):
 
     @abstractmethod
     def _parameters_now(self) -> tuple[Tensor, ...]:
-        """Gain, offset, read noise and what else there is, float64 numbers."""
+        """Gain, offset, read noise and any further parameters, float64 scalars."""
 
     @property
     def gain(self) -> Tensor:
@@ -35,18 +35,18 @@ class ElectronCounter(NoiseModelBase):
 
     @property
     def read_noise(self) -> Tensor:
-        """Electrons rms; before multiplication, where there is any."""
+        """Read noise, electrons rms (before any multiplication)."""
         return self._parameters_now()[2]
 
 
 class PoissonGaussian(ElectronCounter):
     """Shot noise plus read noise: observation = gain·(k + read_noise·n) + offset, k Poisson, n standard normal.
 
-    The rate of k is (signal − offset)/gain. Below the offset it is 0, and read noise is spread about the signal: no clean image
-    lies there, but an estimate may, and the pixel values pull it back. The likelihood is exact at any dose, single electrons
-    included. The second moments, variance = gain·(signal − offset) + (gain·read_noise)², identify only the gain and
-    gain²·read_noise² − gain·offset; the offset itself is known only as far as the shape of the noise tells it: well where
-    single electrons are resolved or the dose is low, hardly where noise is Gaussian. It is a parameter all the same.
+    The rate of k is (signal − offset)/gain. For signals below the offset it is 0, and read noise is centred on the signal: clean
+    images have no such signals, but estimates may, and the likelihood then moves them back. The likelihood is exact at any dose,
+    including single electrons. The variance, gain·(signal − offset) + (gain·read_noise)², determines only the gain and
+    gain²·read_noise² − gain·offset. The offset is a free parameter, but is determined only by the shape of the noise: well if
+    single electrons are resolved or the dose is low, poorly if the noise is nearly Gaussian.
 
     Args:
         gain: counts per electron.
@@ -54,7 +54,7 @@ class PoissonGaussian(ElectronCounter):
         read_noise: electrons rms.
 
     Raises:
-        ValueError: gain or read noise not positive.
+        ValueError: gain or read noise is not positive.
 
     Example:
         >>> import noiseflow, torch
@@ -63,9 +63,11 @@ class PoissonGaussian(ElectronCounter):
         109.0
     """
 
-    starts_most_likely = True  # `standardise` leaves little to climb
-    starts_anew = True  # its gain is that of the residuals; from the gain about a worse signal it would hardly move
-    most_joint_steps = 15  # the exact sum over electrons takes long, and it starts at its most likely parameters
+    starts_most_likely = True  # `standardise` finds nearly the maximum of the likelihood
+    starts_anew = (
+        True  # the gain is measured on the residuals; training would hardly change a gain measured with a worse signal
+    )
+    most_joint_steps = 15  # the exact sum over electrons is slow, and the fit starts at the maximum of the likelihood
     origin: Tensor
     axes: Tensor
 
@@ -83,7 +85,7 @@ class PoissonGaussian(ElectronCounter):
         return torch.exp(now[0]), now[1], torch.exp(now[2].clamp(min=math.log(_LEAST_READ_NOISE)))
 
     def forward(self, signal: Tensor) -> PoissonGaussianDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        """The distribution of the observations, given signals of any shape, detector units."""
         return PoissonGaussianDistribution(signal, *self._parameters_now())
 
     def at_read_noise(self, signal: Tensor, read_noise: Tensor) -> UnevenPoissonGaussian:
@@ -92,11 +94,11 @@ class PoissonGaussian(ElectronCounter):
         return UnevenPoissonGaussian(signal, gain, offset, electrons)
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the most likely of many detectors with the variances of the (N,) signals and observations.
+        """Set the parameters to the maximum of the likelihood of (N,) signals and observations, from many starting points.
 
-        Where single electrons are resolved the likelihood has many maxima, one for each way to lay the comb of electrons on the
-        pixel values; the starts cover them. The parameters are then scaled by the curvature of the likelihood, so that one
-        learning rate suits a comb of fifty electrons, known to a part in a thousand, and an offset that is hardly known at all.
+        If single electrons are resolved, the likelihood has many maxima, one for each alignment of the electron peaks with the
+        pixel values; the starting points cover them. The parameters are then scaled by the curvature of the likelihood, so that
+        one learning rate suits both well-determined gains and poorly determined offsets.
         """
         from noiseflow.models.detector_start import find_detector, likelihood_axes
 
@@ -111,11 +113,11 @@ class PoissonGaussian(ElectronCounter):
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Climb to the maximum of the likelihood of (N,) signals and observations, from where the parameters are.
+        """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
 
         Args:
             signal, observation: detector units.
-            behind: puts the detector behind what stands in front of its values, such as rounding and clipping.
+            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
         """
         from noiseflow.models.detector_start import settle
 

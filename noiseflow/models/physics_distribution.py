@@ -1,4 +1,4 @@
-"""The distribution of `PhysicsFlow`: a detector's latent, mapped on; and the inverse of that latent."""
+"""The distribution of `PhysicsFlow`: the latent of a detector transformed by a flow, and the inverse of that latent."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from noiseflow.models.flow import _inverse
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _MAX_INVERSION_STEPS = 80
 _SIGNALS_AT_ONCE = 1024
-_CENTRE, _END = 7.0, 30.0  # latents that bound the even nodes and all nodes
+_CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
 _LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
 
 class PhysicsFlowDistribution(NoiseDistribution):
-    """A Poisson–Gaussian distribution whose latent is mapped on; float64 inside.
+    """A Poisson–Gaussian distribution whose latent is transformed by monotone maps; computed in float64.
 
     Args:
-        base: the detector's distribution.
-        maps: gives at a signal the increasing maps from the detector's latent to this model's, in order.
-        model: the `PhysicsFlow` it comes from, for the tables of large inputs.
+        base: the distribution of the detector.
+        maps: function from signals to the increasing maps from the detector's latent to that of this model, in order.
+        model: the `PhysicsFlow`, for the tables of large inputs.
     """
 
     per_pixel = ()
@@ -55,7 +55,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return self.once(lambda: self._maps(self.base.signal))
 
     def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """The mapped latent, and the log-density of this model over that of the detector."""
+        """The transformed latent, and the log-density of this model minus that of the detector."""
         mapped, gain = latent, torch.zeros_like(latent)
         for transform in self._transforms:
             mapped, ladj = transform.forward(mapped)
@@ -68,7 +68,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return torch.where(finite, latent, value.to(latent))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """The latent of an observation and the log-derivative, ``(z, log dz/do)``."""
+        """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
         latent, _ = self.correct(self._detector_latent(value))
         ladj = self._log_prob(value) + 0.5 * latent**2 + _LOG_SQRT_2PI
         return latent.to(value.dtype), ladj.to(value.dtype)
@@ -108,14 +108,14 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return torch.where(finite, mapped, latent)
 
     def interval_part(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The detector's latents at both ends and its log-mass between them."""
+        """The detector's latents at both ends and its log-probability between them."""
         mass = self.base.log_interval_prob(low.double(), high.double())
         return self._detector_latent(low), self._detector_latent(high), mass
 
     def corrected_interval(self, bottom: Tensor, top: Tensor, mass: Tensor) -> Tensor:
-        """The detector's own, exact mass times the mean correction, so that masses far below rounding of the CDF survive."""
+        """The detector's exact probability times the mean correction, accurate even for tiny probabilities."""
         zero = torch.zeros_like(bottom)
-        empty = bottom == top  # at the ends of the line too
+        empty = bottom == top  # also at infinite ends
         bottom, top = torch.where(empty, zero, bottom), torch.where(empty, zero, top)
         narrow = top - bottom < 1e-3
         at_middle = self.correct(torch.where(narrow, (bottom + top) / 2, zero))[1]
@@ -144,7 +144,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     @torch.no_grad()
     def _moments(self) -> tuple[Tensor, Tensor]:
-        """Mean and variance, by integrals of the CDF over nodes as fine as the read noise."""
+        """Mean and variance, from integrals of the CDF over nodes as fine as the read noise."""
         signal = self.base.signal.reshape(-1)
         parts = []
         for part in torch.split(signal, _SIGNALS_AT_ONCE):
@@ -169,9 +169,9 @@ def _latent(
 
 @torch.no_grad()
 def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
-    """Residuals, electrons, that cover the pixel values of signals (G, 1) as finely as the read noise asks, and their latents.
+    """Residuals, electrons, that cover the pixel values of signals (G, 1) with the spacing of the read noise, and their latents.
 
-    The nodes of a row are equally spaced but in the far tails, which only a flow that widens them brings near.
+    The nodes of a row are equally spaced except in the far tails, which matter only if the flow widens them.
 
     Returns:
         Two (G, K) tensors, float64.
@@ -189,14 +189,14 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
 
 
 def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """Φ⁻¹(P(pixel value ≤ residual)), of residuals in electrons."""
+    """Φ⁻¹(P(pixel value ≤ residual)) for residuals in electrons."""
     side = torch.where(residual.detach() > 0, -1.0, 1.0).to(residual)
     return side * ndtri_exp(log_tail(residual, rate, read_noise, twice=twice), twice=twice)
 
 
 @torch.no_grad()
 def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """The residual, electrons, whose detector latent is `target`: Newton's method between bounds that close in on it; (N,)."""
+    """The residual, electrons, whose detector latent is `target`, by Newton's method with bracketing bounds; (N,)."""
     spread, size = torch.sqrt(rate) + read_noise + 1, target.abs() + 3
     low, high = -spread * size, spread * size + size**2
     result = residual = torch.sqrt(rate + read_noise**2) * target
@@ -219,7 +219,7 @@ def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
 
 
 def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
-    """Φ⁻¹(exp(log_probability)), accurate and differentiable however small the probability; twice only if asked for."""
+    """Φ⁻¹(exp(log_probability)), accurate and differentiable for tiny probabilities; second derivatives only if `twice`."""
     with torch.no_grad():
         deep = log_probability < -200
         far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
@@ -232,5 +232,5 @@ def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
         return z - (log_normal_cdf(z) - log_probability) / hazard
     z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(
         z
-    )  # the first step has the slope, the second the curvature
+    )  # the first step carries the slope, the second the curvature
     return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)

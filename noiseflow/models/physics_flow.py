@@ -1,4 +1,4 @@
-"""Physics and a flow: shot and read noise exactly, and a smooth map of its latent for what they miss."""
+"""Physical noise model with a flow: exact shot and read noise, and a smooth map of its latent for deviations."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from noiseflow.models.physics_distribution import PhysicsFlowDistribution
 class PhysicsFlow(NoiseModelBase):
     """Poisson–Gaussian noise, corrected by a flow of its latent.
 
-    The latent of an observation under the detector, z = Φ⁻¹(F(o | s)), is standard normal if the detector is the whole truth.
-    A conditional affine map and spline, which start at the identity, take it to z′, and z′ is the standard normal latent of this
-    model: log p = log p_detector + log φ(z′) + log dz′/dz − log φ(z). Peaks of single electrons stay where the physics puts them.
+    The latent of an observation under the detector, z = Φ⁻¹(F(o | s)), is standard normal if the detector describes the noise
+    completely. A conditional affine map and spline, initially the identity, map it to z′, the standard normal latent of this
+    model: log p = log p_detector + log φ(z′) + log dz′/dz − log φ(z). Peaks of single electrons keep their positions.
 
-    A fit finds the detector first, by maximum likelihood, and holds it while the flow learns; what the likelihood of a pixel
-    takes from the detector is then computed once.
+    A fit first finds the detector by maximum likelihood and keeps it fixed while the flow is trained. The detector's part of the
+    likelihood of each pixel is then computed only once.
 
     Args:
-        num_bins: bins of the spline.
-        mean_preserving: shift the latent so that E[observation | signal] is the signal. Peaks stay in their places. To 1e-4
-            standard deviations where the read noise exceeds 0.4 electrons; where electrons are resolved better, a strong
-            correction leaves up to 1e-2, and 1e-1 near the offset.
+        num_bins: number of bins of the spline.
+        mean_preserving: shift the latent so that E[observation | signal] is the signal. Peaks keep their positions. The error
+            of the mean is 1e-4 standard deviations if the read noise exceeds 0.4 electrons. If electrons are resolved better,
+            strong corrections leave errors up to 1e-2, and 1e-1 near the offset.
         width: hidden units of the conditioning network.
-        detector: the physical part; a default `PoissonGaussian` where none is given.
+        detector: the physical part; by default a `PoissonGaussian`.
 
     Example:
         >>> import noiseflow, torch
@@ -58,7 +58,7 @@ class PhysicsFlow(NoiseModelBase):
         self._latent_mean = LatentMean()
 
     def forward(self, signal: Tensor) -> PhysicsFlowDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        """The distribution of the observations, given signals of any shape, detector units."""
         return PhysicsFlowDistribution(self.detector(signal), self._maps, model=self)
 
     def _maps(self, signal: Tensor) -> list[Transform]:
@@ -71,14 +71,14 @@ class PhysicsFlow(NoiseModelBase):
         return [Affine(shift, torch.zeros_like(shift)), *maps]
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Find the most likely detector for (N,) signals and observations."""
+        """Find the maximum-likelihood detector for (N,) signals and observations."""
         self.detector.standardise(signal, observation)
         self.correction.standardise(signal, observation)
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Move the detector to its most likely parameters; see `PoissonGaussian.settle`."""
+        """Set the detector to its maximum-likelihood parameters; see `PoissonGaussian.settle`."""
         self.detector.settle(signal, observation, behind)
 
     @property
@@ -87,26 +87,26 @@ class PhysicsFlow(NoiseModelBase):
 
     @torch.no_grad()
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:
-        """What of the likelihood of (N,) pixels does not change while the flow learns, (N, 2); see `log_prob_from`."""
+        """The part of the likelihood of (N,) pixels that training the flow does not change, (N, 2); see `log_prob_from`."""
         return torch.stack(self.forward(signal).detector_part(observation), -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of pixels by their `fixed_part`."""
+        """Log-likelihood of pixels from their `fixed_part`."""
         latent, log_density = fixed_part.unbind(-1)
         return (log_density + self.forward(signal).correct(latent)[1]).to(signal.dtype)
 
     @torch.no_grad()
     def fixed_interval_part(self, signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """The same for the likelihood of intervals, (N, 3)."""
+        """As `fixed_part`, for the likelihood of intervals, (N, 3)."""
         return torch.stack(self.forward(signal).interval_part(low, high), -1)
 
     def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of intervals by their `fixed_interval_part`."""
+        """Log-likelihood of intervals from their `fixed_interval_part`."""
         return self.forward(signal).corrected_interval(*fixed_part.unbind(-1)).to(signal.dtype)
 
     def extra_repr(self) -> str:
         return f"{self.num_bins} bins, width={self.width}, mean_preserving={self.mean_preserving}"
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again, besides the detector inside."""
+        """Arguments that recreate this model, without the detector."""
         return {"num_bins": self.num_bins, "mean_preserving": self.mean_preserving, "width": self.width}

@@ -1,4 +1,4 @@
-"""Detectors whose pixels have gains, offsets and read noises of their own."""
+"""Detectors with per-pixel gains, offsets and read noises."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from noiseflow.models.base import NoiseModelBase
 
 
 class WithMaps(ModelAround):
-    """A noise model seen through a detector whose pixels have gains, offsets and, where known, read noises of their own.
+    """A noise model of a detector whose pixels have individual gains, offsets and, optionally, read noises.
 
-    observation = gain·o + offset, o drawn from the model at the clean signal: signals are those of an ideal pixel (gain 1,
-    offset 0), as after a flat-field correction; observations are raw. The maps are known and not fitted.
+    The observation is gain·o + offset, with o drawn from the inner model at the clean signal. Signals are those of an ideal pixel
+    (gain 1, offset 0), as after a flat-field correction; observations are raw. The maps are known and not fitted.
 
     Args:
         model: the noise model of an ideal pixel.
         gain: (y, x) relative gains, positive; 1 by default.
         offset: (y, x) offsets, detector units; 0 by default.
-        variance: (y, x) or a number, variance of raw observations in darkness before rounding, detector units², in place of the
-            read noise of the model inside, which is then a `PoissonGaussian`, perhaps `Digitised`; by default the model's own.
-        shape: (y, x) size of the maps where none is given.
+        variance: (y, x) or a number, variance of raw dark observations before rounding, detector units². It replaces the read
+            noise of the inner model, which must be a `PoissonGaussian`, possibly `Digitised`. By default the model's own.
+        shape: (y, x) size of the maps, if no map is given.
 
     Raises:
-        ValueError: no map, maps of different sizes, not finite, or gains or variances that are not positive.
+        ValueError: there is no map, maps differ in size or are not finite, or gains or variances are not positive.
 
     Example:
         >>> import noiseflow, torch
@@ -61,29 +61,29 @@ class WithMaps(ModelAround):
         if variance is not None and np.ndim(variance) == 0:
             variance = float(variance)
             if not 0 < variance < math.inf:
-                raise ValueError(f"a variance of {variance} is not positive; give a positive number or a map")
+                raise ValueError(f"variance is {variance}; give a positive number or a map")
         given = [each for each in (gain, offset, variance) if each is not None and not isinstance(each, (int, float))]
         sizes = [tuple(each.shape) for each in given] or [tuple(shape or ())]
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:
-            raise ValueError(f"maps have the sizes {sizes}; give a gain or an offset map (y, x), or maps of one size")
+            raise ValueError(f"the maps have sizes {sizes}; give a gain or an offset map (y, x), or maps of equal size")
         self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
         self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
-        alike = isinstance(variance, (int, float))  # so too where a file is opened, whose maps come later
+        alike = isinstance(variance, (int, float))  # also when a file is loaded, whose maps are filled in later
         known = torch.full(sizes[0], float(variance)) if isinstance(variance, (int, float)) else variance
         self.register_buffer("variance", None if known is None else floating(known).detach().clone())
         checked = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
         checked += [] if self.variance is None or alike else [self.variance.log()]
         if not all(bool(torch.isfinite(each).all()) for each in checked):
             raise ValueError(
-                "some gains or variances are not positive, or some values are NaN; mend or mask these pixels' maps"
+                "some gains or variances are not positive, or some values are NaN; correct the maps at these pixels"
             )
 
     def forward(self, signal: Signal) -> NoiseDistribution:
         """The distribution of raw pixel values.
 
         Raises:
-            ValueError: a flat signal, images of another size than the maps, or a map of variance around a model that has no
-                read noise.
+            ValueError: the signal is flat, images and maps differ in size, or there is a variance map and the inner model has
+                no read noise.
         """
         gain, offset = self._at(signal)
         inner = given_to(self.model, signal)
@@ -95,7 +95,7 @@ class WithMaps(ModelAround):
 
     @staticmethod
     def _of_pixels(values: Tensor, signal: Signal) -> Tensor:
-        """A map at the pixels of a signal."""
+        """Values of a map at the pixels of a signal."""
         found = values.reshape(-1)[signal.place] if isinstance(signal, PickedSignal) else values
         kind = values_of(signal).dtype
         return found.to(
@@ -106,7 +106,7 @@ class WithMaps(ModelAround):
         """Gain and offset at the pixels of a signal."""
         if isinstance(signal, PickedSignal):
             return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
-        require_image(signal, "every pixel has a gain and an offset of its own")
+        require_image(signal, "every pixel has its own gain and offset")
         if signal.shape[-2:] != self.gain.shape:
             raise ValueError(
                 f"images are {tuple(signal.shape[-2:])} pixels and the maps {tuple(self.gain.shape)}; crop them"
@@ -114,7 +114,7 @@ class WithMaps(ModelAround):
         return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
-        """Standardise the model inside on the pixel values of ideal pixels."""
+        """Standardise the inner model on pixel values corrected by the maps."""
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 
@@ -122,7 +122,7 @@ class WithMaps(ModelAround):
         return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again, besides the model inside and the maps."""
+        """Arguments that recreate this model, without the inner model and the maps."""
         return {"shape": list(self.gain.shape)} | ({} if self.variance is None else {"variance": 1.0})
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""Noise that a whole row or column of an image shares: one random offset for each."""
+"""Scan noise: a random offset for each row or column of an image."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ from noiseflow.distributions.picked import PickedSignal, Signal, given_to, requi
 from noiseflow.models.around import ModelAround, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 
-_REACH = 8.0  # standard deviations of the offset beyond which nothing is looked for
+_REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
 
 
 class ScanNoise(ModelAround):
-    """A noise model plus one Gaussian offset for every row (or column) of an image, as scanning adds it.
+    """A noise model plus a Gaussian offset for every row (or column) of an image, as added by scanning.
 
-    The pixel values of a row are no longer independent: given the offset b they are, so the likelihood of a row is
-    ∫ N(b; 0, scale²) ∏ p(oᵢ − b | sᵢ) db, one integral along each row, done by quadrature (to 1e-6 nats per row for smooth
-    noise, to 1e-3 nats per pixel for densities with kinks). ``log_prob`` of a pixel
-    is that of its pixel value given those before it in its row, so that the sum over a row is the row's log-likelihood; ``cdf``,
-    ``icdf``, ``mean`` and ``variance`` are of single pixel values.
+    The pixel values of a row are independent only given the offset b. The likelihood of a row is therefore
+    ∫ N(b; 0, scale²) ∏ p(oᵢ − b | sᵢ) db, computed by quadrature (error 1e-6 nats per row for smooth noise, 1e-3 nats per pixel
+    for densities with kinks). ``log_prob`` of a pixel is conditional on the pixel values before it in its row, so that the sum
+    over a row is the log-likelihood of the row. ``cdf``, ``icdf``, ``mean`` and ``variance`` are those of single pixel values.
 
     Args:
-        model: the noise model of each pixel; a `Digitised` one rounds and clips after the offset is added.
+        model: the noise model of each pixel; a `Digitised` model rounds and clips after the offset is added.
         scale: standard deviation of the offsets, detector units.
         along: whether each ``"row"`` or each ``"column"`` has an offset.
 
     Raises:
-        ValueError: scale not positive, or a model inside that holds offsets already.
+        ValueError: `scale` is not positive, or the inner model already has offsets.
 
     Example:
         >>> import noiseflow, torch
@@ -52,9 +51,7 @@ class ScanNoise(ModelAround):
         if along not in ("row", "column"):
             raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
         if self.model.shared_axis is not None:
-            raise ValueError(
-                "the model inside has offsets of rows or columns already; one such term is all there can be"
-            )
+            raise ValueError("the inner model already has row or column offsets; only one such term is supported")
         self.along = along
         self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
 
@@ -68,22 +65,22 @@ class ScanNoise(ModelAround):
         return self.axis
 
     def forward(self, signal: Signal) -> ScanDistribution:
-        """The distribution of images; of picked pixels, those along the last axis share an offset.
+        """The distribution of images; for selected pixels, those along the last axis share an offset.
 
         Raises:
-            ValueError: a flat signal.
+            ValueError: the signal is flat.
         """
         require_image(signal, f"every {self.along} of the image has an offset")
         axis = -1 if isinstance(signal, PickedSignal) else self.axis
         return ScanDistribution(self.model(given_to(self.model, signal)), torch.exp(self.log_scale), axis)
 
     def behind(self, converter: Callable[[NoiseModelBase], NoiseModelBase]) -> ScanNoise:
-        """Put the model inside behind a converter: offsets are added before pixel values are rounded and clipped."""
+        """Wrap the inner model in a converter, because offsets are added before rounding and clipping."""
         self.model = converter(self.model)
         return self
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:
-        """Measure the offsets' scale by the means of rows (R, X), and standardise the model inside on what is left."""
+        """Estimate the scale from the means of rows (R, X), and standardise the inner model on the remaining noise."""
         present = torch.isfinite(observation)
         residual = torch.where(present, observation - values_of(signal), torch.zeros_like(observation)).double()
         count = present.sum(-1).clamp(min=1)
@@ -103,7 +100,7 @@ class ScanNoise(ModelAround):
         return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale)), along=self.along)
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again, besides the model inside."""
+        """Arguments that recreate this model, without the inner model."""
         return {"along": self.along}
 
     def extra_repr(self) -> str:
@@ -111,7 +108,7 @@ class ScanNoise(ModelAround):
 
 
 def shared_axis(noise_model: nn.Module) -> int | None:
-    """The axis of an image along which pixels share an offset of a noise model; None where pixels are independent."""
+    """The image axis along which pixels share an offset under a noise model; None if pixels are independent."""
     return as_noise_model(noise_model).shared_axis
 
 
@@ -136,7 +133,7 @@ class ScanDistribution(NoiseDistribution):
         return self.base.widened(value, dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density of each pixel value given those before it along the axis; NaN pixel values are missing and count 0."""
+        """Log-density of each pixel value given those before it along the axis; NaN means missing and contributes 0."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
         cumulative = torch.cumsum(self._log_prob_at(value, offsets), self.axis)
         total = torch.logsumexp(cumulative + log_weight, 0)
@@ -144,13 +141,13 @@ class ScanDistribution(NoiseDistribution):
         return torch.diff(torch.cat([before, total], self.axis), dim=self.axis)
 
     def line_log_prob(self, value: Tensor) -> Tensor:
-        """Log-likelihood of each row (or column) as a whole; the axis is left out. Quicker than the sum of `log_prob`."""
+        """Log-likelihood of each whole row (or column), without the shared axis. Faster than the sum of `log_prob`."""
         offsets, log_weight = self._offsets(value, _COARSE, whole=False)
         total = self._log_prob_at(value, offsets).sum(self.axis, keepdim=True)
         return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
 
     def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """P(pixel value < value) and P(pixel value ≤ value) given the pixel values before each along the axis."""
+        """P(pixel value < value) and P(pixel value ≤ value), given the pixel values before it along the axis."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
         log_prob = self._log_prob_at(value, offsets)
         weight = torch.softmax(torch.cumsum(log_prob, self.axis) - log_prob + log_weight, 0)
@@ -172,8 +169,8 @@ class ScanDistribution(NoiseDistribution):
     def _offsets(self, value: Tensor, spacing: float, *, whole: bool) -> tuple[Tensor, Tensor]:
         """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included.
 
-        They are densest where the offset of the whole line lies, and thin out like the sinh so as to serve its first pixels
-        too where `whole`, or to end where the line's likelihood does.
+        They are densest around the offset of the whole line. Their spacing grows like sinh, either to the full range if `whole`,
+        which the first pixels of the line need, or to the range of the line's likelihood.
         """
         with torch.no_grad():
             centre, width = self._posterior(value)
@@ -188,7 +185,7 @@ class ScanDistribution(NoiseDistribution):
         return offsets.to(value.dtype), (log_prior + log_step).to(value.dtype)
 
     def _posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of each line's offset given all its pixel values."""
+        """Mean and standard deviation of the offset of each line, given all its pixel values."""
         present = ~torch.isnan(value)
         precision = torch.where(present, 1 / self.base.variance, 0.0)
         residual = torch.where(present, value - self.base.mean, 0.0)
@@ -196,12 +193,12 @@ class ScanDistribution(NoiseDistribution):
         centre, width = (precision * residual).sum(self.axis, keepdim=True) / total, total**-0.5
         if not bool(torch.isfinite(centre).all()):
             raise ValueError(
-                "a signal is NaN or infinite, or an observation infinite: its whole line has no likelihood; fill the signal, and "
-                "set observations that are missing to NaN"
+                "some signals are NaN or infinite, or some observations infinite, so that whole lines have no likelihood; fill "
+                "in the signal, and set missing observations to NaN"
             )
         t = torch.linspace(-2.5, 2.5, 13, dtype=centre.dtype, device=centre.device)
         t = t.reshape(-1, *(1 for _ in centre.shape))
-        for _ in range(2):  # the estimate by moments is not the mode where the noise is not Gaussian
+        for _ in range(2):  # for non-Gaussian noise the moment estimate is not the mode
             offsets = centre + width * torch.sinh(t)
             found = self._log_prob_at(value, offsets.to(value.dtype)).sum(self.axis, keepdim=True)
             weight = torch.softmax(found - 0.5 * (offsets / self.scale) ** 2 + torch.log(torch.cosh(t)), 0)
@@ -211,7 +208,7 @@ class ScanDistribution(NoiseDistribution):
         return centre, width
 
     def _average(self, function: Callable[[NoiseDistribution], Tensor]) -> Tensor:
-        """Mean over the offsets of something of single pixel values."""
+        """Mean over the offsets of a function of the single-pixel distribution."""
         nodes, weights = normal_quadrature(torch.float64, limit=7.0, count=57)
         like = self.scale.detach()
         parts = [
@@ -234,7 +231,7 @@ class ScanDistribution(NoiseDistribution):
         return bisect_quantile(self, value, self.mean - reach + 0 * value, self.mean + reach + 0 * value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        """Draw pixel values; every row (or column) of every image has an offset of its own."""
+        """Draw pixel values; every row (or column) of every image has its own offset."""
         return self._shifted(self._draw_offsets(sample_shape, generator)).sample(generator=generator)
 
     def _draw_offsets(self, sample_shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
@@ -249,14 +246,14 @@ class ScanDistribution(NoiseDistribution):
         return self.cast(self._shifted(offset).rsample(generator=generator))
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        """Not of pixels that depend on each other.
+        """Not available, because pixels depend on each other.
 
         Raises:
             NotImplementedError: always.
         """
         raise NotImplementedError(
-            "pixels that share an offset depend on each other: expectations, entropy and mode of single ones are those of the "
-            "model inside, model.model(signal)"
+            "pixels that share an offset are not independent; for expectations, entropy and mode without the offset use the "
+            "inner model, model.model(signal)"
         )
 
     @property

@@ -1,4 +1,4 @@
-"""The scaling stored inside a model: a smooth coordinate of the signal, and the noise's rough location and scale along it."""
+"""Data scaling stored in a model: a smooth signal coordinate, and approximate location and scale of the noise along it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _ROOT_SHIFT = 0.01
 
 
 class Standardisation(nn.Module):
-    """Brings signals to a coordinate in [0, 1] and residuals to unit scale, whatever the detector's units.
+    """Maps signals to a coordinate in [0, 1] and residuals to unit scale, for any detector units.
 
-    The coordinate grows like the square root of the signal above its lowest value, because shot noise changes fastest where the
-    signal is weak. Signals outside the range seen in the fit share the coordinate of the nearest end.
+    The coordinate grows like the square root of the signal above its lowest value, because shot noise changes fastest at weak
+    signals. Signals outside the range of the fit have the coordinate of the nearest end.
 
     Buffers:
         signal_low, signal_high: range of the signals of the fit, detector units.
@@ -35,7 +35,7 @@ class Standardisation(nn.Module):
 
     @property
     def fitted_range(self) -> tuple[float, float]:
-        """Least and greatest signal of the fit, detector units."""
+        """Smallest and largest signal of the fit, detector units."""
         return float(self.signal_low), float(self.signal_high)
 
     def coordinate(self, signal: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ class Standardisation(nn.Module):
         return _root(fraction)
 
     def signal_at(self, coordinate: Tensor) -> Tensor:
-        """The signal of each coordinate in [0, 1]."""
+        """The signal at each coordinate in [0, 1]."""
         start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
         fraction = (start + (end - start) * coordinate) ** 2 - _ROOT_SHIFT
         signal: Tensor = self.signal_low + (self.signal_high - self.signal_low) * fraction
@@ -56,23 +56,23 @@ class Standardisation(nn.Module):
 
     @torch.no_grad()
     def set_from(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
-        """Measure range, location and scale on (N,) signals and observations; robust to outliers and empty levels.
+        """Measure range, location and scale of (N,) signals and observations, robust to outliers and empty levels.
 
         Args:
             signal, observation: (N,), detector units.
-            span: range of signals to cover; that of `signal` by default.
+            span: range of signals to cover; by default that of `signal`.
 
         Raises:
-            ValueError: the observations equal the signals, so that there is no noise to learn.
+            ValueError: the residuals are constant, so that there is no noise to fit.
         """
         signal, residual = signal.double(), observation.double() - signal.double()
         spread = residual.std(correction=0)
         if not spread > 0:
             raise ValueError(
-                "observation − signal is constant: there is no noise to learn; check that the two images differ"
+                "observation − signal is constant: there is no noise to fit; check that the two images differ"
             )
         low, high = (signal.min(), signal.max()) if span is None else (signal.new_tensor(end) for end in span)
-        if high <= low:  # one signal level: give the coordinate a width of its own
+        if high <= low:  # one signal level: give the coordinate a finite width
             low, high = low - spread, high + spread
         self.signal_low.copy_(low)
         self.signal_high.copy_(high)
@@ -91,7 +91,7 @@ def _root(fraction: Tensor) -> Tensor:
 
 
 def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
-    """Median and robust scale at each knot; knots with too few pixels take them from their neighbours."""
+    """Median and robust scale at each knot; knots with too few pixels use those of their neighbours."""
     import numpy as np
 
     known, location, scale = [], [], []
@@ -123,7 +123,7 @@ def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:
 
 
 def _taken(table: Tensor, index: Tensor) -> Tensor:
-    """``table[index]``, which ``torch.func.vmap`` does not take for single numbers."""
+    """``table[index]``, also for scalars under ``torch.func.vmap``, which does not support that indexing."""
     return table.index_select(0, index.reshape(-1)).reshape(index.shape)
 
 

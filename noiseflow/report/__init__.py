@@ -1,4 +1,4 @@
-"""Building blocks of the self-contained HTML report: the page, its figures and interactive pictures, provenance."""
+"""Components of the self-contained HTML report: page, figures, interactive images and provenance."""
 
 from noiseflow.report.charts import COLOURS, add_legend, new_chart, new_figure, show_image
 from noiseflow.report.page import Report

@@ -1,4 +1,4 @@
-"""Figures for the report: pictures on white, and small charts whose colours follow the reader's light or dark page."""
+"""Figures for the report: images on white, and small charts whose colours follow the light or dark theme."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ COLOURS = {
     "warm": "#050505",
     "data": "#060606",
 }
-"""Stand-ins for the page's colours; `themed_svg` puts the page's own in their place."""
+"""Placeholder colours, which `themed_svg` replaces by those of the page theme."""
 
 
 def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: float = 3.4) -> tuple[Figure, Any]:
-    """A figure and its axes, array of (rows, columns), without the global state of pyplot.
+    """Create a figure and its axes, an array (rows, columns), without the global state of pyplot.
 
     Args:
-        width: inches in all.
-        height: inches per row.
+        width: total width, inches.
+        height: height per row, inches.
     """
     from matplotlib.figure import Figure
 
@@ -34,7 +34,7 @@ def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: 
 
 
 def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float] | None = None) -> None:
-    """Draw a grey image with a colour bar, its contrast from the 0.5 to 99.5 percentiles unless `limits` say otherwise."""
+    """Draw a grey image with a colour bar; its grey range is `limits`, or the 0.5 and 99.5 percentiles by default."""
     import numpy as np
 
     low, high = limits or np.percentile(image, (0.5, 99.5))
@@ -46,10 +46,10 @@ def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float]
 
 
 def new_chart(title: str, *, x: str = "", y: str = "", width: float = 4.1, height: float = 2.8) -> tuple[Figure, Any]:
-    """A small figure with one plain axis, for `Report.charts`; draw on it in `COLOURS`.
+    """Create a small figure with one axis for `Report.charts`; use the colours in `COLOURS`.
 
     Args:
-        title, x, y: text above and along the axes.
+        title, x, y: title and axis labels.
         width, height: inches.
     """
     from matplotlib.figure import Figure
@@ -69,14 +69,14 @@ def new_chart(title: str, *, x: str = "", y: str = "", width: float = 4.1, heigh
 
 
 def add_legend(axis: Any) -> None:
-    """A frameless legend in the page's text colour, below the axis where it hides nothing."""
+    """Add a frameless legend in the text colour of the page, below the axis."""
     handles, labels = axis.get_legend_handles_labels()
     style = {"frameon": False, "fontsize": 8.5, "labelcolor": COLOURS["soft"], "ncols": len(labels)}
     axis.figure.legend(handles, labels, loc="outside lower center", **style)
 
 
 def themed_svg(figure: Figure) -> str:
-    """The figure as an ``<svg>`` element whose text is text and whose `COLOURS` are the page's."""
+    """The figure as an ``<svg>`` element with selectable text and the colours of the page theme."""
     import matplotlib
 
     stream = io.StringIO()

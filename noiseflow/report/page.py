@@ -1,4 +1,4 @@
-"""The self-contained HTML page: text, tables, figures and interactive pictures that work offline, in light and dark."""
+"""The self-contained HTML page: text, tables, figures and interactive images that work offline, with light and dark themes."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 
 class Report:
-    """An HTML page that grows part by part; it asks nothing of any network.
+    """A self-contained HTML page that is built part by part and works offline.
 
     Args:
-        title: page title; this and all other text is escaped.
-        lead: a sentence under the title.
+        title: page title; all text is escaped.
+        lead: a sentence below the title.
     """
 
     def __init__(self, title: str, lead: str = "") -> None:
@@ -45,19 +45,19 @@ class Report:
         self._parts.append(f"<p>{_escape(text)}</p>")
 
     def command(self, text: str) -> None:
-        """Add a command as it would be typed; no line ends within an option."""
+        """Add a command line; options are not broken across lines."""
         unbroken = re.sub(r"(?<!\S)(--\S+)", r"<span>\1</span>", _escape(text))
         self._parts.append(f'<p class="command">{unbroken}</p>')
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
-        """Add the few figures that matter most, (name, value), as cards."""
+        """Add the most important values, (name, value), as cards."""
         cards = "".join(f"<div><dt>{_escape(n)}</dt><dd>{_escape(v)}</dd></div>" for n, v in facts)
         self._parts.append(f'<dl class="facts">{cards}</dl>')
 
     def table(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str = "", prose: bool = False
     ) -> None:
-        """Add a table; the first column is left-aligned, and with `prose` all are, and long cells wrap."""
+        """Add a table. The first column is left-aligned; with `prose` all columns are, and long cells wrap."""
         head = "".join(f"<th>{_escape(cell)}</th>" for cell in header)
         body = "".join("<tr>" + "".join(f"<td>{_escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         note = f'<p class="note">{_escape(caption)}</p>' if caption else ""
@@ -65,9 +65,9 @@ class Report:
         self._parts.append(f'<div class="scroll"><table{kind}><tr>{head}</tr>{body}</table></div>{note}')
 
     def figure(self, figure: Figure, *, caption: str) -> None:
-        """Add a matplotlib figure, embedded as PNG on white; use it for images, and `charts` for curves."""
+        """Add a matplotlib figure as PNG on white. Use it for images, and `charts` for curves."""
         stream = io.BytesIO()
-        margins = None if figure.get_layout_engine() else "tight"  # which draws everything twice
+        margins = None if figure.get_layout_engine() else "tight"  # "tight" draws everything twice
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
         data = base64.b64encode(stream.getvalue()).decode()
         text = _escape(caption)
@@ -76,14 +76,14 @@ class Report:
         )
 
     def charts(self, figures: Sequence[Figure], *, caption: str) -> None:
-        """Add small figures of `new_chart` side by side, as many in a row as fit; they follow light and dark."""
+        """Add small figures from `new_chart` side by side, as many per row as fit; they follow the page theme."""
         drawn = "".join(themed_svg(figure) for figure in figures)
         self._parts.append(
             f'<figure><div class="charts">{drawn}</div><figcaption>{_escape(caption)}</figcaption></figure>'
         )
 
     def widget(self, kind: str, data: dict[str, Any], *, caption: str) -> None:
-        """Add an interactive picture: ``volume`` or ``tilts``, with the data its script in ``assets`` reads."""
+        """Add an interactive view, ``volume`` or ``tilts``, with the data for its script in ``assets``."""
         stored = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
         self._parts.append(
             f'<figure data-widget="{_escape(kind)}"><script type="application/json">{stored}</script>'
@@ -92,17 +92,17 @@ class Report:
         )
 
     def include(self, path: str | Path) -> None:
-        """Add the content of a page that another report saved, as a part of this one."""
+        """Add the content of a saved report as a part of this one."""
         page = Path(path).read_text(encoding="utf-8")
         title = page.partition("<title>")[2].partition("</title>")[0]
         content = page.partition("<main>")[2].rpartition("</main>")[0]
         if not content:
-            raise ValueError(f"{path} is not a noiseflow report; it has no content to include")
+            raise ValueError(f"{path} is not a noiseflow report and has no content to include")
         content = content.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
         self._parts.append(f'<section class="part"><h2>{title}</h2>{content}</section>')
 
     def save(self, path: str | Path) -> Path:
-        """Write the page; returns its path."""
+        """Write the page and return its path."""
         path = check_output(path, suffixes=frozenset({".html"}))
         title, lead = _escape(self.title), _escape(self.lead)
         page = (

@@ -1,4 +1,4 @@
-"""Where a result comes from: command, seed, versions and checksums of the inputs."""
+"""Provenance of a result: command, seed, versions and checksums of the inputs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _PACKAGES = ("noiseflow", "torch", "numpy", "scipy")
 def provenance(
     inputs: Sequence[str | Path] = (), *, seed: int | None = None, more: Mapping[str, str] | None = None
 ) -> list[tuple[str, str]]:
-    """Rows (what, value) that let a reader repeat a result.
+    """Rows (name, value) with the information needed to reproduce a result.
 
     Args:
-        inputs: files and folders of images that were read; each is listed with its size and SHA-256.
-        seed: of the random choices.
-        more: other rows to add, such as the device.
+        inputs: input files and image folders; each is listed with its size and SHA-256.
+        seed: seed of the random choices.
+        more: further rows, such as the device.
     """
     called = invocation()
     rows = [("command", called.command_line if called is not None else "called from Python")]
@@ -37,7 +37,7 @@ def provenance(
 
 
 def _checksum(path: str | Path) -> str | None:
-    """Size and digest of a file, or of a folder's images one after the other; None where nothing is."""
+    """Size and digest of a file, or of the concatenated images of a folder; None if it does not exist."""
     files = [file for file in files_of(path) if file.is_file()]
     digest = hashlib.sha256()
     for file in files:

@@ -1,4 +1,4 @@
-"""Stacks of images as a few compressed sprite sheets that a page can carry and a browser can unpack."""
+"""Stacks of images as a few compressed sprite sheets for embedding in a page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _QUALITIES = (101, 90, 75, 60)
 _LOSSLESS = 101
 _MOST_HALVINGS = 12
 _PROBED = 6
-_MOST_PIXELS = 2**26  # 400³: more would hardly ever fit into a page, and trying takes memory for nothing
+_MOST_PIXELS = 2**26  # 400³: larger stacks hardly ever fit into a page, and trying would waste memory
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,12 @@ class Sprites:
     """A stack as 8-bit images tiled on sheets.
 
     Attributes:
-        sheets: WebP files; tiles run along rows, ``columns`` to a row, ``per_sheet`` to a sheet.
+        sheets: WebP files; tiles are ordered along rows, with ``columns`` tiles per row and ``per_sheet`` per sheet.
         shape: (section, y, x) as stored.
-        original: (section, y, x) before it was made smaller.
-        columns, per_sheet: layout.
-        low: detector or volume units of the grey value 0.
-        high: of the grey value 255.
-        lossless: whether the sheets hold the 8-bit values exactly.
+        original: (section, y, x) before downsampling.
+        columns, per_sheet: layout of the tiles.
+        low, high: values of the grey levels 0 and 255, detector or volume units.
+        lossless: whether the sheets store the 8-bit values exactly.
     """
 
     sheets: tuple[bytes, ...]
@@ -43,22 +42,22 @@ class Sprites:
 
     @property
     def num_bytes(self) -> int:
-        """Size in the page, where it is written in base64."""
+        """Size in the page, in base64 encoding."""
         return sum(4 * math.ceil(len(sheet) / 3) for sheet in self.sheets)
 
     def as_json(self) -> dict[str, Any]:
-        """What the page's script needs to unpack it."""
+        """The data that the script of the page needs for unpacking."""
         sheets = ["data:image/webp;base64," + base64.b64encode(sheet).decode() for sheet in self.sheets]
         layout = {"shape": list(self.shape), "columns": self.columns, "perSheet": self.per_sheet}
         return layout | {"low": self.low, "high": self.high, "sheets": sheets}
 
     def in_words(self) -> str:
-        """How the stored stack differs from the original, for the reader of the page."""
-        depth = "8-bit grey values" if self.lossless else "8-bit grey values, compressed with slight losses"
+        """A sentence about the differences between the stored and the original stack."""
+        depth = "8-bit grey values" if self.lossless else "8-bit grey values with slightly lossy compression"
         if self.shape == self.original:
             return f"Shown at full size in {depth}."
         sizes = " × ".join(map(str, self.shape)), " × ".join(map(str, self.original))
-        return f"Shown at {sizes[0]}, averaged down from {sizes[1]} to keep this page small, in {depth}."
+        return f"Shown at {sizes[0]}, binned from {sizes[1]} to keep this page small, in {depth}."
 
 
 def make_sprites(
@@ -68,19 +67,19 @@ def make_sprites(
     limits: tuple[float, float] | None = None,
     keep_sections: bool = False,
 ) -> Sprites:
-    """Pack a stack into sheets of at most 2048² pixels: exact where that is small enough, else compressed, else smaller.
+    """Pack a stack into sheets of at most 2048² pixels: lossless if small enough, otherwise lossy, otherwise also binned.
 
     Args:
         stack: (section, y, x), finite.
-        most_bytes: of all sheets in base64.
-        limits: values of black and white; the smallest and largest by default.
-        keep_sections: make only y and x smaller, for stacks whose sections are separate views.
+        most_bytes: largest size of all sheets in base64.
+        limits: values of black and white; by default the minimum and maximum.
+        keep_sections: bin only y and x, for stacks whose sections are separate views.
 
     Raises:
-        ValueError: not a stack, or pixels that are not finite.
+        ValueError: the array is not a stack, or pixels are not finite.
     """
     if stack.ndim != 3 or not stack.size:
-        raise ValueError(f"a stack (section, y, x) is needed; this array has shape {stack.shape}")
+        raise ValueError(f"give a stack (section, y, x); this array has shape {stack.shape}")
     if not all(np.isfinite(section).all() for section in stack):
         raise ValueError("the stack has NaN or infinite pixels; replace them before drawing it")
     low, high = limits or (float(stack.min()), float(stack.max()))
@@ -98,11 +97,11 @@ def make_sprites(
                 if sprites.num_bytes <= most_bytes:
                     return sprites
         small = _halved(small, keep_sections)
-    raise ValueError(f"a stack of shape {stack.shape} does not fit {most_bytes} bytes; allow more")
+    raise ValueError(f"a stack of shape {stack.shape} does not fit into {most_bytes} bytes; increase most_bytes")
 
 
 def _expected_bytes(grey: NDArray[np.uint8], quality: int) -> float:
-    """Size of the whole stack from a few of its sections: packing all of it at every quality would take minutes."""
+    """Estimate the packed size from a few sections, because packing the whole stack at every quality would take minutes."""
     chosen = grey[np.unique(np.linspace(0, len(grey) - 1, _PROBED).round().astype(int))]
     return _packed(chosen, quality, chosen.shape, (0.0, 1.0)).num_bytes * len(grey) / len(chosen)
 
@@ -126,7 +125,7 @@ def _packed(grey: NDArray[np.uint8], quality: int, original: Any, limits: tuple[
 
 
 def _halved(stack: NDArray[Any], keep_sections: bool) -> NDArray[np.float32]:
-    """The stack averaged over 2 × 2 pixels, and pairs of sections; an odd last one is left out."""
+    """The stack binned by 2 × 2 pixels and, unless `keep_sections`, pairs of sections; an odd last one is dropped."""
     sizes = [size if size == 1 or (axis == 0 and keep_sections) else size // 2 for axis, size in enumerate(stack.shape)]
     steps = [1 if size == full else 2 for size, full in zip(sizes, stack.shape, strict=True)]
     total = np.zeros(sizes, np.float32)

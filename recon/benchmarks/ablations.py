@@ -1,4 +1,4 @@
-"""What each part of the reconstruction is worth: one thing changed at a time on one scene of known truth."""
+"""Ablations of the reconstruction: one change at a time on a scene with known ground truth."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from recon.joint.run import RunFit, run_fit
 from recon.metrics.metrics import compare
 
 WEIGHT = 0.4
-"""Of the total variation, where it is the same for all variants."""
+"""Weight of the total variation in groups where it is the same for all variants."""
 
 DENOISERS = ("nlm", "tv", "wavelet", "wiener", "bm3d")
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One row: what group it belongs to, what it is called, and how its volume is made."""
+    """One row of the table: its group, its name, and a function that computes its volume."""
 
     group: str
     name: str
@@ -39,14 +39,14 @@ class Variant:
 
 
 def run(scene: Scene, results: Results, line: Callable[[str], None], *, quick: bool, small: Scene) -> None:
-    """Fill one cell for each variant; what is there already is kept.
+    """Compute the result of each variant; existing results are kept.
 
     Args:
-        scene: of most groups.
-        results: where cells are kept.
-        line: called with what is going on.
-        quick: the first groups only.
-        small: the scene of the coordinate networks, which are slow.
+        scene: scene of most groups.
+        results: file of the results.
+        line: called with progress messages.
+        quick: compute only the first groups.
+        small: scene for the coordinate networks, which are slow.
     """
     for group in GROUPS[:1] if quick else GROUPS:
         fill(group(scene), results, line)
@@ -55,7 +55,7 @@ def run(scene: Scene, results: Results, line: Callable[[str], None], *, quick: b
 
 
 def fill(variants: list[Variant], results: Results, line: Callable[[str], None]) -> None:
-    """One cell for each of these variants."""
+    """Compute the result of each of these variants."""
     for variant in variants:
         cell = results.cell(f"{variant.group}/{variant.name}", lambda v=variant: _judged(v))  # type: ignore[misc]
         line(f"  {variant.group}: {variant.name}: {cell['psnr raw']:.2f} dB, 2D {cell['2d psnr raw']:.2f} dB")
@@ -178,7 +178,7 @@ def _skipping(scene: Scene) -> list[Variant]:
 
 
 GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers, _defocus, _skipping)
-"""What changes, on one scene."""
+"""Groups of variants by name."""
 
 
 def _networks(scene: Scene) -> list[Variant]:
@@ -200,12 +200,12 @@ def _network(scene: Scene, width: int, noise_model: Callable[[], nn.Module] | No
 
 
 def small_scene(size: int, options: dict[str, Any]) -> Scene:
-    """The scene of the networks: half as wide."""
+    """The scene for the networks, half as wide."""
     return make_scene(max(16, size // 2), **options)
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows, in the order of the groups."""
+    """Table header and rows, in the order of the groups."""
     header = ("changed", "to", "3D PSNR", "3D PSNR, affine", "2D PSNR", "2D PSNR, affine", "best setting")
     rows: list[tuple[str, ...]] = []
     for key, cell in cells.items():

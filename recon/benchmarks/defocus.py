@@ -1,4 +1,4 @@
-"""A benchmark's scene as a converging beam would show it."""
+"""A benchmark scene imaged with a convergent beam."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from recon.projection.projector import SliceProjector
 from recon.simulate.simulation import add_noise
 
 STRENGTH = 0.08
-"""Pixels of blur per voxel out of the plane of focus: some 2 pixels at the edges of 48 voxels."""
+"""Blur in pixels per voxel out of the focal plane: about 2 pixels at the edges of 48 voxels."""
 
 
 def defocused_scene(scene: Scene, strength: float = STRENGTH) -> Scene:
-    """The same volume and noise, with images blurred by depth, see `recon.projection.defocused_projector.DefocusedProjector`."""
+    """The same volume and noise with depth-dependent blur; see `recon.projection.defocused_projector.DefocusedProjector`."""
     series = scene.clean
     depth, _, width = scene.truth.shape
     projector = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)

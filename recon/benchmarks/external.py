@@ -20,27 +20,27 @@ Array = NDArray[Any]
 
 
 def missing(package: str) -> bool:
-    """Whether the package of another method is not installed; ``pip install 'noiseflow[benchmark]'`` brings all."""
+    """Whether the package of another method is missing; ``pip install 'noiseflow[benchmark]'`` installs all."""
     return find_spec(package) is None
 
 
 def astra_sirt(tilt_series: TiltSeries, grid: VolumeGrid, counts: Sequence[int]) -> Iterator[tuple[str, float, Array]]:
-    """SIRT of the ASTRA toolbox (doi:10.1364/OE.24.025129) on the processor, slice by slice, not below zero.
+    """SIRT of the ASTRA toolbox (doi:10.1364/OE.24.025129) on the CPU, slice by slice, with non-negativity.
 
     Args:
         tilt_series: the data.
         grid: the voxel grid.
-        counts: numbers of iterations at which to look.
+        counts: numbers of iterations after which to yield the volume.
 
     Yields:
-        A label, the seconds so far, and the volume (z, y, x).
+        A label, the elapsed seconds, and the volume (z, y, x).
     """
     import astra
 
     started = time.perf_counter()
     measured = LineIntegralProblem.of(tilt_series, grid).line_integrals.numpy()
     volume_geometry = astra.create_vol_geom(grid.depth, grid.width)
-    # rows count downwards: z grows with the row, and a tilt turns the other way
+    # ASTRA's rows are numbered downwards: z increases with the row, and tilts have the opposite sign
     angles = -np.deg2rad(tilt_series.tilt_angles)
     geometry = astra.create_proj_geom("parallel", 1.0, measured.shape[2], angles)
     projector = astra.create_projector("linear", geometry, volume_geometry)
@@ -70,18 +70,18 @@ def quantem_inr(
 ) -> Iterator[tuple[str, float, Array]]:
     """quantem's implicit reconstruction (``TomographyLiteINR``: an H-SIREN network, Adam at 1e-4, 1024 rays at a time).
 
-    Its own settings are left alone but for the poses, which are known here and not learnt. It wants square images with no fewer
-    pixels a side than there are tilts (it counts its rays by the longest side of the stack), so they are padded with vacuum. The
-    volume is cut out of its cube, in the orientation that agrees best with a back-projection.
+    The default settings are used, except that poses are known and not fitted. Images must be square, with at least as many pixels
+    per side as tilts (the method counts rays by the longest side of the stack), so they are padded with vacuum. The volume is cut
+    out of the result, in the orientation that agrees best with a back-projection.
 
     Args:
         tilt_series: the data.
         grid: the voxel grid.
-        budget: seconds after which no further pass over the data is begun.
-        device: where to compute.
+        budget: time in seconds after which no further pass over the data starts.
+        device: torch device.
 
     Yields:
-        A label, the seconds so far, and the volume (z, y, x), on a scale of its own.
+        A label, the elapsed seconds, and the volume (z, y, x), with arbitrary scale.
     """
     from quantem.tomography.tomography_lite import TomographyLiteINR
 
@@ -104,7 +104,7 @@ def quantem_inr(
 
 
 def _padded(line_integrals: Array) -> Array:
-    """Square images (tilt, y, u) with vacuum around them, as many pixels a side as there are tilts or more; centres stay."""
+    """Pad images (tilt, y, u) with vacuum to squares with at least as many pixels per side as tilts; centres are kept."""
     tilts, height, width = line_integrals.shape
     side = max(tilts, height, width)
     side += (side - width) % 2
@@ -118,7 +118,7 @@ def _cut(cube: Array, side: int) -> Array:
 
 
 def _oriented(volume: Array, like: Array) -> Array:
-    """The permutation and flips of a volume that correlate best with another."""
+    """Permute and flip the axes of a volume for the best correlation with another."""
     best, found = -np.inf, volume
     for axes in itertools.permutations(range(3)):
         for steps in itertools.product((1, -1), repeat=3):

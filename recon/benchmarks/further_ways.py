@@ -1,4 +1,4 @@
-"""Further ways to spoil a good tilt series: what microscopes, file formats and well-meant corrections do."""
+"""Further defects for tilt series: effects of microscopes, file formats and well-meant corrections."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _spikes(source: Source) -> TiltSeries:
 
 @way("drift within every tilt", "resolution")
 def _drift_within(source: Source) -> Spoilt:
-    """Exposures blurred along u, the same at all tilts: the images of an object that is blurred across the axis."""
+    """Blur along u, equal at all tilts: identical to images of an object that is blurred across the axis."""
     images, moves = source.series.images.astype(np.float64), range(-3, 4)
     blurred = np.mean([ndimage.shift(images, (0, 0, by), order=1, cval=source.empty) for by in moves], axis=0)
     deviation = float(np.std(moves))
@@ -109,7 +109,7 @@ def _partly_inverted(source: Source) -> TiltSeries:
 
 @way("detector's response bent", "mode", "saturation")
 def _bent(source: Source) -> TiltSeries:
-    """The square root of the contrast: strong contrast counts for too little."""
+    """Square root of the contrast, which compresses strong contrast."""
     contrast = (source.series.images - source.empty) / (source.full - source.empty)
     return with_images(source, source.empty + (source.full - source.empty) * np.sqrt(contrast.clip(0)))
 
@@ -126,7 +126,7 @@ def _zero_borders(source: Source) -> TiltSeries:
 
 @way("compressed by blocks of 8 pixels", "pattern", "residuals", late=True)
 def _compressed(source: Source) -> TiltSeries:
-    """The cosine transform of every block keeps its ten lowest frequencies, coarsely rounded, as a photograph's file does."""
+    """Keep the ten lowest frequencies of the cosine transform of every block, coarsely rounded, as in JPEG."""
     images = source.series.images.astype(np.float64)
     height, width = (8 * (size // 8) for size in images.shape[1:])
     blocks = images[:, :height, :width].reshape(len(images), height // 8, 8, width // 8, 8)
@@ -171,7 +171,7 @@ def _rotating(source: Source) -> TiltSeries:
 
 @way("a bright background that moves", "pattern", "beam")
 def _moving_background(source: Source) -> TiltSeries:
-    """A smooth hill, of a tenth of the contrast, that stays where it is for a few tilts and then lies elsewhere."""
+    """A smooth bump with a tenth of the contrast that changes its position every few tilts."""
     count, height, width = source.series.images.shape
     centres = source.generator.uniform(0.2, 0.8, (count, 2)) * (height, width)
     y, x = np.arange(height)[:, None], np.arange(width)
@@ -243,7 +243,7 @@ def _standardised(source: Source) -> TiltSeries:
 
 @way("frequencies above a quarter taken out", "resolution", "pattern", late=True)
 def _low_pass(source: Source) -> TiltSeries:
-    """A quarter of the highest that pixels hold."""
+    """Low-pass filter at a quarter of the Nyquist frequency."""
     images = source.series.images.astype(np.float32)
     spectrum = fft.fft2(images, axes=(1, 2))
     y, x = (np.abs(fft.fftfreq(size)) for size in images.shape[1:])

@@ -1,4 +1,4 @@
-"""The benchmarks that `noiseflow benchmark` knows by name. A benchmark is added by one function here."""
+"""The benchmarks of `noiseflow benchmark`, one function each."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from recon.metrics.metrics import fourier_shell_correlation, resolution
 
 @dataclass(frozen=True)
 class Options:
-    """What to run and where to put it.
+    """Options of a benchmark run.
 
     Attributes:
         size: voxels along each edge.
         scene: further arguments of `make_scene`.
-        effort: how much to spend.
-        again: cells whose name contains this are computed anew; none if empty.
+        effort: computational effort.
+        again: results whose name contains this text are computed again; none if empty.
         out: folder of results and figures.
-        output: tells people what is going on.
-        overwrite: replace figures whoever made them; otherwise only those that this program made.
-        method: of `sabotage`; None for the joint fit, or least squares where quick.
-        in_turn: whether `sabotage` spoils one scene in each way, the next way the next scene.
+        output: console output.
+        overwrite: replace existing figures; otherwise only those that this program wrote.
+        method: method of `sabotage`; None for the joint fit, or least squares if quick.
+        in_turn: whether `sabotage` applies each defect to one scene only, alternating between scenes.
     """
 
     size: int
@@ -49,12 +49,12 @@ class Options:
     in_turn: bool = False
 
     def results(self, name: str) -> Results:
-        """The kept results of a benchmark on this scene; another scene or effort has another file."""
+        """The stored results of a benchmark on this scene; each scene and effort has its own file."""
         return self._kept(name, str(self.size), *(str(value).replace(":", "_") for value in self.scene.values()))
 
     @property
     def quick(self) -> bool:
-        """Whether few settings and a small scene shall do."""
+        """Whether to use a small scene and few settings."""
         return self.effort is benchmark_rivals.QUICK
 
     def _kept(self, name: str, *words: str) -> Results:
@@ -65,19 +65,19 @@ class Options:
         return results
 
     def results_of_series(self, name: str, method: str) -> Results:
-        """The kept results of a benchmark that has scenes of its own, of this size and method."""
+        """The stored results of a benchmark with its own scenes, for this size and method."""
         return self._kept(name, str(self.size), method, str(self.scene["seed"]))
 
     def results_on_real_data(self, name: str) -> Results:
-        """The kept results of a benchmark that has data of its own."""
+        """The stored results of a benchmark with its own data."""
         return self._kept(name, str(self.scene["seed"]))
 
 
 def check_figures(names: Sequence[str], options: Options) -> None:
-    """Refuse now, before long work, figures of these benchmarks that would replace files of others.
+    """Check before a long run that the figures of these benchmarks do not replace files of other programs.
 
     Raises:
-        FileExistsError: one would.
+        FileExistsError: a figure would replace such a file.
     """
     for name in sorted({"rivals", "slow-rivals"} & set(names)):
         require_own(_figure(options.results(name)), overwrite=options.overwrite)
@@ -88,14 +88,14 @@ def _figure(results: Results) -> Path:
 
 
 def rivals(options: Options) -> dict[str, Any]:
-    """Run time against error of every method that takes seconds or minutes."""
+    """Run time against error for every method that takes seconds or minutes."""
     results = options.results("rivals")
     benchmark_rivals.run(options.size, results, effort=options.effort, line=options.output.line, **options.scene)
     return _shown(options, results)
 
 
 def slow_rivals(options: Options) -> dict[str, Any]:
-    """The other methods that take hours, as far as the budget goes."""
+    """Run time against error for other methods that take hours, within a time budget."""
     results = options.results("slow-rivals")
     benchmark_rivals.run_slow(options.size, results, effort=options.effort, line=options.output.line, **options.scene)
     return _shown(options, results)
@@ -114,7 +114,7 @@ def _shown(options: Options, results: Results) -> dict[str, Any]:
 
 
 def even_odd(options: Options) -> dict[str, Any]:
-    """Fourier shell correlation of volumes from even and from odd tilts, and of each method's volume with the truth."""
+    """Fourier shell correlation between volumes from even and odd tilts, and between each method's volume and the truth."""
     scene, results = make_scene(options.size, **options.scene), options.results("resolution")
     steps = 60 if options.quick else None
 
@@ -136,7 +136,7 @@ def even_odd(options: Options) -> dict[str, Any]:
 
 
 def paper_table(options: Options) -> dict[str, Any]:
-    """The main table of Kniesel et al. (CVPR 2022) beside the published figures."""
+    """The main table of Kniesel et al. (CVPR 2022) compared with the published values."""
     scene, results = make_scene(options.size, **options.scene), options.results("paper-table")
     options.output.line(f"{scene.name}: settings of the other methods are tuned against the ground truth")
     benchmark_paper.run(scene, results, options.output.line)
@@ -144,7 +144,7 @@ def paper_table(options: Options) -> dict[str, Any]:
 
 
 def ablations(options: Options) -> dict[str, Any]:
-    """What each part of the reconstruction is worth."""
+    """Ablations of the reconstruction."""
     scene, results = make_scene(options.size, **options.scene), options.results("ablations")
     small = benchmark_ablations.small_scene(options.size, options.scene)
     options.output.line(scene.name)
@@ -153,14 +153,14 @@ def ablations(options: Options) -> dict[str, Any]:
 
 
 def needle(options: Options) -> dict[str, Any]:
-    """Every method on a real tilt series, judged by tilts left out."""
+    """Every method on a real tilt series, evaluated on held-out tilts."""
     results = options.results_on_real_data("needle")
     benchmark_needle.run(results, options.output.line, quick=options.quick, seed=options.scene["seed"])
     return _told(options, results, benchmark_needle.table(results.cells))
 
 
 def sabotage(options: Options) -> dict[str, Any]:
-    """Series spoilt on purpose: whether the verdict sees it and names the reason."""
+    """Tilt series with deliberate defects: whether the verdict detects them and names the reason."""
     method = options.method or ("l2" if options.quick else "joint")
     results = options.results_of_series("sabotage", method)
     benchmark_sabotage.run(

@@ -1,4 +1,4 @@
-"""The methods on a real tilt series, judged by tilts that they never saw: as measured, and with noise added."""
+"""The methods on a real tilt series, evaluated on held-out tilts: as measured, and with added noise."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
 from recon.simulate.noises import CountingNoise
 
 NOISES = {"as measured": None, "10 counts": 10.0}
-"""Noise added to the real images, by name: the mean of counts in the brightest pixel, or none."""
+"""Noise added to the real images, by name: mean counts in the brightest pixel, or none."""
 
 GAPS: dict[str, Callable[[Array], Array]] = {
     "every fifth": lambda angles: np.arange(len(angles)) % 5 == 2,
     "beyond 60°": lambda angles: abs(angles) > 60,
 }
-"""Which tilts are left out, by name."""
+"""Held-out tilts, by name."""
 
 _READ_NOISE = 0.5
 _ROUNDS = 2
@@ -38,12 +38,12 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class Split:
-    """A series in two parts.
+    """A tilt series split into reconstruction and held-out tilts.
 
     Attributes:
-        given: what the methods see.
-        left_out: noisy like the others.
-        target: the same tilts as measured, in units of `left_out`.
+        given: tilts for the reconstruction.
+        left_out: held-out tilts, with the same noise.
+        target: the held-out tilts as measured, in the units of `left_out`.
     """
 
     given: TiltSeries
@@ -52,13 +52,13 @@ class Split:
 
 
 def load() -> TiltSeries:
-    """The shipped needle."""
+    """The needle series of the example data."""
     data = Path(noiseflow.__file__).parent / "data" / "tilt_needle"
     return read_tilt_series(data / "needle_aligned.mrc", mode="linear")
 
 
 def split(series: TiltSeries, noise: str, gap: str, *, seed: int) -> Split:
-    """The series with noise added and tilts left out, both by name; counts are in detector units."""
+    """Add noise and hold out tilts, both by name; counts are in detector units."""
     images = np.asarray(series.images, dtype=np.float32)
     counts = NOISES[noise]
     target = images if counts is None else images * np.float32(counts / images.max())
@@ -72,7 +72,7 @@ def split(series: TiltSeries, noise: str, gap: str, *, seed: int) -> Split:
 
 
 def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Callable[[], Best]]:
-    """The best volume by method and score; the joint fits choose by themselves and come last."""
+    """Functions that compute the best volume of each method by `score`; joint fits use their own selection and come last."""
     grid = VolumeGrid.of(given)
     least_squares = JointReconstructor(noise_model=Gaussian, num_steps=STEPS, regulariser=TotalVariation())
     absolute = replace(least_squares, noise_model=Laplace)
@@ -98,7 +98,7 @@ def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Cal
 
 
 def run(results: Results, line: Callable[[str], None], *, quick: bool, seed: int) -> None:
-    """Fill one cell for each noise, gap and method; what is there already is kept."""
+    """Compute the result of each noise, gap and method; existing results are kept."""
     series = load()
     for noise in list(NOISES)[1:] if quick else NOISES:
         for gap in list(GAPS)[:1] if quick else GAPS:
@@ -123,21 +123,21 @@ def _judged(parts: Split, found: Best) -> Cell:
 
 
 def psnr_of(parts: Split, volume: Array) -> float:
-    """PSNR of the tilts left out, dB."""
+    """PSNR of the held-out tilts, dB."""
     predicted = predict(parts.given, volume, parts.left_out.tilt_angles)
     span = float(parts.target.max() - parts.target.min())
     return -10 * float(np.log10(np.mean((predicted - parts.target) ** 2) / span**2))
 
 
 def predict(given: TiltSeries, volume: Array, angles: Array, *, likely: bool = False) -> Array:
-    """Images at other angles: projections with the one gain and offset that suit the given tilts best.
+    """Predict images at other angles: projections with a common gain and offset fitted to the given tilts.
 
     Args:
-        given: what the volume was made from.
+        given: the tilts the volume was reconstructed from.
         volume: (z, y, x).
         angles: degrees.
-        likely: whether gain and offset are the most likely ones under noise that depends on the signal, found by weighing the
-            pixels over and over; else they are of least squares, which vacuum hardly counts for.
+        likely: fit gain and offset by maximum likelihood under signal-dependent noise (iteratively reweighted least squares)
+            instead of ordinary least squares, in which vacuum has little weight.
     """
     own, images = project(volume, given.tilt_angles).ravel(), given.images.ravel()
     gain, offset = np.polyfit(own.astype(np.float64), images.astype(np.float64), 1)
@@ -151,7 +151,7 @@ def predict(given: TiltSeries, volume: Array, angles: Array, *, likely: bool = F
 
 
 def held_out_nll(predicted: Array, observed: Array) -> float:
-    """Nats per pixel of tilts left out, under a Gaussian whose width depends on the signal, fitted to the other half of them."""
+    """Nats per pixel of the held-out tilts, under a signal-dependent Gaussian fitted to the other half of their pixels."""
     signals, readings = (torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in (predicted, observed))
     found = []
     for first in (0, 1):
@@ -170,7 +170,7 @@ def _noise_of(signals: Tensor, readings: Tensor) -> SignalDependentGaussian:
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows of all noises and gaps, best PSNR first."""
+    """Table header and rows for all noises and gaps, best PSNR first."""
     header = ("noise", "left out", "method", "PSNR (dB)", "NLL (nats per pixel)", "best setting")
     keys = [(noise, gap) for noise in NOISES for gap in GAPS]
     rows: list[tuple[str, ...]] = []

@@ -1,4 +1,4 @@
-"""The coordinate network of Kniesel et al. (CVPR 2022) evaluated once on the whole voxel grid and projected to all tilts."""
+"""The coordinate network of Kniesel et al. (CVPR 2022), evaluated once on the whole voxel grid and projected to all tilts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EMPTY = -4.0
 
 
 class NetworkField(Field):
-    """A volume that a network of nine layers computes from coordinates.
+    """A volume computed from coordinates by a network with nine layers.
 
     Args:
         shape: (depth, height, width) of the voxel grid.
@@ -45,7 +45,7 @@ class NetworkField(Field):
         self.register_buffer("points", torch.stack([x, y, z], -1).reshape(-1, 3), persistent=False)
 
     def start_from(self, volume: Tensor) -> None:
-        """The network starts nearly empty, whatever the volume."""
+        """Ignore the volume; the network starts nearly empty."""
 
     def units(self) -> Tensor:
         density: Tensor = self.network(self.points) * (2 * _DENSITY_SCALE / self.width / self.scale)
@@ -61,15 +61,15 @@ def fit_network(
     num_steps: int = _STEPS,
     seed: int = 0,
 ) -> NDArray[Any]:
-    """Fit the network by least squares, then with a noise model if there is one; held-out pixels choose the best step.
+    """Fit the network by least squares, then with a noise model if given; held-out pixels select the best step.
 
     Args:
         tilt_series: the data.
         grid: the voxel grid.
-        width: of the hidden layers.
-        noise_model: makes a model to learn with the volume.
-        num_steps: of Adam, over all pixels; half of them by least squares where there is a noise model.
-        seed: of every random choice.
+        width: width of the hidden layers.
+        noise_model: function that creates a noise model to fit jointly with the volume.
+        num_steps: full-batch steps of Adam; half of them by least squares if there is a noise model.
+        seed: seed of all random choices.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,4 +1,4 @@
-"""The main table of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018) made again on a scene of known truth."""
+"""The main table of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018), repeated on a scene with known truth."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ PUBLISHED: dict[str, tuple[float, float, float, float, float]] = {
     "joint, supervised": (20.07, 0.991, 0.636, 20.64, 0.864),
     "L2, clean images": (20.73, 0.840, 0.393, 21.60, 0.691),
 }
-"""2D PSNR (dB), 100·MSE and 10·DSSIM, 3D PSNR and 100·MSE, as printed, but for MSE and DSSIM of the last five rows: their
-columns are exchanged in print (10·log10 of the printed DSSIM/100 is the printed PSNR)."""
+"""2D PSNR (dB), 100·MSE and 10·DSSIM, 3D PSNR and 100·MSE, as printed, except that MSE and DSSIM of the last five rows are
+exchanged: in print their columns are swapped (10·log10 of the printed DSSIM/100 is the printed PSNR)."""
 
 METHODS = (*PUBLISHED, "oracle")
-_CLEAN = 0.02  # where the search of a weight begins when there is no noise
-CLEAN_STEPS = 4 * STEPS  # without noise a fit goes on to gain long after the others end
+_CLEAN = 0.02  # initial weight of the search for data without noise
+CLEAN_STEPS = 4 * STEPS  # without noise a fit improves for much longer
 
 
 def run(scene: Scene, results: Results, line: Callable[[str], None]) -> None:
-    """Fill one cell for each method of the table, the joint fits last; what is there already is kept."""
+    """Compute the result of each method of the table, joint fits last; existing results are kept."""
     for name, method in _methods(scene).items():
         cell = results.cell(name, lambda m=method: _judged(scene, m()))  # type: ignore[misc]
         line(f"  {name}: 2D {cell['2d psnr min-max']:.2f} dB, 3D {cell['psnr min-max']:.2f} dB ({cell['setting']})")
@@ -70,7 +70,7 @@ def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
 
 
 def calibrated(scene: Scene, *, seed: int = 0) -> nn.Module:
-    """A flow fitted to clean and noisy images of the scene and then kept, as calibration gives it."""
+    """A flow fitted to clean and noisy images of the scene, as a calibration would give it."""
     digitisation = detect_digitisation(scene.noisy.images)
     flow: nn.Module = SplineFlow(mean_preserving=True)
     model = Digitised(flow, *digitisation) if digitisation.found else flow
@@ -88,7 +88,7 @@ def _judged(scene: Scene, found: Best) -> Cell:
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows: ours min–max as the paper does, the published figures, and ours affinely matched."""
+    """Table header and rows: our values with min–max scaling as in the paper, the published values, and ours affinely matched."""
     figures = ("2D PSNR", "2D MSE", "2D DSSIM", "3D PSNR", "3D MSE")
     published = (f"{name}, published" for name in figures)
     header = ("method", *figures, *published, "2D PSNR, affine", "3D PSNR, affine", "best setting")

@@ -1,4 +1,4 @@
-"""Where a figure comes from: commit, date and machine, for each cell and for the head of a page."""
+"""Provenance of benchmark results: commit, date and machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import torch
 
 @cache
 def origin() -> dict[str, str]:
-    """Commit (with ``+`` where files differ from it; empty outside a checkout) and date of what is measured now."""
+    """Current commit (with ``+`` if files differ from it; empty outside a checkout) and date."""
     return {"commit": _commit(), "date": date.today().isoformat()}
 
 
@@ -28,14 +28,14 @@ def _commit() -> str:
         return found.stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/*.py")  # of the whole checkout
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/*.py")  # of the whole repository
         return git("rev-parse", "--short=7", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return ""
 
 
 def measured_on(contents: Iterable[dict[str, Any]]) -> str:
-    """Markdown: the commits, dates and machines of the cells of some results; a machine that is None was not recorded."""
+    """Markdown list of the commits, dates and machines of some results; a machine that is None was not recorded."""
     contents = list(contents)
     cells = [cell for content in contents for cell in content["cells"].values()]
     origins = Counter((_origin(cell), cell.get("date", "")) for cell in cells)
@@ -56,14 +56,14 @@ def measured_on(contents: Iterable[dict[str, Any]]) -> str:
 
 
 def _origin(cell: dict[str, Any]) -> str:
-    """The commit that a row was measured on; of older rows the one that recorded them, which is that of the code or the next."""
+    """The commit that a row was measured on; for older rows the commit that recorded them, the same or the next one."""
     if "recorded" in cell:
         return f"recorded by commit {cell['recorded']}, measured on the code shortly before it"
     return f"commit {cell['commit']}" if cell.get("commit") else "an earlier commit, not recorded"
 
 
 def machine() -> dict[str, Any]:
-    """Processor, memory and versions, for whoever compares the figures."""
+    """Processor, memory and versions of this machine."""
     from importlib.metadata import PackageNotFoundError, version
 
     versions = {}

@@ -1,7 +1,7 @@
-"""Run time against error: the curve of every method on the same data and machine, and the oracle as the floor.
+"""Run time against error for every method on the same data and machine, with an oracle as the lower bound.
 
-A point is a volume and the seconds it took; errors are measured outside the clock. Methods of few settings take their best one,
-found by looking at the truth in a search that is not counted, which favours them; the joint fit finds its own, within its time.
+A point is a volume and its run time; computing the error is not timed. Settings of other methods are tuned against the ground
+truth in a search that is not timed, which favours them. The joint fit chooses its settings itself, within its run time.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 
 @dataclass(frozen=True)
 class Effort:
-    """How much to spend.
+    """Computational effort of the benchmark.
 
     Attributes:
-        steps: of the fits; each is a run of its own, and weights are searched at the most of them.
-        weights: of the total variation, where the search begins.
-        refine: how often the search halves its ladder around the best weight.
-        repeats: of every curve, in turn.
-        budget: seconds for methods that would go on for hours.
+        steps: numbers of steps of the fits, each a separate run; weights are searched with the largest number.
+        weights: initial weights of the total variation in the search.
+        refine: number of refinements of the search around the best weight.
+        repeats: repeats of every curve, in turn.
+        budget: time in seconds for methods that would take hours.
     """
 
     steps: tuple[int, ...] = (30, 120, 300)
@@ -59,7 +59,7 @@ QUICK = Effort(steps=(20, 60), weights=(0.2,), refine=0, repeats=1, budget=5.0)
 
 
 def back_projection(scene: Scene, window: str, cutoff: float) -> Iterator[Point]:
-    """One back-projection, its set-up in the clock."""
+    """One back-projection, timed with its set-up."""
     started = time.perf_counter()
     problem = LineIntegralProblem.of(scene.noisy, scene.grid)
     volume = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff).numpy()
@@ -67,7 +67,7 @@ def back_projection(scene: Scene, window: str, cutoff: float) -> Iterator[Point]
 
 
 def own_sirt(scene: Scene) -> Iterator[Point]:
-    """SIRT by numbers of iterations."""
+    """SIRT at several numbers of iterations."""
     started = time.perf_counter()
     problem = LineIntegralProblem.of(scene.noisy, scene.grid)
     seconds, volume, done = time.perf_counter() - started, None, 0
@@ -79,7 +79,7 @@ def own_sirt(scene: Scene) -> Iterator[Point]:
 
 
 def fitted(scene: Scene, reconstructor: JointReconstructor, steps: Iterable[int | None]) -> Iterator[Point]:
-    """Whole fits of different lengths; None is the length that users get."""
+    """Complete fits of different lengths; None is the default length."""
     for count in steps:
         started = time.perf_counter()
         result = replace(reconstructor, num_steps=count)(scene.noisy)
@@ -88,7 +88,7 @@ def fitted(scene: Scene, reconstructor: JointReconstructor, steps: Iterable[int 
 
 
 def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
-    """The fits whose weight is searched, by name."""
+    """Fits with searched weight, by name."""
 
     def truth() -> nn.Module:
         return scene.noise_model
@@ -103,7 +103,7 @@ def reconstructors(scene: Scene) -> dict[str, JointReconstructor]:
 
 
 def best_setting(scene: Scene, reconstructor: JointReconstructor, effort: Effort) -> Cell:
-    """The weight, and the incident intensity learnt or not, of the highest PSNR of the volume."""
+    """The weight, and whether to fit the incident intensity, with the highest PSNR of the volume."""
     tried: dict[float, float] = {}
     reconstructor = replace(reconstructor, num_steps=max(effort.steps))
 
@@ -126,7 +126,7 @@ def _psnr(scene: Scene, reconstructor: JointReconstructor) -> float:
 
 
 def best_cutoff(scene: Scene, window: str) -> Cell:
-    """The cutoff of the highest PSNR of the volume, affinely matched."""
+    """The cutoff with the highest PSNR of the affinely matched volume."""
     problem = LineIntegralProblem.of(scene.noisy, scene.grid)
     tried = {}
     for cutoff in CUTOFFS:
@@ -136,7 +136,7 @@ def best_cutoff(scene: Scene, window: str) -> Cell:
 
 
 def curves(scene: Scene, results: Results, key: str, effort: Effort) -> dict[str, Callable[[], Iterator[Point]]]:
-    """Every method that can run here, ready to run at its best setting; the searches are cells of their own."""
+    """Every method that is installed, with its best setting; the searches are stored as separate results."""
     found: dict[str, Callable[[], Iterator[Point]]] = {"SIRT": lambda: own_sirt(scene)}
     for window in WINDOWS:
         cutoff = results.cell(f"{key}/search/WBP {window}", lambda w=window: best_cutoff(scene, w))["cutoff"]  # type: ignore[misc]
@@ -154,14 +154,14 @@ def curves(scene: Scene, results: Results, key: str, effort: Effort) -> dict[str
 
 
 def run(size: int, results: Results, *, effort: Effort, line: Callable[[str], None], **scene_options: Any) -> None:
-    """Fill the cells of the curves at one size; what is there already is kept.
+    """Compute the curves at one size; existing results are kept.
 
     Args:
         size: voxels along each edge.
-        results: where cells are kept.
-        effort: how much to spend.
-        line: called with what is going on.
-        **scene_options: as `make_scene`.
+        results: file of the results.
+        effort: computational effort.
+        line: called with progress messages.
+        **scene_options: arguments of `make_scene`.
     """
     scene = make_scene(size, **scene_options)
     line(f"{scene.name}: settings are searched, then {effort.repeats} curves of each method in turn")
@@ -175,7 +175,7 @@ def run(size: int, results: Results, *, effort: Effort, line: Callable[[str], No
 
 
 def run_slow(size: int, results: Results, *, effort: Effort, line: Callable[[str], None], **scene_options: Any) -> None:
-    """The other methods that take hours, as far as the budget goes; one curve each."""
+    """Compute one curve per method that takes hours, within the budget."""
     scene = make_scene(size, **scene_options)
     slow: dict[str, Callable[[], Iterator[Point]]] = {
         name: lambda p=preset: _trained(scene, p, effort.budget)  # type: ignore[misc]
@@ -189,7 +189,7 @@ def run_slow(size: int, results: Results, *, effort: Effort, line: Callable[[str
 
 
 def _trained(scene: Scene, preset: Kniesel2022, budget: float) -> Iterator[Point]:
-    """A preset's volumes at growing times, each half as long again as the one before."""
+    """Volumes of a preset at increasing times, each 1.5 times the previous one."""
     seconds, due, started = 0.0, budget / 30, time.perf_counter()
     for state in preset.train(scene.noisy):
         now = seconds + time.perf_counter() - started
@@ -211,7 +211,7 @@ def _measured(scene: Scene, points: Iterator[Point]) -> Cell:
 
 
 def summary(results: Results, size: int) -> dict[str, list[dict[str, Any]]]:
-    """The curves at one size: by method its points, each with the median seconds of the repeats."""
+    """The curves at one size: points by method, with the median run time of the repeats."""
     found: dict[str, list[list[dict[str, Any]]]] = {}
     for key, cell in results.cells.items():
         parts = key.split("/", 2)
@@ -227,7 +227,7 @@ def summary(results: Results, size: int) -> dict[str, list[dict[str, Any]]]:
 
 
 def table(curves_of_methods: dict[str, list[dict[str, Any]]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows: the best point of each finished curve and the first that comes within 0.2 dB of it."""
+    """Table header and rows: the best point of each finished curve, and the first point within 0.2 dB of it."""
     rows: list[tuple[str, ...]] = []
     for name, points in curves_of_methods.items():
         if not points or unfinished(points):
@@ -251,18 +251,18 @@ def table(curves_of_methods: dict[str, list[dict[str, Any]]]) -> tuple[tuple[str
 
 
 def unfinished(points: list[dict[str, Any]]) -> str:
-    """How far a curve came whose time ran out, such as "4 of 400000 steps"; empty where it ended by itself."""
+    """Progress of an unfinished curve, such as "4 of 400000 steps"; empty if the method finished."""
     last = points[-1]["setting"] if points else ""
     numbers = re.fullmatch(r"(\d+) of (\d+) steps", last)
     return last if numbers and numbers[1] != numbers[2] else ""
 
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
-"""Okabe and Ito's: eyes that confuse red and green tell them apart. Methods beyond seven differ by their markers."""
+"""The colour-blind-safe palette of Okabe and Ito. Beyond seven methods, markers differ."""
 
 
 def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
-    """Error against time on one set of axes; the oracle's best is a line, and unfinished curves are dotted."""
+    """Plot error against time; the best result of the oracle is a line, and unfinished curves are dotted."""
     from noiseflow.report import new_figure
 
     figure, axes = new_figure(1, width=10.5, height=5.2)
@@ -288,7 +288,7 @@ def draw(curves_of_methods: dict[str, list[dict[str, Any]]], title: str) -> Any:
             marker, colour = next(looks)
             style = {"linewidth": 2.6 if bold else 1.3, "marker": marker, "markersize": 5 if bold else 3.5}
             style |= {"linestyle": ":", "label": f"{name}, unfinished: {stopped}"} if stopped else {"label": name}
-            if len(points) == 1:  # which curves would hide
+            if len(points) == 1:  # single points would be hidden by curves
                 style |= {"linestyle": "none", "marker": "*", "markersize": 13, "markeredgecolor": "black", "zorder": 4}
             axis.plot(seconds, psnr, color=colour, **style)
     axis.set(xscale="log", xlabel="wall time (s)", ylabel="PSNR of the volume, affinely matched (dB)", title=title)

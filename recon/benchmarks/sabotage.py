@@ -1,4 +1,4 @@
-"""Good series spoilt on purpose: whether each is reconstructed right, or graded doubtful or bad for the true reason."""
+"""Tilt series with deliberate defects: each must be reconstructed correctly, or graded doubtful or bad for the true reason."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ STANDARD = tuple(
     for noise in ("clipped", "skewed", "outliers", "low-dose", "8-bit")
 )
 TILTS = "-60:60:3"
-RIGHT = 0.3  # dB below the unspoilt
-_OTHER = 9  # added to the seed for another object of the same kind
+RIGHT = 0.3  # dB below the series without defects
+_OTHER = 9  # added to the seed to get another object of the same type
 Result = tuple[TiltSeries, Any, Verdict]
 
 
@@ -44,9 +44,9 @@ def run(
     quick: bool,
     in_turn: bool = False,
 ) -> None:
-    """Fill a cell for each good series, and for each scene and way of spoiling it; what is there already is kept.
+    """Compute the result of each good series and of each scene with each defect; existing results are kept.
 
-    In turn, each way spoils one scene, the next way the next one: a third of the time.
+    If `in_turn`, each defect is applied to one scene only, alternating between scenes, which takes a third of the time.
     """
     for phantom, noise in SCENES if quick else STANDARD:
         _cell(results, line, f"good/{phantom}, {noise}", partial(_good, phantom, noise, size, method, seed))
@@ -78,18 +78,18 @@ def _spoilt(phantom: str, noise: str, name: str, size: int, method: str, seed: i
     truth = scene.truth if spoilt.truth is None else spoilt.truth
     try:
         _, result, verdict = _result(spoilt.series, method, seed, spoilt.thickness)
-    except ValueError as error:  # an answer in one line is as good as a verdict
+    except ValueError as error:  # an error message is as good as a verdict
         return {"grade": "refused", "subjects": [], "reasons": [str(error)], "psnr": None}
     return _graded(verdict) | {"psnr": _psnr(result, truth)}
 
 
 def spoil(scene: Scene, name: str, *, other: Scene, seed: int) -> Spoilt:
-    """A scene's series spoilt in one of `WAYS`, with noise; `other` is where objects that do not belong come from."""
+    """The noisy series of a scene with one of the defects in `WAYS`; `other` provides foreign objects."""
     way, generator = WAYS[name], np.random.default_rng(seed)
     intensity = next(each.intensity for each in ACQUISITIONS.values() if _made(each.noise) == repr(scene.noise_model))
     images = scene.noisy if way.late else scene.clean
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of the angles that are spoilt on purpose
+        warnings.simplefilter("ignore", UserWarning)  # warnings about deliberately wrong angles
         found = way.spoil(Source(scene.truth, images, other.truth, intensity, generator))
         spoilt = found if isinstance(found, Spoilt) else Spoilt(found)
         if way.late:
@@ -104,7 +104,7 @@ def _made(make: Callable[[], Any] | None) -> str:
 
 
 def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = None) -> Result:
-    """Screened, reconstructed and judged, as the command does it."""
+    """Screen, reconstruct and grade a series, as the command does."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         screening = screen(series)
@@ -118,13 +118,13 @@ def _graded(verdict: Verdict) -> Cell:
 
 
 def _psnr(result: Any, truth: Any) -> float | None:
-    """Of the volume, gain and offset matched, for a spoilt series need not keep its units; None for another shape."""
+    """PSNR of the volume after matching gain and offset, because defects may change the units; None if shapes differ."""
     volume = result.volume.attenuation
     return compare(volume, truth, scaling="affine").psnr if volume.shape == truth.shape else None
 
 
 def outcome(name: str, cell: Cell, unspoilt: float) -> str:
-    """``right``, ``named``, ``other reason`` or ``missed``, of one way of spoiling."""
+    """Outcome of one defect: ``right``, ``named``, ``other reason`` or ``missed``."""
     right = cell["psnr"] is not None and cell["psnr"] >= unspoilt - RIGHT
     if cell["grade"] == "refused" or set(cell["subjects"][:2]) & set(WAYS[name].reasons):
         return "named"
@@ -134,7 +134,7 @@ def outcome(name: str, cell: Cell, unspoilt: float) -> str:
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows: every way of spoiling by scene, and counts last."""
+    """Table header and rows: every defect by scene, with counts in the last rows."""
     scenes = sorted({key.split("/")[0] for key in cells} - {"good"})
     rows: list[tuple[str, ...]] = []
     counts: dict[str, int] = {}

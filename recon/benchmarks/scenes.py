@@ -1,4 +1,4 @@
-"""What every benchmark shares: scenes of known truth, cells that are computed once and kept, timing in turn, and the machine."""
+"""Shared parts of the benchmarks: scenes with known truth, stored results, and timing."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Scene:
 
     Attributes:
         truth: (z, y, x) attenuation.
-        clean, noisy: the series.
-        test_angles: degrees, none of them a tilt of the series.
-        noise_model: the true noise.
-        name: what it is.
+        clean, noisy: the tilt series without and with noise.
+        test_angles: degrees, different from the tilts of the series.
+        noise_model: the true noise model.
+        name: description of the scene.
     """
 
     truth: Array
@@ -53,7 +53,7 @@ class Scene:
         return VolumeGrid.of(self.noisy)
 
     def errors(self, volume: Array) -> dict[str, float]:
-        """Errors of a volume in three dimensions, raw, affinely matched and min–max."""
+        """Errors of a volume: raw, affinely matched and min–max scaled."""
         found: dict[str, float] = {}
         for scaling in ("raw", "affine", "min-max"):
             errors = compare(volume, self.truth, scaling=scaling)
@@ -61,7 +61,7 @@ class Scene:
         return found
 
     def projection_errors(self, volume: Array) -> dict[str, float]:
-        """Errors of the projections that a volume predicts at the test angles, one by one, as `errors` names them."""
+        """Errors of the predicted projections at the test angles, named as by `errors`."""
         predicted, true = (project(array, self.test_angles, mode=self.noisy.mode) for array in (volume, self.truth))
         found: dict[str, float] = {}
         for scaling in ("raw", "affine", "min-max"):
@@ -75,18 +75,18 @@ class Scene:
 def make_scene(
     size: int, *, phantom: str = "shells", noise: str = "clipped", tilts: str = "-59.5:57.5:1.5", seed: int = 0
 ) -> Scene:
-    """A scene by name; the same arguments give the same voxels and the same noise.
+    """Create a scene; the same arguments give the same voxels and the same noise.
 
     Args:
         size: voxels along each edge.
         phantom: one of `recon.simulate.phantoms.PHANTOMS`.
-        noise: one of `recon.simulate.simulation.ACQUISITIONS`, with noise.
+        noise: one of `recon.simulate.simulation.ACQUISITIONS` except none.
         tilts: START:STOP:STEP, degrees.
-        seed: of the phantom; the noise takes the next.
+        seed: seed of the phantom; the noise uses seed + 1.
     """
     acquisition, angles = ACQUISITIONS[noise], tilt_range(tilts)
     if acquisition.noise is None:
-        raise ValueError(f"{noise} has no noise; a benchmark needs some")
+        raise ValueError(f"{noise} has no noise; choose an acquisition with noise")
     density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
     clean, unit = clean_tilt_series(density, angles, acquisition=acquisition)
     noise_model = acquisition.noise()
@@ -97,11 +97,11 @@ def make_scene(
 
 
 class Results:
-    """The cells of a benchmark in a JSON file: what is there is not computed again, and what is computed is kept at once.
+    """Results of a benchmark in a JSON file: existing results are not computed again, and new ones are stored at once.
 
     Args:
-        path: the file; made with the first cell.
-        title: the benchmark's name.
+        path: the file; it is created with the first result.
+        title: name of the benchmark.
     """
 
     def __init__(self, path: Path, title: str) -> None:
@@ -111,26 +111,26 @@ class Results:
             try:
                 kept = json.loads(path.read_text(encoding="utf-8"))
             except json.JSONDecodeError as error:
-                raise ValueError(f"{path} is not a results file ({error}); remove it to start again") from error
+                raise ValueError(f"{path} is not a results file ({error}); remove it to start over") from error
             if kept.get("benchmark") != title or "cells" not in kept:
                 raise ValueError(
-                    f"{path} holds results of something else; remove it, or name another folder with --out"
+                    f"{path} holds results of another benchmark; remove it, or name another folder with --out"
                 )
             self.content |= {name: kept[name] for name in ("machines", "cells") if name in kept}
 
     @property
     def cells(self) -> dict[str, Cell]:
-        """All cells so far."""
+        """All stored results."""
         cells: dict[str, Cell] = self.content["cells"]
         return cells
 
     def forget(self, part: str) -> None:
-        """Leave out the cells whose name contains `part`: they are computed anew."""
+        """Remove results whose name contains `part`, so that they are computed again."""
         for key in [key for key in self.cells if part in key]:
             del self.cells[key]
 
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
-        """The cell of a name, computed and saved if it is not there, with commit, date, machine and its load before."""
+        """The result of a name; if missing, it is computed and stored with commit, date, machine and initial load."""
         if key not in self.cells:
             load, here = os.getloadavg()[0], machine()
             found = compute()
@@ -144,7 +144,7 @@ class Results:
 
 
 def plain(value: Any) -> Any:
-    """Numbers that JSON knows, to five digits; what is not finite becomes None."""
+    """Convert values for JSON: numbers are rounded to five digits, and non-finite ones become None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -157,7 +157,7 @@ def plain(value: Any) -> Any:
 
 
 def in_turn(functions: Sequence[Callable[[], Any]], *, repeats: int) -> list[tuple[float, Any]]:
-    """Median seconds and last result of each function, all called in turn so that a busy machine slows none alone."""
+    """Median seconds and last result of each function, called in turn so that background load affects all equally."""
     seconds: list[list[float]] = [[] for _ in functions]
     results: list[Any] = [None] * len(functions)
     for _ in range(repeats):

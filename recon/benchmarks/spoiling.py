@@ -1,4 +1,4 @@
-"""Ways to spoil a good tilt series. Each is one function; what a verdict may rightly name as the reason stands beside it."""
+"""Defects for tilt series, one function each, with the reasons that a verdict may correctly name."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _shifts_y(source: Source) -> TiltSeries:
 
 @way("drift of the specimen", "alignment", "specimen")
 def _specimen_drift(source: Source) -> Spoilt:
-    """Nearly the images of an object that lies elsewhere along the beam, by which a right volume is moved."""
+    """Nearly identical to images of an object shifted along the beam; a correct volume is shifted accordingly."""
     drift, sine = np.linspace(-6, 6, source.series.num_tilts), np.sin(np.deg2rad(source.series.tilt_angles))
     place = float((drift * sine).sum() / (sine**2).sum())
     return Spoilt(moved_across(source, drift), truth=np.asarray(ndimage.shift(source.truth, (place, 0, 0), order=1)))
@@ -82,7 +82,7 @@ def _jump(source: Source) -> TiltSeries:
 
 @way("angles in reversed order")
 def _reversed(source: Source) -> Spoilt:
-    """The images of a mirrored and slightly turned object: right but for the handedness, which no image tells."""
+    """Images of a mirrored and slightly rotated object: correct except for the handedness, which images do not determine."""
     angles = source.series.tilt_angles[::-1].copy()
     offset = angles[0] + source.series.tilt_angles[0]
     mirrored = source.truth[::-1]
@@ -91,7 +91,7 @@ def _reversed(source: Source) -> Spoilt:
 
 @way("angles offset by 10°")
 def _offset(source: Source) -> Spoilt:
-    """The images of a turned object, right but for the orientation, which no image tells."""
+    """Images of a rotated object: correct except for the orientation, which images do not determine."""
     return Spoilt(with_angles(source, source.series.tilt_angles + 10), truth=turned_volume(source.truth, 10))
 
 

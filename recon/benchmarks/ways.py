@@ -1,4 +1,4 @@
-"""What a way to spoil a good tilt series is given and gives back, the list of them, and what several of them do."""
+"""Registry of defects for tilt series, their input and output, and shared operations."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Source:
-    """What a way of spoiling may use.
+    """Input of a defect function.
 
     Attributes:
         truth: (z, y, x) attenuation.
-        series: clean images of it, or noisy ones for what the detector does.
-        other: (z, y, x) another object of the same kind.
-        intensity: of the beam (transmission), detector units.
+        series: clean images of it, or noisy ones for defects of the detector.
+        other: (z, y, x) another object of the same type.
+        intensity: incident intensity (transmission), detector units.
         generator: source of random choices.
     """
 
@@ -55,12 +55,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Spoilt:
-    """A spoilt series.
+    """A series with a defect.
 
     Attributes:
         series: the images.
-        thickness: of the volume, voxels; None for as deep as wide.
-        truth: what a right reconstruction would show, where the images cannot tell it from the unspoilt; None otherwise.
+        thickness: thickness of the volume, voxels; None if it equals the width.
+        truth: the expected reconstruction, if the images are consistent with a different object; None otherwise.
     """
 
     series: TiltSeries
@@ -70,12 +70,12 @@ class Spoilt:
 
 @dataclass(frozen=True)
 class Way:
-    """One way to spoil a series.
+    """One defect.
 
     Attributes:
-        spoil: does it.
-        reasons: subjects of findings that name it truly; ``geometry`` names angles, axis and magnification as alternatives.
-        late: whether it happens in the detector, after the noise.
+        spoil: function that applies it.
+        reasons: subjects of findings that name it correctly; ``geometry`` stands for angles, axis or magnification.
+        late: whether it is applied in the detector, after the noise.
     """
 
     spoil: Callable[[Source], Spoilt | TiltSeries]
@@ -84,11 +84,11 @@ class Way:
 
 
 WAYS: dict[str, Way] = {}
-"""Ways by name."""
+"""Defects by name."""
 
 
 def way(name: str, *reasons: str, late: bool = False) -> Callable[[Any], Any]:
-    """Make a function a way to spoil a series."""
+    """Register a function as a defect."""
 
     def register(function: Callable[[Source], Spoilt | TiltSeries]) -> Callable[[Source], Spoilt | TiltSeries]:
         WAYS[name] = Way(function, reasons, late)
@@ -98,12 +98,12 @@ def way(name: str, *reasons: str, late: bool = False) -> Callable[[Any], Any]:
 
 
 def with_images(source: Source, images: Array) -> TiltSeries:
-    """The series with other images, of its own number type."""
+    """The series with other images, in its own data type."""
     return replace(source.series, images=np.ascontiguousarray(images).astype(source.series.images.dtype))
 
 
 def moved(source: Source, shifts: Array) -> TiltSeries:
-    """Images moved by (tilt, (y, u)) pixels; vacuum comes in from outside."""
+    """Images shifted by (tilt, (y, u)) pixels, filled with vacuum."""
     images = [
         ndimage.shift(image, shift, order=1, cval=source.empty)
         for image, shift in zip(source.series.images, shifts, strict=True)
@@ -112,7 +112,7 @@ def moved(source: Source, shifts: Array) -> TiltSeries:
 
 
 def turned(source: Source, degrees: float) -> TiltSeries:
-    """Images turned in their plane; vacuum comes in from outside."""
+    """Images rotated in their plane, filled with vacuum."""
     images = [
         ndimage.rotate(image, degrees, reshape=False, order=1, cval=source.empty) for image in source.series.images
     ]
@@ -120,7 +120,7 @@ def turned(source: Source, degrees: float) -> TiltSeries:
 
 
 def scaled_about_middle(source: Source, image: Array, factors: tuple[float, float]) -> Array:
-    """An image magnified by (y, u) factors about its middle."""
+    """An image magnified by (y, u) factors about its centre."""
     middle = (np.array(image.shape) - 1) / 2
     matrix = 1 / np.array(factors)
     offset = middle - matrix * middle
@@ -128,7 +128,7 @@ def scaled_about_middle(source: Source, image: Array, factors: tuple[float, floa
 
 
 def moved_across(source: Source, shifts: Array) -> TiltSeries:
-    """Images moved by (tilt,) pixels along u."""
+    """Images shifted by (tilt,) pixels along u."""
     return moved(source, np.stack([np.zeros(len(shifts)), shifts], 1))
 
 
@@ -138,14 +138,14 @@ def with_angles(source: Source, angles: Array) -> TiltSeries:
 
 
 def later(source: Source, volume: Array) -> TiltSeries:
-    """From the middle of the series on, images of another volume."""
+    """Images of another volume in the second half of the series."""
     images, half = source.series.images.copy(), source.series.num_tilts // 2
     images[half:] = source.images(volume, source.series.tilt_angles[half:])
     return with_images(source, images)
 
 
 def turned_volume(volume: Array, degrees: float) -> Array:
-    """A volume turned about the tilt axis so that its images at θ + `degrees` are those of the volume at θ."""
+    """A volume rotated about the tilt axis, so that its images at θ + `degrees` are those of the original at θ."""
     theta, size = np.deg2rad(degrees), (np.array(volume.shape)[[0, 2]] - 1) / 2
     matrix = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     slices = [

@@ -1,1 +1,1 @@
-"""The commands of this package, one file each. Nothing heavy is imported before a command runs."""
+"""The commands of this package, one file each. Large packages are imported only when a command runs."""

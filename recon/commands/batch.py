@@ -58,14 +58,14 @@ def batch(
     words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
     jobs, skipped = jobs_of(source, out, words), left_out(source)
     if skipped:
-        output.line(f"left out, without tilt angles beside them or in them: {', '.join(skipped)}")
+        output.line(f"skipped, because no tilt angles were found in or next to them: {', '.join(skipped)}")
     with io.output_folder(out), io.locked(table):
         rows = [row for row in read_table(table) if row["status"] == "done"] if resume else []
         known = {row["volume"] for row in rows if Path(row["volume"]).exists()}
         rows = [row for row in rows if row["volume"] in known]
         left = [job for job in jobs if str(job.out) not in known]
         if known:
-            output.line(f"{len(known)} of {len(jobs)} series are done already")
+            output.line(f"{len(known)} of {len(jobs)} series are already done")
         with (
             client_of(None, scheduler) as client,
             progress_bar("series", max(1, len(left)), json_mode=json) as progress,
@@ -78,15 +78,15 @@ def batch(
                     output.line(_in_words(row))
             except KeyboardInterrupt:
                 done = sum(row["status"] == "done" for row in rows)
-                raise KeyboardInterrupt(
-                    f"{done} of {len(jobs)} series are done; --resume goes on with the others"
-                ) from None
+                raise KeyboardInterrupt(f"{done} of {len(jobs)} series are done; continue with --resume") from None
         write_table(table, rows := _in_order(rows, jobs))
     failed = [row for row in rows if row["status"] != "done"]
     output.line(f"{len(rows) - len(failed)} of {len(jobs)} series reconstructed; table: {table}")
     output.result({"table": table, "series": rows, "left_out": skipped})
     if failed:
-        raise ValueError(f"{len(failed)} of {len(jobs)} series failed; {table} says why, and --resume tries them again")
+        raise ValueError(
+            f"{len(failed)} of {len(jobs)} series failed; {table} gives the reasons, and --resume tries them again"
+        )
 
 
 def _shared_words(options: str, noise_model: Path | None, *, resume: bool, overwrite: bool) -> list[str]:

@@ -56,7 +56,7 @@ def benchmark(
     _check_scene(size, noise, phantom)
     _check_method(method, names)
     if in_turn and (names != ["sabotage"] or quick):
-        raise ValueError("--in-turn belongs to the benchmark sabotage without --quick")
+        raise ValueError("--in-turn is only for the benchmark sabotage without --quick")
     out.mkdir(parents=True, exist_ok=True)
     effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
@@ -67,7 +67,7 @@ def benchmark(
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})
     except KeyboardInterrupt:
-        kept = f"what is finished is kept in {out}; the same command goes on from there"
+        kept = f"finished results are kept in {out}; run the same command to resume"
         raise KeyboardInterrupt(kept) from None
 
 
@@ -77,7 +77,7 @@ def _check_method(method: str | None, names: list[str]) -> None:
     if method is None:
         return
     if names != ["sabotage"]:
-        raise ValueError("--method belongs to the benchmark sabotage; the others run every method")
+        raise ValueError("--method is only for the benchmark sabotage; the others run every method")
     if method not in method_names():
         raise ValueError(f"--method {method}: choose from {', '.join(method_names())}")
 

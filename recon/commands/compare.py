@@ -13,7 +13,7 @@ from recon.commands.options import parse_mode
 
 
 def compare(
-    volume: Annotated[Path, typer.Argument(help="Volume to judge, from any program: .mrc, .rec, .tif or .npy.")],
+    volume: Annotated[Path, typer.Argument(help="Volume to evaluate, from any program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
     angles: Annotated[
         Path | None, typer.Option(help="Angle file; projections at these angles are also compared.")
@@ -49,7 +49,7 @@ def compare(
         output.line(f"Fourier shell correlation {reach}")
     if comparison.expected is not None:
         reach = comparison.expected.in_words(second.voxel_size)
-        output.line(f"its error bars expect 0.5 to be reached at {reach}")
+        output.line(f"resolution at 0.5 expected from its error bars: {reach}")
     page = None
     if report is not None:
         pictures = comparison_report(

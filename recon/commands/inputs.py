@@ -1,4 +1,4 @@
-"""The tilt series that `noiseflow reconstruct` was given, read as its options say."""
+"""Reading of the tilt series of `noiseflow reconstruct` according to its options."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def load_tilt_series(
     mask_nan: bool,
     mapped: bool = False,
 ) -> TiltSeries:
-    """Read the series as the options of the command say.
+    """Read a tilt series according to the options of the command.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_tilt_series`, or a mask that does not match.
+        FileNotFoundError, ValueError: as `read_tilt_series`, or the mask does not match.
     """
     series = read_tilt_series(
         path,
@@ -52,7 +52,7 @@ def load_tilt_series(
 
 
 def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[Path]:
-    """The stack, its angle file, given or found beside it, and the other files that were given."""
+    """The stack, its angle file (given or found next to it), and the other given files."""
     return [path for path in (tilts, angles or io.angle_file_of(tilts), *others) if path is not None]
 
 
@@ -66,7 +66,7 @@ def prepare(
     output: Output,
     report: StepReport | None = None,
 ) -> Prepared:
-    """`recon.prepare` for the command line: the alignment found is printed. Raises as `recon.prepare`."""
+    """As `recon.prepare`, and print the alignment that was found."""
     prepared = prepare_series(
         tilt_series,
         tilt_axis=tilt_axis,

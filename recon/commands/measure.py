@@ -43,7 +43,7 @@ def measure(
     part = parse_region(region, values.shape)
     if not np.isfinite(values[part]).all():
         raise ValueError(
-            f"{volume} has NaN or infinite voxels in the region {region}; choose another one with --region"
+            f"{volume} has NaN or infinite voxels in the region {region}; choose another region with --region"
         )
     profile = None if line is None else line_profile(values, *_ends(line), bars, level=level)
     mean = mean_of_region(values, part, bars, level=level)
@@ -73,7 +73,7 @@ def measure(
         output.table(names, [tuple(f"{value:.4g}" for value in row) for row in zip(*columns, strict=True)])
         along_line = dict(zip(names, columns, strict=True))
     if bars is None:
-        output.line(f"no error bars beside {volume}: noiseflow reconstruct --uncertainty 16 writes them")
+        output.line(f"no error bars next to {volume}: noiseflow reconstruct --uncertainty 16 writes them")
     output.result(
         {"volume": volume, "region": region, "level": level, **result}
         | {"line": along_line, "error_bars": bars is not None}
@@ -81,11 +81,11 @@ def measure(
 
 
 def _read(path: Path) -> Volume:
-    """A volume.
+    """Read a volume.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or is no volume.
+        FileNotFoundError: the file does not exist.
+        ValueError: it cannot be read, or is not a volume.
     """
     from noiseflow import io
     from recon.series.tilt_series import Volume
@@ -97,10 +97,10 @@ def _read(path: Path) -> Volume:
 
 
 def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
-    """The error bars beside the file of a volume; None where there are none.
+    """Read the error bars next to the file of a volume; None if there are none.
 
     Raises:
-        ValueError: one of the two files is missing, or has another shape.
+        ValueError: one of the two files is missing, or its shape differs from the volume.
     """
     from recon.uncertainty.result import Uncertainty, error_bar_paths
 
@@ -110,21 +110,23 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
         return None
     if not all(there):
         missing = next(each for each in paths.values() if not each.exists())
-        raise ValueError(f"{missing} is missing: error bars are two files; write them again, or remove the other")
+        raise ValueError(
+            f"{missing} is missing: error bars consist of two files; write them again, or remove the other file"
+        )
     std, bias = (_read(each) for each in paths.values())
     for each, where in zip((std, bias), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
             raise ValueError(
-                f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}: of another volume"
+                f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}; they do not match"
             )
     return Uncertainty(std, bias, 0, read_shell_band(path))
 
 
 def read_shell_band(path: Path) -> ShellBand | None:
-    """The expected shell correlation beside the file of a volume; None where noiseflow has written none.
+    """Read the expected shell correlation next to the file of a volume; None if noiseflow has written none.
 
     Raises:
-        ValueError: its table was changed.
+        ValueError: its table was modified.
     """
     from noiseflow.io.ownership import is_own
     from recon.uncertainty.result import shell_band_path

@@ -1,4 +1,4 @@
-"""What the commands of this package read from their options alike."""
+"""Parsing of options that the commands of this package share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def parse_mode(text: str) -> Mode:
     """The mode of image formation that `--mode` names.
 
     Raises:
-        ValueError: another word.
+        ValueError: the mode is unknown.
     """
     if text not in ("transmission", "linear"):
         raise ValueError(f"--mode {text}: choose transmission (bright field) or linear (HAADF, EDX)")
@@ -26,7 +26,7 @@ def method_of(method: str, preset: str | None) -> str:
     """The method that `--method` or `--preset` names.
 
     Raises:
-        ValueError: no preset of that name, or a method beside it.
+        ValueError: the preset is unknown, or `--method` is given too.
     """
     if preset is None:
         return method
@@ -35,7 +35,7 @@ def method_of(method: str, preset: str | None) -> str:
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: choose {' or '.join(PRESETS)}")
     if method not in ("auto", preset):
-        raise ValueError(f"--preset {preset} is a method of its own; leave --method {method} out")
+        raise ValueError(f"--preset {preset} is itself a method; remove --method {method}")
     return preset
 
 

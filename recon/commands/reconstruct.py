@@ -50,7 +50,7 @@ def reconstruct(
     angles: Annotated[
         Path | None,
         typer.Option(
-            help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file beside the stack, or the stack itself."
+            help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
     ] = None,
     transforms: Annotated[Path | None, typer.Option(help="Alignment of IMOD (.xf) to apply to the stack.")] = None,
@@ -79,7 +79,7 @@ def reconstruct(
         int,
         typer.Option(
             min=0,
-            help="Write error bars, VOLUME_std and VOLUME_bias, from this number of samples of the posterior; 16 are usual.",
+            help="Write error bars, VOLUME_std and VOLUME_bias, from this number of posterior samples (typically 16).",
         ),
     ] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Number of steps of the fit, or of iterations.")] = None,
@@ -104,12 +104,12 @@ def reconstruct(
     ] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
     invert_contrast: Annotated[
-        bool, typer.Option("--invert-contrast", help="Swap bright and dark before anything else.")
+        bool, typer.Option("--invert-contrast", help="Invert the contrast of the images before all other steps.")
     ] = False,
     mask: Annotated[
-        Path | None, typer.Option(help="Image or stack that is 0 at the pixels to leave out of the fit.")
+        Path | None, typer.Option(help="Image or stack that is 0 at pixels to exclude from the fit.")
     ] = None,
-    mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Leave out NaN and infinite pixels.")] = False,
+    mask_nan: Annotated[bool, typer.Option("--mask-nan", help="Exclude NaN and infinite pixels.")] = False,
     refine_alignment: Annotated[
         bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
     ] = False,
@@ -120,12 +120,14 @@ def reconstruct(
             "--refine-alignment, a rough value."
         ),
     ] = None,
-    keep_tilts: Annotated[bool, typer.Option("--keep-tilts", help="Keep tilts that do not fit the others.")] = False,
+    keep_tilts: Annotated[
+        bool, typer.Option("--keep-tilts", help="Keep tilts that are inconsistent with the others.")
+    ] = False,
     defocus: Annotated[
         float,
         typer.Option(
-            help="Blur by depth that fitted methods model: pixels per voxel out of the plane of focus, such as 0.02; ignored "
-            "below a quarter of a pixel."
+            help="Depth-dependent blur in the model of fitted methods: pixels per voxel out of the focal plane, such as 0.02; "
+            "ignored below a quarter of a pixel."
         ),
     ] = 0.0,
     slices_at_once: Annotated[
@@ -148,7 +150,7 @@ def reconstruct(
         ),
     ] = False,
     reference: Annotated[
-        Path | None, typer.Option(help="Volume to correlate the result with in the report, if --fsc is not given.")
+        Path | None, typer.Option(help="Volume for the Fourier shell correlation in the report, if --fsc is not given.")
     ] = None,
     dry_run: Annotated[
         bool,
@@ -188,13 +190,13 @@ def reconstruct(
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
     settings_of(**options)
     if workers is not None and scheduler is not None:
-        raise ValueError("--scheduler has workers of its own; leave out --workers")
+        raise ValueError("--scheduler provides the workers; remove --workers")
     if workers is not None or scheduler is not None:
         require_blocks(method, "--workers" if scheduler is None else "--scheduler")
     if fsc and report is None:
-        raise ValueError("--fsc adds to the report: name its folder with --report")
+        raise ValueError("--fsc needs a report; name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
-        raise ValueError(f"--save-noise-model: method {method} learns no noise model; use --method joint")
+        raise ValueError(f"--save-noise-model: method {method} does not fit a noise model; use --method joint")
     with locked(out), warnings_as_lines(output) as warned:
         fixed = load_noise_model(noise_model)
         tilt_series = load_tilt_series(
@@ -257,13 +259,13 @@ def reconstruct(
             )
         journal.discard()
     if strict and verdict.grade == "bad":
-        raise ValueError(f"--strict: the verdict is bad, though {out} is written. {verdict.reasons[0]}")
+        raise ValueError(f"--strict: the verdict is bad ({out} is written). {verdict.reasons[0]}")
 
 
 def _solve(
     tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
 ) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
-    """The reconstruction, and those of the even and of the odd tilts where they are asked for."""
+    """The reconstruction, and those of the even and the odd tilts if requested."""
     from recon.methods import reconstruct
     from recon.report.page import even_odd
 
@@ -292,7 +294,7 @@ def _show_plan(
     needed: dict[str, str],
     output: Output,
 ) -> None:
-    """What would be done, in words and for programs."""
+    """Print the plan, and its JSON form."""
     from dataclasses import asdict
 
     from recon.joint.plan import describe
@@ -304,7 +306,7 @@ def _show_plan(
     result: dict[str, Any] = {"method": method.name, **needed, "slices_at_once": slices_at_once}
     result |= {"stages": [], "expected_seconds": None}
     if method.plan is None:
-        output.line(f"{method.name}: {method.description} It has no stages to plan.")
+        output.line(f"{method.name}: {method.description} This method has no plan of stages.")
     else:
         made = {name: value for name, value in options.items() if name != "method"}
         stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
@@ -320,7 +322,7 @@ def _show_plan(
 def _settings(
     tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], noise_model: Path | None
 ) -> dict[str, Any]:
-    """All that decides the volume, with digests in place of the data."""
+    """All settings that determine the volume, with digests of the data."""
     import numpy as np
 
     digest = hashlib.blake2b(digest_size=16)

@@ -1,4 +1,4 @@
-"""What `noiseflow reconstruct` writes and tells."""
+"""Outputs of `noiseflow reconstruct`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from recon.verdict.verdict import Verdict
 
 @dataclass(frozen=True)
 class Targets:
-    """Where results go, checked before the long work.
+    """Output files, checked before the computation.
 
     Attributes:
-        volume: the volume's file.
+        volume: file of the volume.
         report: folder of the HTML report, or None.
         noise_model: file for the learnt noise model, or None.
         overwrite: replace existing files even if this program did not write them.
-        error_bars: whether their files, beside the volume's, are written.
+        error_bars: whether error bars are written next to the volume.
 
     Raises:
         ValueError, OSError: as `noiseflow.io.check_output` and `noiseflow.io.check_folder`.
@@ -74,8 +74,8 @@ class Targets:
         warned: Sequence[str] = (),
         filled: Path | None = None,
     ) -> Verdict:
-        """Write what was asked for, report what was found, and return the verdict. A volume that is `filled` already, in a file
-        beside its target and of the same kind, is put in its place."""
+        """Write the requested files, print the results, and return the verdict. A volume that is already `filled`, in a
+        file of the same format next to its target, is renamed to it."""
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
         if filled is not None and filled.suffix == self.volume.suffix:
@@ -127,21 +127,23 @@ class Targets:
         return verdict
 
     def _remove_former(self, written: dict[str, Path], output: Output) -> None:
-        """Error bars of a volume that is no longer there would be read as those of the new one."""
+        """Remove error bars of the previous volume, which would be read as those of the new one."""
         pair, band = error_bar_paths(self.volume), shell_band_path(self.volume)
-        whole = all(path.exists() for path in pair.values())  # one of the two alone is another volume of such a name
+        whole = all(
+            path.exists() for path in pair.values()
+        )  # a single one of the two files is an unrelated volume of that name
         beside = (pair if whole else {}) | {"fsc": band}
         for path in (path for name, path in beside.items() if name not in written and path.exists()):
             if not is_own(path):
-                output.line(f"{path} was not written by noiseflow: it does not belong to the new volume")
+                output.line(f"{path} was not written by noiseflow and does not belong to the new volume")
                 continue
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-            output.line(f"removed: {path}, of the volume that was there before")
+            output.line(f"removed: {path}, which belonged to the previous volume")
 
 
 def _save_noise_model(outcome: Reconstruction, path: Path, source: Path) -> None:
     if outcome.noise_model is None:
-        raise ValueError(f"--save-noise-model: method {outcome.method} learns no noise model; use --method joint")
+        raise ValueError(f"--save-noise-model: method {outcome.method} does not fit a noise model; use --method joint")
     noiseflow.save(outcome.noise_model, path, provenance={"tilt_series": source.name, "method": outcome.method})
 
 
@@ -162,7 +164,7 @@ def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -
 
 
 def _residual_rms(tilt_series: TiltSeries, projections: NDArray[np.float32]) -> float:
-    """Image by image: a series may be larger than memory."""
+    """RMS of the residuals, computed image by image because a series may be larger than memory."""
     total, count = 0.0, 0
     for number, (image, predicted) in enumerate(zip(tilt_series.images, projections, strict=True)):
         residual = image.astype(np.float32) - predicted

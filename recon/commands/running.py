@@ -1,4 +1,4 @@
-"""Long work that can be stopped: Ctrl-C, the command that goes on, and warnings as plain lines."""
+"""Interruptible runs: Ctrl-C, the command that resumes, and warnings as plain lines."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class StopSignal:
-    """Within the ``with`` block, Ctrl-C or SIGTERM stops a journal's run: once after the running step, twice at once.
+    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately.
 
     Args:
-        journal: whose fits are running.
+        journal: the journal of the run.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -55,36 +55,34 @@ class StopSignal:
             raise KeyboardInterrupt
         journal.stop_requested = True
         with contextlib.suppress(OSError, ValueError, AttributeError):
-            # past the buffer, which a line that was stopped may be writing to
-            os.write(sys.stderr.fileno(), b"noiseflow: finishing this step; Ctrl-C again stops at once\n")
+            # bypasses the buffer, which the interrupted code may be writing to
+            os.write(sys.stderr.fileno(), b"noiseflow: finishing this step; press Ctrl-C again to stop immediately\n")
 
 
 @contextlib.contextmanager
 def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
-    """Run fits that can be stopped, alone on their journal; says how to go on, and ends with exit code 130.
+    """Run interruptible fits with a lock on their journal. An interrupted run prints how to resume and exits with code 130.
 
     Raises:
-        SystemExit: the run was stopped.
+        SystemExit: the run was interrupted.
         BlockingIOError: another run holds the journal.
-        OSError: the disk is full or gone; the error says how to go on where there is a state.
+        OSError: the disk is full or not available; the message says how to resume if there is a saved state.
     """
-    try:  # around the signals too: the second Ctrl-C may come while they are handed back
+    try:  # also covers the signal handlers: a second Ctrl-C may arrive while they are restored
         with locked(journal.folder.with_suffix("")), StopSignal(journal):
             try:
                 yield
             except OSError as error:
                 if journal.resumed and journal.exists:
-                    error.add_note(
-                        f"the last state is kept: when that is mended, go on with: {resume_command(context)}"
-                    )
+                    error.add_note(f"the last state is kept: after fixing this, resume with: {resume_command(context)}")
                 raise
     except KeyboardInterrupt as stop:
-        advice = f"go on with: {resume_command(context)}" if journal.resumed else START_AGAIN
-        end_stopped(f"{str(stop) or ('stopped at once' if journal.abandoned else 'stopped')}; {advice}")
+        advice = f"resume with: {resume_command(context)}" if journal.resumed else START_AGAIN
+        end_stopped(f"{str(stop) or ('stopped immediately' if journal.abandoned else 'stopped')}; {advice}")
 
 
 def resume_command(context: typer.Context) -> str:
-    """The command line that goes on with the present command."""
+    """The command line that resumes the current command."""
     words = ["noiseflow", context.command.name or ""]
     for parameter in context.command.params:
         value, name = context.params.get(parameter.name or ""), max(parameter.opts, key=len)
@@ -99,7 +97,7 @@ def resume_command(context: typer.Context) -> str:
 
 @contextlib.contextmanager
 def warnings_as_lines(output: Output) -> Iterator[list[str]]:
-    """Show each warning once, as one line; yields the list that collects them."""
+    """Show each warning once, as one line; yield the list that collects them."""
     told: list[str] = []
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
@@ -122,10 +120,10 @@ def memory_line(
     slices_at_once: int | None = None,
     workers: int = 1,
 ) -> str:
-    """One line about the memory needed and available.
+    """One line about required and available memory.
 
     Raises:
-        MemoryError: it does not fit.
+        MemoryError: the memory does not suffice.
     """
     from noiseflow.io.mapped import is_mapped
     from recon.scale.blocks import block_memory
@@ -142,36 +140,37 @@ def memory_line(
 def chosen_slices(
     journal: Journal, tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None
 ) -> int | None:
-    """Slices of a block, where the whole volume is large, does not fit into memory, or workers share it; else None. A run that
-    resumes keeps its blocks, however much memory is free by now: with others, none of them would be finished.
+    """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None.
+
+    A resumed run keeps its blocks, whatever memory is free now, because finished blocks of another size cannot be used.
 
     Raises:
-        MemoryError: not even a few slices fit.
-        ValueError: workers are to share a volume whose fit was begun in one piece.
+        MemoryError: even a few slices do not fit.
+        ValueError: workers are requested for a run that started with the whole volume in one piece.
     """
     found: int | None = journal.choose(
         "slices at once", lambda: _slices_for(tilt_series, grid, method, device, workers)
     )
     if found is None and journal.resumed and (workers or 1) > 1:
         raise ValueError(
-            "the checkpoint is of a run that reconstructs the whole volume in one piece, which workers cannot share; leave out "
-            f"--workers and --scheduler, or leave out --resume to start over ({journal.folder})"
+            "the checkpoint is of a run that reconstructs the whole volume in one piece, which workers cannot share; remove "
+            f"--workers and --scheduler, or remove --resume to start over ({journal.folder})"
         )
     return found
 
 
 def require_blocks(method: str, option: str) -> None:
-    """Refuse an option that shares the blocks of a volume, where a method makes none.
+    """Check that a method reconstructs in blocks, as an option requires.
 
     Raises:
-        ValueError: it makes none.
+        ValueError: it does not.
     """
     from recon.methods import find_method, method_names
 
     if find_method(method).blockwise is None:
         able = [name for name in method_names() if find_method(name).blockwise is not None]
         raise ValueError(
-            f"{option}: method {method} reconstructs no blocks to share; use --method {', '.join(able)}, or leave out {option}"
+            f"{option}: method {method} does not reconstruct in blocks; use --method {', '.join(able)}, or remove {option}"
         )
 
 
@@ -184,7 +183,7 @@ def _slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: 
         return None
     if available is None:
         return None if workers is None else -(-grid.height // workers)
-    plenty = PLENTY if str(device).startswith("cpu") else available  # blocks on a GPU are not measured
+    plenty = PLENTY if str(device).startswith("cpu") else available  # block sizes were not tuned on GPUs
     return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1, plenty=plenty)
 
 
@@ -196,8 +195,8 @@ def disk_line(
     error_bars: bool = False,
     halves: bool = False,
 ) -> str:
-    """One line about the blocks and the room on the disk that they take until the volume is whole; with `halves`, those of the
-    even and of the odd tilts, too."""
+    """One line about the blocks and the disk space that they take until the volume is complete; with `halves`, including
+    those of the even and the odd tilts."""
     from recon.scale.blocks import HALO, blocks
 
     if slices_at_once is None:
@@ -209,19 +208,19 @@ def disk_line(
     num_bytes = 4 * volumes * (listed + 2 * grid.height) * grid.depth * grid.width
     num_images = tilt_series.num_tilts * (2 if halves else 1)
     num_bytes += 4 * num_images * tilt_series.images.shape[2] * (listed + grid.height)
-    return f"blocks: {len(parts)} of {slices_at_once} slices at most; disk: about {num_bytes / 2**30:.1f} GiB meanwhile"
+    return f"blocks: {len(parts)} of at most {slices_at_once} slices; disk: about {num_bytes / 2**30:.1f} GiB during the run"
 
 
 @contextlib.contextmanager
 def scratch_beside(out: Path) -> Iterator[Path]:
-    """A name for a volume beside `out`, gone at the end if it did not take its place; what a killed run left is cleared by the
-    next one."""
+    """Yield the name of a temporary volume next to `out`, which is removed at the end unless it was renamed to `out`. The next
+    run removes leftovers of a killed run."""
     with partial_folder(out) as folder:
         yield folder / f"blocks{out.suffix if is_filled_by_parts(out) else '.npy'}"
 
 
 def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
-    """The journal of the run that makes `out`, beside it. Raises as `Journal`."""
+    """Open the journal of a run next to its output `out`. Raises as `Journal`."""
     from recon.joint.checkpoint import Journal
 
     folder = out.with_name(f"{out.name}.checkpoint")

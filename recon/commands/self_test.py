@@ -1,10 +1,10 @@
-"""A quick check that projecting and reconstructing work on this machine; `noiseflow doctor` runs it."""
+"""A quick self-test of projection and reconstruction for `noiseflow doctor`."""
 
 from __future__ import annotations
 
 
 def check_projection() -> str | None:
-    """Project a small ball, hold the adjoint against it and reconstruct it; returns the problem, or None."""
+    """Project a small ball, check the adjoint, and reconstruct the ball. Return the problem, or None."""
     import numpy as np
     import torch
 
@@ -22,4 +22,4 @@ def check_projection() -> str | None:
     if abs(forward - back) > 1e-4 * abs(forward):
         return f"the projector and its adjoint disagree: {forward:.6g} and {back:.6g}"
     error = float((sirt(projections, projector, num_iterations=20) - ball).square().mean() / ball.square().mean())
-    return None if error < 0.3 else f"a ball comes back with a relative error of {error:.2f}"
+    return None if error < 0.3 else f"the reconstruction of a ball has a relative error of {error:.2f}"

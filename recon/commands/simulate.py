@@ -23,7 +23,7 @@ def simulate(
         Path,
         typer.Argument(help="Folder to write tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc to."),
     ],
-    size: Annotated[int, typer.Option(help="Voxels along each edge, up to 1000 and beyond.")] = 64,
+    size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
     tilts: Annotated[
         str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")
     ] = "-59.5:57.5:1.5",
@@ -111,7 +111,7 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
 
 
 def _brightest_known(noise_model: nn.Module | None) -> float:
-    """The highest signal that a model was fitted on: the brightest pixels shall have noise that it knows; 1 if not known."""
+    """The highest signal that a model was fitted on, so that the brightest pixels are in its range; 1 if not known."""
     known = [getattr(module, "signal_high", None) for module in noise_model.modules()] if noise_model else []
     highest = max((float(value) for value in known if value is not None), default=1.0)
     return highest if highest > 0 else 1.0
@@ -121,7 +121,7 @@ def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:
     from noiseflow import Digitised
 
     if noise_model is None:
-        raise ValueError("--clip clips noisy pixel values; choose a --noise, too")
+        raise ValueError("--clip clips noisy pixel values; choose noise with --noise, too")
     if isinstance(noise_model, Digitised):
-        raise ValueError("--clip: this noise model has clipping limits of its own; leave --clip out")
+        raise ValueError("--clip: this noise model already has clipping limits; remove --clip")
     return Digitised(noise_model, step=0.0, low=0.0, high=high)

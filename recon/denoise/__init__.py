@@ -1,1 +1,1 @@
-"""Denoisers of single images, and the variance stabilisation they work in."""
+"""Denoisers of single images, and variance stabilisation."""

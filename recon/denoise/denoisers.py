@@ -1,4 +1,4 @@
-"""Denoisers of single images behind one callable, image to image; the methods that clean first and reconstruct then."""
+"""Denoisers of single images as functions from image to image, for methods that denoise before reconstruction."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def total_variation(image: Array, strength: float) -> Array:
 
 
 def wavelet(image: Array, strength: float) -> Array:
-    """BayesShrink soft thresholding of wavelets (doi:10.1109/83.862633), averaged over shifts, at noise `strength`."""
+    """BayesShrink wavelet soft thresholding (doi:10.1109/83.862633), averaged over shifts, for noise of `strength`."""
     from skimage.restoration import cycle_spin, denoise_wavelet
 
     options = {"sigma": strength, "method": "BayesShrink", "mode": "soft", "wavelet": "db2"}
@@ -46,7 +46,7 @@ def wavelet(image: Array, strength: float) -> Array:
 def wiener(image: Array, strength: float) -> Array:
     """Wiener–Kolmogorov filter of an image with white noise of standard deviation `strength`.
 
-    The signal's power is the radially averaged periodogram of the mirrored image less the noise's, never below zero.
+    The signal power is the radially averaged periodogram of the mirrored image minus that of the noise, clipped at zero.
     """
     mean = image.mean()
     mirrored = np.pad(image - mean, [(0, size) for size in image.shape], mode="symmetric")
@@ -61,7 +61,7 @@ def wiener(image: Array, strength: float) -> Array:
 
 
 def bm3d(image: Array, strength: float) -> Array:
-    """BM3D (doi:10.1109/TIP.2007.901238) at noise `strength`, from the package `bm3d`, licensed for non-commercial use only."""
+    """BM3D (doi:10.1109/TIP.2007.901238) for noise of `strength`, from the package `bm3d` (non-commercial licence)."""
     try:
         import bm3d as package
     except ModuleNotFoundError:
@@ -78,24 +78,23 @@ DENOISERS: dict[str, Callable[[Array, float], Array]] = {
     "wiener": wiener,
     "bm3d": bm3d,
 }
-"""Denoisers by name: functions of an image (y, x) whose noise has unit standard deviation, and of a strength near 1."""
+"""Denoisers by name: functions of an image (y, x) with noise of unit standard deviation, and of a strength near 1."""
 
 
 def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = None) -> Denoiser:
-    """A denoiser for the images of one series: a callable from image (y, x) to image.
+    """Return a denoiser for the images of one series: a function from image (y, x) to image.
 
-    The images' noise is first stabilised to unit strength, by the noise model where one is fitted and by an estimated line of
-    variance against signal else; the result comes back by the exact unbiased inverse. The strength is chosen by
-    self-supervision (J-invariance, arXiv:1901.11365) on the middle image.
+    The noise is first stabilised to unit standard deviation, by the noise model if one is given, otherwise by an estimated line
+    of variance against signal; the exact unbiased inverse is applied to the result. The strength is chosen by self-supervision
+    (J-invariance, arXiv:1901.11365) on the middle image.
 
     Args:
-        name: one of `DENOISERS`, or a function of your own as ``package.module:function``, which is given the images as they
-            are and does all by itself.
+        name: one of `DENOISERS`, or your own function as ``package.module:function``, which receives the original images.
         images: (image, y, x) noisy pixel values, detector units.
-        noise_model: fitted to such images.
+        noise_model: noise model fitted to such images.
 
     Raises:
-        ValueError: an unknown name, or a package that is not installed.
+        ValueError: the name is unknown, or its package is not installed.
     """
     if ":" in name:
         return _of_user(name)
@@ -114,7 +113,7 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
 
 
 def best_strength(function: Callable[[Array, float], Array], image: Array) -> float:
-    """The strength whose J-invariant result is nearest to the noisy image: it predicts each pixel from the others only."""
+    """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the noisy image."""
     from skimage.restoration import denoise_invariant
 
     rows, columns = (slice(max(0, (n - _CALIBRATION_SIZE) // 2), (n + _CALIBRATION_SIZE) // 2) for n in image.shape)
@@ -137,12 +136,12 @@ def _of_user(name: str) -> Denoiser:
     def denoise(image: Array) -> Array:
         try:
             result = np.asarray(function(image), dtype=np.float64)
-        except Exception as error:  # whatever another's code raises
+        except Exception as error:  # user code may raise anything
             problem = f"it failed on an image of shape {image.shape} with {type(error).__name__} ({error})"
             raise ValueError(f"denoiser {name}: {problem}; it must take an image and return one") from error
         if result.shape != image.shape or not np.isfinite(result).all():
             raise ValueError(
-                f"denoiser {name}: it must return a finite image of shape {image.shape}; it gave {result.shape}"
+                f"denoiser {name}: it must return a finite image of shape {image.shape}; it returned shape {result.shape}"
             )
         return result.astype(np.float32)
 

@@ -1,7 +1,7 @@
-"""Variance stabilisation: noise that depends on the signal becomes noise of one strength, and back without bias.
+"""Variance stabilisation: transforms signal-dependent noise to unit standard deviation, with an exact unbiased inverse.
 
-The generalised Anscombe transform (doi:10.1109/TIP.2012.2202675) stabilises a variance that is a straight line in the signal. Its
-inverse is exact: the clean signal whose *expected* stabilised reading is the given one, which no algebraic inverse gives.
+The generalised Anscombe transform (doi:10.1109/TIP.2012.2202675) stabilises a variance that is linear in the signal. The exact
+unbiased inverse is the clean signal whose *expected* stabilised value is the given one; the algebraic inverse is biased.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Stabiliser:
 
     Attributes:
         pixel values, stabilised: (N,) the map of pixel values.
-        signals, expected: (N,) the mean of the stabilised reading at each clean signal, increasing.
+        signals, expected: (N,) the mean of the stabilised value at each clean signal, increasing.
     """
 
     readings: Array
@@ -35,23 +35,23 @@ class Stabiliser:
     expected: Array
 
     def forward(self, image: Array) -> Array:
-        """Pixel values, any shape, to the scale on which the noise has unit standard deviation."""
+        """Stabilise pixel values of any shape, so that the noise has unit standard deviation."""
         return _extended(image, self.readings, self.stabilised)
 
     def inverse(self, image: Array) -> Array:
-        """Denoised stabilised values to clean signals, detector units, within the range of signals of the table."""
+        """Convert denoised stabilised values to clean signals, detector units, within the range of the table."""
         return np.interp(image, self.expected, self.signals)
 
 
 def of_noise_model(noise_model: nn.Module, images: Array) -> Stabiliser:
-    """The stabiliser of a fitted noise model, for images of its units.
+    """The stabiliser of a fitted noise model, for images in its units.
 
     The map is ∫ ds / σ(s) over the model's own standard deviation; for Poisson–Gaussian noise that is the generalised Anscombe
-    transform. The inverse uses the model's quantiles, so that skewness, rounding and clipping limits are accounted for.
+    transform. The inverse uses the model's quantiles, so that it accounts for skewness, rounding and clipping.
 
     Args:
-        noise_model: called with signals, gives distributions with ``variance`` and ``icdf``.
-        images: the noisy pixel values, any shape; they tell the range of signals.
+        noise_model: called with signals, returns distributions with ``variance`` and ``icdf``.
+        images: the noisy pixel values, any shape; they determine the range of signals.
     """
     low, high = (float(value) for value in np.quantile(images, (0.002, 0.998)))
     margin = 0.05 * (high - low)
@@ -73,10 +73,10 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
         gain: detector units per electron.
         offset: detector units at zero dose.
         read_noise: standard deviation at zero dose, detector units.
-        images: the noisy pixel values, any shape; they tell the range of signals.
+        images: the noisy pixel values, any shape; they determine the range of signals.
 
     Raises:
-        ValueError: a gain that is not positive.
+        ValueError: the gain is not positive.
     """
     if not gain > 0:
         raise ValueError(f"gain {gain} must be positive")
@@ -97,9 +97,9 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
 
 
 def estimated(images: Array) -> Stabiliser:
-    """The stabiliser of noise whose variance is estimated as a straight line in the signal, from the images alone.
+    """The stabiliser for noise whose variance, linear in the signal, is estimated from the images.
 
-    Second differences along both axes judge the noise where the image is smooth (robustly, in groups of equal local mean).
+    The noise is estimated robustly from second differences along both axes, in groups of equal local mean.
 
     Args:
         images: (image, y, x).
@@ -117,7 +117,7 @@ def estimated(images: Array) -> Stabiliser:
 
 
 def _variance_line(images: Array) -> tuple[float, float]:
-    mask = np.outer([1, -2, 1], [1, -2, 1]) / 6.0  # unit gain for white noise, blind to planes
+    mask = np.outer([1, -2, 1], [1, -2, 1]) / 6.0  # unit gain for white noise, zero for planes
     means, squares = [], []
     for image in images:
         windows = np.lib.stride_tricks.sliding_window_view(image, (3, 3))
@@ -127,7 +127,9 @@ def _variance_line(images: Array) -> tuple[float, float]:
     order = np.argsort(mean)
     groups = np.array_split(order, max(4, min(40, order.size // 500)))
     level = np.array([mean[group].mean() for group in groups])
-    variance = np.array([np.median(square[group]) / 0.4549 for group in groups])  # the median of χ² with one degree
+    variance = np.array(
+        [np.median(square[group]) / 0.4549 for group in groups]
+    )  # the median of χ² with one degree of freedom
     slope, intercept = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, 1e-3 * variance.max()))
     return float(slope), float(intercept)
 
@@ -138,14 +140,14 @@ def _with_inverse(signals: Array, stabilised: Array, readings: Array) -> Stabili
 
 
 def _increasing(values: Array) -> Array:
-    """Strictly increasing by the least change: flat where clipping limits hide the signal, an inverse still exists."""
+    """Make values strictly increasing with the smallest change, so that an inverse exists where clipping makes them flat."""
     step = 1e-9 * max(float(np.ptp(values)), 1e-12)
     raised: Array = np.maximum.accumulate(values) + step * np.arange(values.size)
     return raised
 
 
 def _extended(values: Array, at: Array, table: Array) -> Array:
-    """Linear interpolation, going on in a straight line beyond both ends."""
+    """Linear interpolation with linear extrapolation beyond both ends."""
     inside = np.interp(values, at, table)
     first = (table[1] - table[0]) / (at[1] - at[0])
     last = (table[-1] - table[-2]) / (at[-1] - at[-2])

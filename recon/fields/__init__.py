@@ -1,4 +1,4 @@
-"""What holds the volume, where it is evaluated, and what it is expected to look like."""
+"""Volume parameterisations (fields), occupancy, and regularisers."""
 
 import lazy_loader as _lazy
 

@@ -1,4 +1,4 @@
-"""The volume as a network of coordinates, evaluated on the voxel grid: one evaluation serves the rays of all tilts."""
+"""The volume as a coordinate network, evaluated once on the voxel grid for the rays of all tilts."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _POINTS_TOGETHER = 2**15
 class CoordinateNetwork(Field):
     """The field of Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018): a network on a positional encoding.
 
-    Gradients are computed anew block by block of points, so that memory holds the activations of one block only.
+    Activations are recomputed block by block in the backward pass, so that only those of one block are in memory.
 
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
         scale: see `Field`.
-        width: of the hidden layers.
-        layers: hidden layers.
-        frequencies: octaves of the positional encoding.
-        skip: hidden layers after which the encoding is handed in again; 0 for none.
+        width: width of the hidden layers.
+        layers: number of hidden layers.
+        frequencies: number of octaves of the positional encoding.
+        skip: number of hidden layers after which the encoding is concatenated again; 0 for none.
 
     Example:
         >>> import recon, torch
@@ -51,7 +51,7 @@ class CoordinateNetwork(Field):
         self.density = CoordinateDensity(frequencies=frequencies, layers=layers, width=width, skip=skip)
 
     def start_from(self, volume: Tensor) -> None:
-        """Start flat, at the mean of the volume."""
+        """Initialise with a constant, the mean of the volume."""
         share = (volume.mean() / self.scale / _DENSEST).clamp(1e-3, 0.5)
         with torch.no_grad():
             self.density.last.bias.copy_(torch.logit(share))
@@ -61,13 +61,13 @@ class CoordinateNetwork(Field):
         return self.at(everywhere).view(self.depth, self.width, self.height)
 
     def at(self, indices: Tensor) -> Tensor:
-        """Attenuation, in units of the scale, at (N,) places of the flat voxel grid (z, x, y)."""
+        """Attenuation, in units of the scale, at (N,) flat indices of the voxel grid (z, x, y)."""
         parts = torch.split(indices, _POINTS_TOGETHER)
         values = [checkpoint(self._density, part, use_reentrant=False) for part in parts]
         return torch.cat(values) * _DENSEST
 
     def _density(self, indices: Tensor) -> Tensor:
-        """Density in (0, 1); coordinates are in units of half the width, from the centre."""
+        """Density in (0, 1); coordinates are relative to the centre, in units of half the width."""
         y, x = indices % self.height, indices // self.height % self.width
         z = indices // (self.height * self.width)
         sizes = ((x, self.width), (y, self.height), (z, self.depth))

@@ -1,4 +1,4 @@
-"""What holds the volume: ``field()`` gives the attenuation of the whole voxel grid in the projector's native layout."""
+"""Volume parameterisations (fields): ``field()`` returns the attenuation on the voxel grid in the projector's layout."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from recon.fields.upsampling import upsample
 from recon.projection.projector import from_columns
 from recon.projection.tiles import Tiles
 
-_COARSE = 16  # voxels along each axis, at which a field and the volume that it started from are compared
-_MUCH_NEARER = 0.25  # of the squared distance; detail that a smooth field loses counts alike in both orientations
-_LEAST = 0.003  # of an empty field, in units of its scale: low, for a haze would pass for a brighter beam
+_COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
+_MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
+_LEAST = 0.003  # attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam
 
 
 class Field(Described, ABC):
-    """A trainable volume of non-negative attenuation.
+    """Base class of fields: trainable volumes of non-negative attenuation.
 
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
-        scale: attenuation per voxel that counts as one unit; a guess within a factor of ten serves.
+        scale: attenuation per voxel of one unit; a guess within a factor of ten suffices.
 
     Example:
         >>> import recon, torch
@@ -37,14 +37,12 @@ class Field(Described, ABC):
     measured_in = "attenuation per voxel"
     scale: Tensor
     relative_rate = 1.0
-    """Learning rate that suits the field, relative to what suits a free number per voxel."""
+    """Learning rate of the field relative to that of a voxel field."""
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__()
         if len(shape) != 3 or min(shape) < 1:
-            raise ValueError(
-                f"shape {tuple(shape)}: three sizes (depth, height, width) of at least one voxel are needed"
-            )
+            raise ValueError(f"shape {tuple(shape)}: give three sizes (depth, height, width) of at least one voxel")
         if not 0 < scale < math.inf:
             raise ValueError(f"scale {scale} must be positive and finite")
         self.depth, self.height, self.width = shape
@@ -52,27 +50,27 @@ class Field(Described, ABC):
 
     @abstractmethod
     def units(self) -> Tensor:
-        """Attenuation in units of the scale, not negative, (depth, width, height)."""
+        """Non-negative attenuation in units of the scale, (depth, width, height)."""
 
     def at(self, places: Tensor) -> Tensor:
-        """Attenuation, in units of the scale, at (N,) places of the flat voxel grid (z, x, y)."""
+        """Attenuation, in units of the scale, at (N,) flat indices of the voxel grid (z, x, y)."""
         return self.units().reshape(-1).index_select(0, places)
 
     def on(self, tiles: Tiles) -> Tensor:
-        """The same as the list of `tiles`, (N,), zero where nothing is occupied."""
+        """Attenuation on the list of `tiles`, (N,), in units of the scale; zero at unoccupied voxels."""
         values = self.at(tiles.voxels)
         return values.new_zeros(tiles.filled.numel()).index_copy(0, tiles.occupied, values)
 
     @abstractmethod
     def start_from(self, volume: Tensor) -> None:
-        """Start from a rough volume (z, y, x) of the same extent and any resolution, with vacuum lifted slightly."""
+        """Initialise with a rough volume (z, y, x) of the same extent and any resolution, with vacuum raised slightly."""
 
     @torch.no_grad()
     def check_axes(self, volume: Tensor) -> None:
-        """Compare with the volume (z, y, x) that the field has just started from, coarsely, for mistaken axes.
+        """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field.
 
         Raises:
-            ValueError: the field holds the volume with y and x swapped, which no shape betrays where slices are square.
+            ValueError: the field has y and x swapped, which shapes cannot reveal if slices are square.
         """
         held = self.volume()
         if self.height != self.width:
@@ -83,22 +81,21 @@ class Field(Described, ABC):
         straight, swapped = (float((held - each).square().sum()) for each in (given, given.transpose(-1, -2)))
         if swapped < _MUCH_NEARER * straight:
             raise ValueError(
-                f"{type(self).__name__} started from a volume and holds it with y and x swapped; units() has the axes "
+                f"{type(self).__name__} was initialised with a volume and has y and x swapped; units() has the axes "
                 "(z, x, y), volumes have (z, y, x): transpose in start_from() or in units()"
             )
 
     @property
     def has_coarser(self) -> bool:
-        """Whether `coarser` gives a field."""
+        """Whether `coarser` returns a field."""
         return False
 
     def coarser(self) -> Field | None:
-        """This field on a voxel grid half as fine, by the same parameters: what it learns, this one has learnt. None where
-        it has no such voxel grid."""
+        """This field on a voxel grid with half the resolution, with shared parameters. None if there is no such grid."""
         return None
 
     def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
-        """Unconstrained values of a volume (z, y, x) averaged or stretched to `shape`, (depth, width, height)."""
+        """Unconstrained values of a volume (z, y, x) resampled to `shape`, (depth, width, height)."""
         lattice = volume.transpose(1, 2)[None, None] / self.scale
         pooled = functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
         return torch.log(torch.expm1(pooled.clamp(_LEAST, 20)))
@@ -114,7 +111,7 @@ class Field(Described, ABC):
         return values.reshape(self.depth * self.width, self.height)
 
     def extra_repr(self) -> str:
-        """The voxel grid and the scale."""
+        """Voxel grid and scale."""
         return f"{self.depth} x {self.height} x {self.width} voxels (z, y, x), scale={float(self.scale):.4g}"
 
     def volume(self) -> Tensor:
@@ -124,7 +121,7 @@ class Field(Described, ABC):
 
 
 class VoxelField(Field):
-    """One free number per voxel.
+    """One free parameter per voxel.
 
     Example:
         >>> import recon
@@ -149,12 +146,12 @@ class VoxelField(Field):
 
 
 class MultiresolutionField(Field):
-    """The sum of dense grids at doubling resolutions: the same volumes as `VoxelField`, far better conditioned.
+    """The sum of dense grids at doubling resolutions: as general as `VoxelField`, but much better conditioned.
 
-    The coarse grids act as a multigrid preconditioner: a step of Adam moves all wavelengths at once.
+    The coarse grids act as a multigrid preconditioner: one step of Adam changes all wavelengths.
 
     Args:
-        coarsest: voxels along the longest side of the coarsest grid, at least.
+        coarsest: minimum number of voxels along the longest side of the coarsest grid.
 
     Example:
         >>> import recon
@@ -174,7 +171,7 @@ class MultiresolutionField(Field):
         nn.init.constant_(self.grids[0], math.log(math.expm1(_LEAST)))
 
     def start_from(self, volume: Tensor) -> None:
-        """The start lives in a grid four times coarser than the voxel grid: what is finer is noise."""
+        """Initialise a grid four times coarser than the voxel grid, because finer detail of the volume is noise."""
         with torch.no_grad():
             for grid in self.grids:
                 grid.zero_()
@@ -186,7 +183,7 @@ class MultiresolutionField(Field):
         return len(self.grids) > 1 and type(self) is MultiresolutionField
 
     def coarser(self) -> Field | None:
-        """The sum of all grids but the finest; a derived class may make its volume otherwise."""
+        """The sum of all grids except the finest; None for derived classes that compute their volume differently."""
         if not self.has_coarser:
             return None
         depth, width, height = self.grids[-2].shape

@@ -1,4 +1,4 @@
-"""Where a volume may hold anything: the rest need not be evaluated, projected or regularised."""
+"""Occupied voxels of a volume; all others are not evaluated, projected or regularised."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from torch.nn import functional
 from recon.projection.base import Projector
 
 OCCUPIED_MARGIN = 2
-"""Voxels around what a rough volume holds that are occupied, too."""
+"""Margin, voxels, around the contents of a rough volume that is also occupied."""
 
 _RETEST_EVERY = 10
 
 
 class Occupancy(nn.Module):
-    """The voxels that may hold something, from a rough volume, and more of them as soon as the data wants them.
+    """The voxels that may be non-empty, from a rough volume; voxels are added if the data require it.
 
-    Everything within a margin of what the rough volume holds is occupied. The rest counts as vacuum, and is tested again in every
-    tenth step: a block of voxels becomes occupied where the likelihood gains more by raising it than the total variation of its
-    faces costs, two times in a row, for a fit that swings wants much at once. Nothing is ever taken out.
+    All voxels within a margin around the contents of the rough volume are occupied. The others are treated as vacuum and tested
+    again in every tenth step. A block of voxels becomes occupied if raising it increases the likelihood by more than the total
+    variation of its faces costs. This must hold in two tests in a row, because an oscillating fit makes many blocks pass once.
+    Occupied voxels are never removed.
 
     Args:
-        rough: (z, y, x) of the same extent and any resolution, in units of the field's scale.
+        rough: (z, y, x) volume of the same extent and any resolution, in units of the field's scale.
         shape: (depth, height, width) of the voxel grid.
-        least: what counts as something in the rough volume.
-        margin: voxels of the voxel grid around it.
-        block: voxels along the edges of the blocks that are tested.
+        least: threshold of non-empty voxels in the rough volume.
+        margin: margin around them, voxels of the voxel grid.
+        block: edge length of the tested blocks, voxels.
     """
 
     mask: Tensor
@@ -48,11 +49,11 @@ class Occupancy(nn.Module):
 
     @property
     def share(self) -> float:
-        """The share of the voxel grid that is occupied."""
+        """The occupied share of the voxel grid."""
         return float(self.mask.float().mean())
 
     def rows(self, rows: slice) -> Occupancy:
-        """The same for some slices."""
+        """The occupancy of some slices."""
         depth, width, _ = self.mask.shape
         part = Occupancy(
             torch.zeros(1, 1, 1), (depth, rows.stop - rows.start, width), least=self.least, block=self.block
@@ -61,16 +62,16 @@ class Occupancy(nn.Module):
         return part
 
     def coarser(self, shape: Sequence[int]) -> Occupancy:
-        """The same on a voxel grid (depth, height, width) half as fine."""
+        """The occupancy on a voxel grid (depth, height, width) with half the resolution."""
         part = Occupancy(torch.zeros(1, 1, 1), shape, least=self.least, block=self.block).to(self.mask.device)
         part.mask = functional.adaptive_max_pool3d(self.mask.float()[None], part.mask.shape)[0] > 0
         return part
 
     @torch.no_grad()
     def wants(self, gradient: Tensor, projector: Projector, cost: float) -> Tensor:
-        """The blocks of voxels that the data want occupied; arguments as of `retest`."""
+        """The blocks of voxels that pass the test for occupation; arguments as for `retest`."""
         options: dict[str, Any] = {"ceil_mode": True, "divisor_override": 1}
-        # slices are projected one by one: those of a block may be added up before
+        # slices are projected independently, so those of a block can be summed first
         depth, width, height = (min(self.block, size) for size in self.mask.shape)  # a thin volume is one block deep
         slabs = functional.avg_pool2d(gradient[None, None], (1, height), **options)[0, 0]
         lattice = projector.backproject(slabs).view(*self.mask.shape[:2], -1)
@@ -79,12 +80,12 @@ class Occupancy(nn.Module):
 
     @torch.no_grad()
     def retest(self, gradient: Tensor, projector: Projector, cost: float) -> None:
-        """Occupy the blocks that the data wants, in every tenth call.
+        """In every tenth call, test unoccupied blocks and occupy those that pass.
 
         Args:
-            gradient: of the loss with respect to the line integrals, (tilts * detector_width, height).
-            projector: of the whole voxel grid.
-            cost: of the total variation, loss per unit of attenuation and voxel face.
+            gradient: gradient of the loss with respect to the line integrals, (tilts * detector_width, height).
+            projector: projector of the whole voxel grid.
+            cost: cost of the total variation, loss per unit of attenuation and voxel face.
         """
         self.num_steps += 1
         if int(self.num_steps) % _RETEST_EVERY:
@@ -98,7 +99,7 @@ class Occupancy(nn.Module):
 
 
 def _grown(mask: Tensor, margin: int) -> Tensor:
-    """Whatever is within a cube of so many voxels to each side of what is set."""
+    """Dilate a mask by a cube that extends `margin` voxels to each side."""
     for axis, size in enumerate(mask.shape):
         start, mask = mask, mask.clone()
         for step in range(1, min(margin, size - 1) + 1):

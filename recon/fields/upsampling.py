@@ -1,4 +1,4 @@
-"""Linear interpolation from each grid of a multiresolution field to the next, twice as fine."""
+"""Linear interpolation between successive grids of a multiresolution field, by a factor of two."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 
 
 def upsample(grid: Tensor, shape: Sequence[int], *, plus: Tensor | None = None) -> Tensor:
-    """Linear interpolation of a 3D grid to twice its size along each axis (or one less), cell centres aligned.
+    """Linear interpolation of a 3D grid to twice its size along each axis (or one less), with aligned cell centres.
 
-    Axis by axis it is several times faster than the general interpolation, forward and back.
+    Interpolating axis by axis is several times faster than torch's general function, forward and backward.
 
     Args:
         grid: (a, b, c).
-        shape: of the result.
-        plus: of that shape; added in the same pass.
+        shape: shape of the result.
+        plus: array of that shape that is added in the same pass.
     """
     result: Tensor = _Upsampling.apply(grid, tuple(shape), plus)  # type: ignore[no-untyped-call]
     return result
@@ -40,7 +40,7 @@ class _Upsampling(torch.autograd.Function):
 
 
 def _doubled(coarse: Tensor, fine: int) -> Tensor:
-    """Linear interpolation along the middle axis: three quarters of the nearest, one quarter of the next."""
+    """Linear interpolation along the middle axis: three quarters of the nearest element, one quarter of the next."""
     size = coarse.shape[1]
     if fine == size:
         return coarse
@@ -70,7 +70,7 @@ def _halved(fine: Tensor, size: int) -> Tensor:
 
 
 def upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:
-    """(fine, coarse) the same interpolation along one axis."""
+    """Matrix (fine, coarse) of the same interpolation along one axis."""
     if coarse == fine:
         return torch.eye(fine, dtype=like.dtype, device=like.device)
     position = ((torch.arange(fine, dtype=like.dtype, device=like.device) - 0.5) / 2).clamp(0, coarse - 1)

@@ -1,4 +1,4 @@
-"""Noise models that a joint fit chooses from, and how each is best fitted."""
+"""Candidate noise models of a joint fit, and their fit settings."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from noiseflow import (
 from noiseflow.models.around import as_noise_model
 
 _CLIPPED = 0.02
-_FAR = 0.01  # of the contrast
-_SHARED = 6  # Gaussians of a shape that all signals share: enough for a long tail on one side
+_FAR = 0.01  # noise relative to the contrast
+_SHARED = 6  # Gaussians of a shape shared by all signals: enough for a long tail on one side
 
 
 def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Module]:
-    """Noise models worth trying for these images, simplest first, behind the rounding and clipping limits that they show.
+    """Candidate noise models for these images, simplest first, wrapped in the detected rounding and clipping.
 
-    All preserve the mean. Where clipping hides a tail of many pixels, a model whose whole shape depends on the signal could put
-    anything there, and with it any mean. Then only those are offered whose shape is given or the same for all signals: what is
-    seen at other signals stands in for what is hidden. Where there is little noise, most of what is left is what the volume
-    cannot explain, and a noise model of learnt shape would learn to excuse it.
+    All of them preserve the mean. If clipping hides a tail of many pixels, a model whose shape depends on the signal could have
+    any hidden tail, and therefore any mean. In this case only models with a fixed shape, or one shared by all signals, are
+    candidates: the visible tails at other signals determine the hidden ones. If there is little noise, the residuals are mostly
+    misfit of the volume, and a noise model with a learnt shape would absorb it.
 
     Args:
         images: the pixel values.
-        quiet: whether noise is small beside the contrast.
+        quiet: whether the noise is small compared with the contrast.
     """
     digitisation = detect_digitisation(images)
     models: list[nn.Module] = [SignalDependentGaussian()]
@@ -47,14 +47,14 @@ def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Mo
 
 
 def first_noise(images: NDArray[Any]) -> nn.Module:
-    """Simple noise to start a fit with: where clipping hides pixel values, least squares would take their mean for the signal."""
+    """The simple noise model of the first fits. It includes clipping, which would bias least squares."""
     digitisation = detect_digitisation(images)
     return Digitised(SignalDependentGaussian(), *digitisation) if _clipped(images, digitisation) else Gaussian()
 
 
 def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
-    """Whether clipping hides much: many pixel values, and noise that takes their neighbours far from the clipping limits. A
-    dark background at zero, whose noise is nothing beside the contrast, is as good as seen."""
+    """Whether clipping hides much: many pixel values are clipped, and the noise is significant compared with the contrast. A
+    dark background at zero with negligible noise does not count."""
     on_rail = (images <= digitisation.low) | (images >= digitisation.high)
     if on_rail.mean() < _CLIPPED:
         return False
@@ -64,21 +64,21 @@ def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
 
 
 def learns(noise_model: nn.Module) -> bool:
-    """Whether a noise model has anything to learn."""
+    """Whether a noise model has trainable parameters."""
     return as_noise_model(noise_model).learns
 
 
 def num_steps_of(noise_model: nn.Module, usual: int) -> int:
-    """Steps of a fit of a noise model to an estimated signal: the usual number, or the most that the model asks for."""
+    """Steps of a fit of a noise model to an estimated signal: the usual number, limited to the maximum of the model."""
     most = as_noise_model(noise_model).most_joint_steps
     return usual if most is None else min(usual, most)
 
 
 def starts_anew(noise_model: nn.Module) -> bool:
-    """Whether a noise model is standardised again on a better signal."""
+    """Whether a noise model is standardised again when the signal has improved."""
     return as_noise_model(noise_model).starts_anew
 
 
 def rate_of(noise_model: nn.Module) -> float:
-    """The rate at which a noise model learns in a joint fit."""
+    """The learning rate of a noise model in a joint fit."""
     return as_noise_model(noise_model).joint_learning_rate

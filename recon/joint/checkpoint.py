@@ -1,7 +1,6 @@
-"""Checkpoints of a reconstruction: what every fit has reached, so that an interrupted run resumes.
+"""Checkpoints of a reconstruction: the state of every fit, so that interrupted runs resume.
 
-A journal is a folder of safetensors files with JSON metadata, each written beside its target and renamed; opening one runs no
-code from it.
+A journal is a folder of safetensors files with JSON metadata, written atomically. Opening one runs no code from it.
 """
 
 from __future__ import annotations
@@ -42,22 +41,22 @@ _RESULT = [field.name for field in fields(FitResult) if field.name not in ("nois
 
 
 class Journal:
-    """Runs the fits and other stages of one reconstruction in order, and keeps what each has reached.
+    """Runs the fits and other stages of one reconstruction in order, and stores their results and states.
 
-    All else in a reconstruction follows from its settings, its seed and what its stages reached, each kept under its name. So a
-    run that resumes repeats the rest, takes the finished stages from the journal, and continues the one that was stopped.
+    A reconstruction is determined by its settings, its seed and the results of its stages, which are stored by name. A resumed
+    run repeats everything else, loads the results of finished stages, and continues the interrupted one.
 
     Args:
-        folder: of the journal; made when there is something to write.
-        settings: all that decides the result, by name, as JSON can hold it. Another run's journal is refused.
-        resume: go on with what the folder holds; otherwise the first thing written replaces it.
-        interval: seconds between checkpoints within a stage; one more is written when it ends, and when it is stopped.
-        report: called with every step. It may raise KeyboardInterrupt: the step is whole by then, and is saved.
+        folder: folder of the journal; created with the first checkpoint.
+        settings: JSON-serialisable settings that determine the result, by name. A journal with other settings is rejected.
+        resume: continue from the contents of the folder; otherwise the first checkpoint replaces them.
+        interval: seconds between checkpoints within a stage; a stage is also saved when it ends or is stopped.
+        report: called after every step. It may raise KeyboardInterrupt; the completed step is then saved.
 
     Attributes:
         in_fit: whether a fit or another stage is running.
-        stop_requested: set it to have KeyboardInterrupt raised after the running step, its state saved.
-        abandoned: set it to have nothing more written.
+        stop_requested: set it to raise KeyboardInterrupt after the current step, with its state saved.
+        abandoned: set it to prevent any further writing.
 
     Raises:
         ValueError: the folder belongs to a run with other settings, or is damaged.
@@ -86,12 +85,12 @@ class Journal:
 
     @property
     def resumed(self) -> bool:
-        """Whether this run goes on with an earlier one."""
+        """Whether this run continues an earlier one."""
         return not self._fresh
 
     def choose(self, name: str, find: Callable[[], Any]) -> Any:
-        """What this run finds by itself, or found before it was stopped, however the machine has changed since: as JSON can hold
-        it. To be called before anything is written."""
+        """Return the JSON-serialisable result of `find`, or the one that the run stored before it was interrupted, so that a
+        resumed run does not depend on the state of the machine. Must be called before anything is written."""
         if name not in self._choices:
             self._choices[name] = find()
         return self._choices[name]
@@ -99,7 +98,7 @@ class Journal:
     def fit(
         self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
     ) -> FitResult:
-        """`noiseflow.fit`, or what it reached earlier under this name; other arguments and errors are the same."""
+        """Run `noiseflow.fit`, or load its result stored under this name; other arguments and errors are the same."""
         finished, generator = self._finished(name), options.get("generator")
         models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
         if not self._fresh and finished.exists():
@@ -125,7 +124,7 @@ class Journal:
         return result
 
     def run_stage(self, title: str, stage: Stage) -> None:
-        """Take the steps of a stage that are left, reported and kept as those of a fit."""
+        """Take the remaining steps of a stage, with progress and checkpoints as for a fit."""
         finished, report = self._finished(title), self.progress(title, stage.num_steps)
         if not self._fresh and finished.exists():
             stage.load_state(read_state(finished))
@@ -150,13 +149,13 @@ class Journal:
 
     @contextmanager
     def _working(self) -> Iterator[None]:
-        """While a fit or another stage runs, a stop waits for the end of its step; an interrupted one counts as running still."""
+        """Mark a fit or stage as running, so that a stop waits for the end of its step; it stays marked if interrupted."""
         self.in_fit = True
         yield
         self.in_fit = False
 
     def _stopping(self, name: str, options: dict[str, Any]) -> Callable[[int, str], None]:
-        """The progress report of a fit, which is also where it stops if that is asked for."""
+        """The progress callback of a fit, which also stops it if requested."""
         total, own = options.get("num_steps", 500), options.get("progress")
         if own is None:
             return self.progress(name, total)
@@ -172,7 +171,7 @@ class Journal:
             raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
 
     def progress(self, title: str, total: int) -> Callable[[int, str], None]:
-        """Tells of the steps of one piece of work, and stops it where that is asked for."""
+        """A progress callback for one task, which also stops it if requested."""
 
         def progress(done: int, note: str) -> None:
             if self.report is not None:
@@ -182,18 +181,18 @@ class Journal:
         return progress
 
     def keep(self, prefix: str = "") -> Path:
-        """The folder of the finished blocks of a volume, named by the prefix of its fits; gone with the journal."""
+        """The folder for finished blocks of a volume, named after the prefix of its fits; removed with the journal."""
         if self._fresh:
             self._start()
         return self.folder / f"{_BLOCKS}{hashlib.blake2b(prefix.encode(), digest_size=4).hexdigest()}"
 
     def forget(self, prefix: str) -> None:
-        """Remove what fits of this prefix have reached: their block is kept, and their states are larger than it."""
+        """Remove the states of fits with this prefix, whose block is stored and smaller than they are."""
         for file in filter(is_state, self.folder.glob(f"{_slug(prefix)}*.safetensors")):
             file.unlink()
 
     def discard(self) -> None:
-        """Remove the journal: its run is complete, or is not wanted any more."""
+        """Remove the journal of a complete or abandoned run."""
         for blocks in self.folder.glob(f"{_BLOCKS}{'[0-9a-f]' * 8}"):
             clear_all_leftovers(blocks)
             for file in blocks.glob(f"*-{_ROW}-{_ROW}.npy"):
@@ -240,11 +239,11 @@ class Journal:
         head = run.read_bytes()[: len(_RUN_START)] if run.is_file() else b""
         if head and head != _RUN_START:
             raise FileExistsError(
-                f"{run} was not written by noiseflow and would be lost; move it, or name another output"
+                f"{run} was not written by noiseflow and would be overwritten; move it, or name another output"
             )
 
     def _check_settings(self) -> None:
-        advice = f"give the same input and options, or leave out --resume to start over ({self.folder})"
+        advice = f"give the same input and options, or remove --resume to start over ({self.folder})"
         try:
             kept = json.loads((self.folder / _RUN).read_text(encoding="utf-8"))
             format_, settings = kept["format"], dict(kept["settings"])

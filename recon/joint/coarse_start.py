@@ -1,4 +1,4 @@
-"""A quick, coarse and converged reconstruction: where a fit starts, and how bright the beam is."""
+"""A fast, converged reconstruction at low resolution, which gives the initial volume and the incident intensity."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 _COARSE = 24
 _LEAST_BINNING = 4
 _HIGHEST_RATE, _RATE = 0.4, 0.6
-# of noise relative to contrast, and its limits: noise of 0.5 or more leaves a haze of 0.2 of the scale in the coarse volume of a
-# vacuum; that of the raw needle, of noise 0.003, is clean, and its dim holder, at 0.1, must not be taken for vacuum
+# vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
+# of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
 _HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
 
 
 @dataclass(frozen=True)
 class Start:
-    """What all slices of a series begin with.
+    """The starting point of the fits of all slices of a series.
 
     Attributes:
-        rough: (z, y, x) the coarse volume of all slices, attenuation per voxel of the whole grid.
-        response: the detector's, as it suits that volume.
-        height: slices of the series.
-        noise: of single pixels relative to the contrast, see `recon.joint.task.noise_share`.
+        rough: (z, y, x) coarse volume of all slices, attenuation per voxel of the whole grid.
+        response: detector response fitted to that volume.
+        height: number of slices of the series.
+        noise: noise of single pixels relative to the contrast, see `recon.joint.task.noise_share`.
     """
 
     rough: Tensor
@@ -65,17 +65,17 @@ def coarse_start(
     num_steps: int = 200,
     generator: torch.Generator,
 ) -> Tensor:
-    """Reconstruct binned images by least squares, and set the response to what suits them best.
+    """Reconstruct binned images by least squares, and fit the response to them.
 
-    Incident intensity and volume trade off against each other: a haze looks like a dimmer beam. A fit at full resolution never
-    gets far along that valley; here every step takes the best response for the volume as it is, and steps are cheap.
+    Incident intensity and volume are correlated: a haze looks like a weaker beam. A fit at full resolution moves slowly along
+    this valley. Here every step uses the best response for the current volume, and steps are cheap.
 
     Args:
         tilt_series: the data.
-        response: its first guess; set in place.
+        response: initial response; set in place.
         grid: the voxel grid at full resolution.
-        num_steps: of the fit.
-        generator: source of the choice of pixels that judge the fit.
+        num_steps: number of steps of the fit.
+        generator: source of the choice of held-out pixels.
 
     Returns:
         The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`.
@@ -95,13 +95,13 @@ def coarse_start(
 
 
 def learning_rate(volume: Tensor, field: Field) -> float:
-    """Learning rate that suits how much a beam has to cross: steps of all voxels along a ray add up in its line integral."""
+    """Learning rate for the thickness of the object, because steps of all voxels along a ray add up in its line integral."""
     thickness = float(volume.mean() / field.scale) * field.depth
     return min(_HIGHEST_RATE, _RATE / math.sqrt(max(thickness, 1e-6)))
 
 
 class _BestResponse(nn.Module):
-    """A response that is matched to the images anew for all line integrals that it is shown."""
+    """A response that is fitted to the images at every evaluation of the line integrals."""
 
     def __init__(self, response: Transmission | Linear, images: Tensor, use: Tensor) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class _BestResponse(nn.Module):
 def _binned(
     tilt_series: TiltSeries, grid: VolumeGrid, binning: int
 ) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
-    """The series averaged over squares of pixels, with a mask, and the projector from a grid of voxels as large."""
+    """The binned series with a mask, and the projector of a grid with voxels of that size."""
     images, share = (np.stack(parts) for parts in zip(*_binned_images(tilt_series, binning), strict=True))
     mask = share > 0
     images[~mask] = images[mask].mean()
@@ -131,7 +131,7 @@ def _binned(
 
 
 def _binned_images(tilt_series: TiltSeries, binning: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Image by image, for a series may be larger than memory: means of the used pixels of each square, and their share."""
+    """Means of the used pixels of each bin, and their share; image by image, because a series may be larger than memory."""
     for number, image in enumerate(tilt_series.images):
         use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
         share = _means(use, binning)
@@ -139,7 +139,7 @@ def _binned_images(tilt_series: TiltSeries, binning: int) -> Iterator[tuple[NDAr
 
 
 def _means(image: NDArray[Any], size: int) -> NDArray[np.float32]:
-    """Means of squares of `size` pixels; what is left over at the far edges is left out."""
+    """Means of squares of `size` pixels; incomplete squares at the far edges are dropped."""
     tensor = torch.from_numpy(np.asarray(image, dtype=np.float32))
     means: NDArray[np.float32] = functional.avg_pool2d(tensor[None], size)[0].numpy()
     return means

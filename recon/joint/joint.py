@@ -1,4 +1,4 @@
-"""The joint fit: a volume and the noise model of its images, learnt together from one noisy tilt series."""
+"""The joint fit of a volume and the noise model of its images to one noisy tilt series."""
 
 from __future__ import annotations
 
@@ -39,45 +39,54 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
 _WIDTH_OF_FIRST = (
-    128  # voxels; of wider volumes the best weight is lower: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+    128  # voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
 )
-_QUIET_FIRST = 6.4  # four rungs up, near to where real quiet series end (10 and 11): the same rungs in fewer fits
-_HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2  # of the pixels: those of a slab are few to tell weights apart
+_QUIET_FIRST = (
+    6.4  # four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
+)
+_HELD_OUT, _HELD_OUT_TO_CHOOSE = (
+    0.1,
+    0.2,
+)  # shares of the pixels; larger on a slab, which has few pixels to distinguish weights
 _SLAB, _SLAB_VOXELS = (
     24,
     16 * 96**2,
-)  # slices; more where they are small: so many voxels tell weights apart as well as more do
-_QUIET_SLAB = 12  # of 256²: they choose 6.8 for the raw needle, 24 choose 5.7, which is 0.0001 nats likelier to them
-_QUIET = 0.2  # noise relative to contrast: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
-_WORTHWHILE = 0.4  # share of the voxel grid that may be occupied; skipping little costs more than it saves
+)  # slices; more if they are small: this number of voxels suffices to distinguish weights
+_QUIET_SLAB = (
+    12  # for slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
+)
+_QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
+_WORTHWHILE = (
+    0.4  # largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
+)
 
 
 @dataclass(frozen=True)
 class JointReconstructor:
-    """Reconstruct a volume together with the noise model of its images; with a `Gaussian`, plain least squares.
+    """Reconstruct a volume jointly with the noise model of its images. With a `Gaussian`, this is least squares.
 
-    Everything that needs choosing is chosen by the likelihood of held-out pixels, on a slab of a few slices; then the whole
-    volume is fitted once. `recon.joint.plan.plan` says in which stages.
+    Noise model and regularisation weight are chosen by the likelihood of held-out pixels on a slab of a few slices. Then the
+    whole volume is fitted once. `recon.joint.plan.plan` defines the stages.
 
     Attributes:
-        weight: of the regulariser, see `TomographySignal`; None has it chosen.
-        noise_model: a noise model to use, learning or not; None chooses a mean-preserving one behind the detector's rounding
-            and clipping limits.
-        make_field: makes the field from shape and scale.
-        regulariser: what is expected of a volume; directional total variation if None.
-        num_steps: signal steps of the whole volume; None as the schedule says.
-        estimate_response: whether incident intensity or offset are learnt.
-        skip_vacuum: whether voxels are left out where there is nothing; without defocus.
-        coarse_to_fine: whether the first steps are taken at half the resolution, where the field knows it and is 128 voxels wide
-            or more; without defocus.
-        defocus: blur to model, pixels per voxel out of the plane of focus, see
+        weight: weight of the regulariser, see `TomographySignal`; None to choose it automatically.
+        noise_model: function that creates the noise model, trainable or not; None to choose a mean-preserving one, wrapped in
+            the detected rounding and clipping.
+        make_field: function that creates the field from shape and scale.
+        regulariser: regulariser of the volume; directional total variation if None.
+        num_steps: signal steps of the whole volume; None for the number in the schedule.
+        estimate_response: whether to fit incident intensity or offset.
+        skip_vacuum: whether to skip voxels of vacuum (only without defocus).
+        coarse_to_fine: whether to take the first steps at half the resolution, if the field supports it and is at least 128
+            voxels wide (only without defocus).
+        defocus: blur to model, pixels per voxel out of the focal plane, see
             `recon.projection.defocused_projector.DefocusedProjector`.
-        slab: slices used to choose; by default 24, or more where they are small.
+        slab: number of slices of the slab; by default 24, or more if slices are small.
         schedule: numbers of steps and learning rates.
-        seed: of every random choice.
-        device: where to compute.
-        run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` keeps what each has reached.
-        prefix: of the names under which it does, where one run makes several volumes.
+        seed: seed of all random choices.
+        device: torch device.
+        run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` also stores states and results.
+        prefix: prefix of the names of fits, if one run makes several volumes.
 
     Example:
         >>> import noiseflow, numpy as np, recon
@@ -111,10 +120,10 @@ class JointReconstructor:
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
     ) -> Reconstruction:
-        """Reconstruct on `grid`, by default one voxel per pixel and as deep as wide.
+        """Reconstruct on `grid`; by default one voxel per pixel, with a depth equal to the width.
 
         Raises:
-            ValueError: the grid does not match the images, or the fit found no finite step.
+            ValueError: the grid does not match the images, or the likelihood is never finite.
         """
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
@@ -123,8 +132,11 @@ class JointReconstructor:
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:
-        """Choose noise model, weight and response for all slices of a series: the first two on the slab of most contrast, the
-        response on it and on the slab of least contrast, where vacuum tells a dimmer beam from a haze as in a whole fit."""
+        """Choose noise model, weight and response for all slices of a series.
+
+        Noise model and weight are chosen on the slab with the highest contrast. The response is fitted to this slab and to the
+        one with the lowest contrast, whose vacuum separates a weaker beam from a haze.
+        """
         start = self._start(tilt_series, grid)
         part, model = self._slabs(start, tilt_series, grid)
         run = self._slab(part, model, start.noise, progress)
@@ -142,17 +154,17 @@ class JointReconstructor:
         projector: Projector | None = None,
         progress: Progress | None = None,
     ) -> Reconstruction:
-        """Reconstruct some slices under what is settled for all of them.
+        """Reconstruct some slices with the choices made for all of them.
 
         Args:
-            tilt_series, grid: of these slices.
-            settled: by `settle`, for all slices.
-            rows: where these stand among all.
-            projector: of the grid, where it is at hand.
-            progress: called with the steps done, those expected, and a note.
+            tilt_series, grid: data and grid of these slices.
+            settled: result of `settle` for all slices.
+            rows: position of these slices among all.
+            projector: projector of the grid, if it exists already.
+            progress: called with completed steps, expected steps and a note.
         """
         whole = self._model(settled.start, tilt_series, grid, rows=rows, settled=settled, projector=projector)
-        # copies, so that a block cannot change what the next one begins with
+        # copies, so that a block does not change the start of the next one
         models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series, share=_HELD_OUT, place=(rows, settled.start.height))
@@ -163,8 +175,8 @@ class JointReconstructor:
         return self._finish(run, tilt_series, grid)
 
     def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int, float]:
-        """The stages for a series, the slices of the slab that choices are made on, and the share of the voxels that are not
-        skipped as vacuum; arguments as of a call. It takes the memory of a few slices, for a whole volume may not fit."""
+        """The stages for a series, the number of slices of the slab, and the share of voxels that are not skipped as vacuum.
+        Arguments as for a call. Needs only the memory of a few slices."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         part, model = self._slabs(start, tilt_series, grid)
@@ -173,7 +185,7 @@ class JointReconstructor:
         return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
-        """The signal model before any fit: a coarse reconstruction on the scale of the data."""
+        """The initial signal model: a coarse reconstruction at the scale of the data."""
         return self._model(self._start(tilt_series, grid), tilt_series, grid)
 
     def projector(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Projector:
@@ -191,7 +203,7 @@ class JointReconstructor:
         height = tilt_series.images.shape[1]
         if grid.height != height:
             raise ValueError(
-                f"the volume is {grid.height} voxels high and the images {height} pixels; they must be equal"
+                f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights"
             )
         response = estimate_response(tilt_series, estimate=self.estimate_response)
         generator = torch.Generator().manual_seed(self.seed)
@@ -199,7 +211,7 @@ class JointReconstructor:
         return Start(rough, response, height, noise_share(tilt_series.images))
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
-        """The slices of most and of least contrast, and their signal model."""
+        """The slices with the highest and the lowest contrast, and their signal model."""
         num_slices = self._num_slices(grid)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
@@ -208,7 +220,7 @@ class JointReconstructor:
         return part, self._model(start, part, replace(grid, height=len(rows)), rows=rows)
 
     def _occupied_share(self, start: Start, model: TomographySignal, grid: VolumeGrid) -> float:
-        """The share of the voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
+        """The share of voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
         if not (self.skip_vacuum and model.projector.has_parts):
             return 1.0
         occupied = 0
@@ -231,7 +243,7 @@ class JointReconstructor:
         settled: Settled | None = None,
         projector: Projector | None = None,
     ) -> TomographySignal:
-        """The signal model of all slices, or of some `rows` of those that `start` knows."""
+        """The signal model of all slices, or of some `rows` of those in `start`."""
         projector = self.projector(tilt_series, grid) if projector is None else projector
         rough = start.rough.to(self.device)
         scale = attenuation_scale(rough)
@@ -265,11 +277,11 @@ class JointReconstructor:
     def _facts(
         self, tilt_series: TiltSeries, whole: TomographySignal, noise: float
     ) -> tuple[Facts, slice, nn.Module | None]:
-        """What is known before any fit, the slices to choose on, and the given noise model; `noise` is that of all slices."""
+        """The facts before any fit, the slices of the slab, and the given noise model; `noise` is that of all slices."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and noise < _QUIET
-        described = quiet and given is None  # by a noise model that no fit of the volume sees
+        described = quiet and given is None  # by a noise model that is fitted after the volume
         rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
         facts = Facts(
             choose_noise=given is None and not described,
@@ -289,7 +301,7 @@ class JointReconstructor:
         noise: float,
         progress: Progress | None,
     ) -> PlannedRun:
-        """A run whose choices are made."""
+        """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
         simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
         with torch.random.fork_rng(devices=[]):
@@ -346,7 +358,7 @@ class JointReconstructor:
         share: float,
         place: tuple[slice, int] | None = None,
     ) -> Task:
-        """The pixels of some rows; `place` says where they stand among how many, and so which of them are held out."""
+        """The pixels of some rows; `place` is their position among all rows, which determines the held-out pixels."""
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
         generator = torch.Generator().manual_seed(self.seed)
@@ -359,8 +371,8 @@ class JointReconstructor:
         return HalfResolution.times(model) if self.coarse_to_fine else 0
 
     def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
-        """Of the slab: a few cannot tell weights apart where each has few pixels, and gaps of tilts need twice as many voxels.
-        The long trials of quiet series take no more of them than that."""
+        """Number of slices of the slab. Small slices need more to distinguish weights, and gaps of tilts need twice as many
+        voxels. Quiet series, with long trial fits, use no more than that."""
         if self.slab is not None:
             return self.slab
         if self.weight is not None:
@@ -369,7 +381,7 @@ class JointReconstructor:
         return max(fewest, -(-voxels // (made.depth * made.width)))
 
     def _finish(self, run: PlannedRun, tilt_series: TiltSeries, grid: VolumeGrid) -> Reconstruction:
-        """The volume, under what is chosen."""
+        """Fit the volume with the choices made."""
         result, model = run.fit_whole(), run.runner.tasks["whole"].signal_model
         noise_model = run.noise_model
         with torch.no_grad():
@@ -381,10 +393,10 @@ class JointReconstructor:
 
 
 def _first_weight(width: int) -> float:
-    """Of the regulariser, where the search for it begins and what steps before it take."""
+    """Initial weight of the regulariser, for the search and for the steps before it."""
     return _FIRST_WEIGHT * min(1.0, _WIDTH_OF_FIRST / width)
 
 
 def _native(images: NDArray[Any], dtype: Any) -> Tensor:
-    """(tilt, y, u) to the projector's order (tilt, u, y)."""
+    """Convert (tilt, y, u) to the projector's order (tilt, u, y)."""
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1), dtype=dtype))

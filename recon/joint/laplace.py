@@ -1,4 +1,4 @@
-"""Laplace noise: as a likelihood it is least absolute deviations (L1), the robust alternative to least squares."""
+"""Laplace noise, whose likelihood is least absolute deviations (L1), the robust alternative to least squares."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from noiseflow.models.base import ArrayModel
 
 
 class Laplace(ArrayModel):
-    """Laplace noise of one width around the signal.
+    """Laplace noise with the same width at all signals.
 
     Args:
         scale: mean absolute deviation, detector units.
@@ -29,11 +29,11 @@ class Laplace(ArrayModel):
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Start at the mean absolute residual of (N,) signals and observations."""
+        """Set the scale to the mean absolute residual of (N,) signals and observations."""
         self.log_scale.copy_(torch.log((observation.double() - signal.double()).abs().mean()))
 
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model again."""
+        """Arguments that recreate this model."""
         return {}
 
 
@@ -57,7 +57,7 @@ class LaplaceDistribution(NoiseDistribution):
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         low, high = self._standard(low), self._standard(high)
-        flip = low > -high  # an interval right of zero is its mirror image left of zero
+        flip = low > -high  # intervals above zero are mirrored
         low, high = torch.where(flip, -high, low), torch.where(flip, -low, high)
         left = high + torch.log(-torch.expm1(low - high)) - math.log(2)
         across = torch.log1p(-0.5 * (torch.exp(low) + torch.exp(-high.clamp_min(0))))

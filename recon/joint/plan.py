@@ -1,4 +1,4 @@
-"""What a joint fit will do: a list of stages, made from what is known of the series and what the user settled."""
+"""The plan of a joint fit: a list of stages, from properties of the series and settings of the user."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ Noise = Literal["simple", "chosen"]
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of a series before any fit.
+    """Properties of a series that are known before any fit.
 
     Attributes:
         choose_noise: whether the noise model is chosen among candidates.
-        learn_noise: whether the noise model that the volume ends with has anything to learn.
-        simple_is_final: whether that model is the simple one that every fit begins with (least squares).
+        learn_noise: whether the final noise model of the volume has trainable parameters.
+        simple_is_final: whether that model is the simple one of the first fits (least squares).
         choose_weight: whether the weight of the regulariser is chosen.
-        halvings: how often the resolution can be halved where that is worth it. Where it can be twice, long wavelengths need
-            more steps than others, and cost little: a block of 512³ shells under true noise has 19.68 dB after two times 74
-            steps at half the resolution, 19.98 with 300 at a quarter in place of the first 74 and 148 at half, and 20.19 with 300
-            at half, which take 15 % more time; a slab that fills the field then loses 0.12 dB.
+        halvings: how often the resolution can usefully be halved. If twice, long wavelengths get more steps, which are cheap: a
+            block of 512³ shells with true noise has 19.68 dB after two times 74 steps at half the resolution, 19.98 with 300 at
+            a quarter instead of the first 74 and 148 at half, and 20.19 with 300 at half, which take 15 % more time; a slab that
+            fills the field then loses 0.12 dB.
         settled: whether noise model, weight and response are known from other slices of the same series.
-        quiet: whether noise is small beside the contrast, and the noise model learns: most of what a fit leaves is then misfit,
-            which a width that follows the signal would excuse where it is bright. Where the noise model is not given, the volume
-            is fitted by least squares, weights are judged by gaps of tilts, for pixels share the misfit of their neighbours, and
-            the noise model describes what is left; one that is given takes over at three quarters of the steps.
-        hold_offset: whether the offset of a linear response stays as the coarse reconstruction found it: without noise, a haze
-            over a lower offset looks as good as vacuum to least squares, and absorbs misfit.
+        quiet: whether noise is small compared with the contrast and the noise model is trainable. The residuals are then mostly
+            misfit, which a signal-dependent width would absorb at bright pixels. Without a given noise model, the volume is
+            fitted by least squares, weights are chosen by gaps of tilts (because misfit correlates between neighbouring pixels),
+            and the noise model is fitted to the residuals. A given noise model is used from three quarters of the steps on.
+        hold_offset: whether the offset of a linear response is fixed to that of the coarse reconstruction. In least squares
+            without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit.
     """
 
     choose_noise: bool = True
@@ -51,18 +51,18 @@ class Schedule:
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
-        candidate: steps of each candidate noise model; its likelihood then differs from where it would end by less than the
+        candidate: steps of each candidate noise model; its likelihood then differs from the converged one by less than the
             tolerance of the choice.
-        adapt: signal steps on the slab under the chosen noise model, and under the likeliest simpler one.
-        refine: noise-model steps on the slab, on a signal that has become better; more would describe the slab's misfit.
+        adapt: signal steps on the slab under the chosen noise model, and under the most likely simpler one.
+        refine: noise-model steps on the slab after the signal has improved; more would fit the misfit of the slab.
         learn: noise-model steps on the whole volume of a quiet series.
-        describe: the same where nothing follows them: misfit spans three decades, and after 60 steps a needle's noise model
+        describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
-        trial: signal steps that compare weights, after the first quarter of those of the volume.
-        quiet_trial: the same where noise is small, as many as finish the volume: unfinished fits predict gaps of tilts best at
-            far too large a weight (needle: 51 after 50 steps, 8 after 180).
-        whole: signal steps of the volume, unless the user gives their number.
-        quiet: the same where noise is small: there is more to fit.
+        trial: signal steps for the comparison of weights, after the first quarter of those of the volume.
+        quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
+            at much too large weights (needle: 51 after 50 steps, 8 after 180).
+        whole: signal steps of the volume, unless the user sets their number.
+        quiet: the same for quiet series, which have more detail to fit.
         rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
     """
 
@@ -85,20 +85,20 @@ class FitStage:
     """One stage of a joint fit.
 
     Attributes:
-        name: unique within a plan; the journal keeps what the stage reached under it.
-        kind: ``signal`` fits the volume and response under a fixed noise model; ``noise`` fits the noise model to a fixed signal;
-            ``candidates`` fits several noise models to a fixed signal and takes one; ``finalists`` fits the volume under that
-            one and under the likeliest simpler one, and takes one of the two; ``weights`` compares weights of the regulariser.
-        where: the slab that choices are made on, or the whole volume.
-        noise: the simple noise model that every fit begins with, or the model of choice.
-        num_steps: optimisation steps; of each fit, where there are several.
-        rate: learning rate of the signal, relative to a rough start's.
+        name: unique name within a plan; the journal stores the result of the stage under it.
+        kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
+            ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
+            one and with the most likely simpler one, and chooses one of the two; ``weights`` compares regulariser weights.
+        where: the slab or the whole volume.
+        noise: the simple noise model of the first fits, or the chosen model.
+        num_steps: optimisation steps of each fit.
+        rate: learning rate of the signal relative to that for a rough start.
         halvings: how often the resolution is halved.
-        afresh: start from the coarse reconstruction again.
-        warm_up: the rate grows to its full size first: the first steps of Adam are as large where little is left.
-        hold_offset: leave the offset as it is.
-        standardise: measure the noise model's scaling first.
-        fits: how many fits the stage is expected to make.
+        afresh: restart from the coarse reconstruction.
+        warm_up: increase the rate gradually at the start, because the first steps of Adam have full length even near the optimum.
+        hold_offset: do not fit the offset.
+        standardise: measure the scaling of the noise model first.
+        fits: expected number of fits of the stage.
     """
 
     name: str
@@ -115,10 +115,8 @@ class FitStage:
     fits: int = 1
 
 
-_START = (
-    10  # steps of a noise model that is measured rather than fitted: of one parameter, or one width at every signal
-)
-_TRIALS, _CANDIDATES = 4, 2  # fits that these stages usually make, for the progress bar
+_START = 10  # steps of a noise model that standardisation determines: one parameter, or one width at every signal
+_TRIALS, _CANDIDATES = 4, 2  # usual number of fits of these stages, for the progress bar
 
 
 def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | None = None) -> list[FitStage]:
@@ -126,14 +124,15 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
 
     Args:
         facts: what is known of the series.
-        num_steps: signal steps of the whole volume; by default as the schedule says.
+        num_steps: signal steps of the whole volume; by default those of the schedule.
         schedule: numbers of steps and learning rates.
     """
     schedule = Schedule() if schedule is None else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
     stages = _on_the_slab(facts, schedule) if choosing else []
     if not facts.settled and not (choosing and (facts.quiet or facts.simple_is_final)):
-        # the slab of most contrast leaves more than the volume does: +0.1 dB in the mean of twelve scenes of 96³, up to +0.7
+        # the slab with the highest contrast has larger residuals than the volume; this gains 0.1 dB in the mean of twelve
+        # scenes of 96³, at most 0.7
         stages.append(FitStage("start noise of the volume", "noise", "whole", "simple", _START, standardise=True))
     usual = schedule.quiet if facts.quiet else schedule.whole
     halvings = facts.halvings if num_steps is None else min(1, facts.halvings)
@@ -152,7 +151,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     ]
     if (
         facts.quiet and not facts.simple_is_final
-    ):  # a width measured on a rough signal leaves the volume to the regulariser
+    ):  # with a width measured on a rough signal, the regulariser would dominate
         stages.append(FitStage("measure noise", "noise", "slab", "simple", _START, standardise=True))
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
@@ -178,7 +177,8 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
 
 
 def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitStage]:
-    """From the coarse reconstruction again, under what is chosen: steps under other noise or another weight leave traces."""
+    """Stages on the whole volume. They restart from the coarse reconstruction, because steps with other noise models or weights
+    affect the result."""
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
     quarter, stages = num_steps // 4, list[FitStage]()
     taken_over = facts.quiet and not facts.simple_is_final
@@ -187,12 +187,12 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         rate, hold = schedule.rate, facts.hold_offset
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, halvings=halvings, hold_offset=hold))
 
-    if quarter:  # the simple noise pulls at a rough signal steadily
+    if quarter:  # the simple noise model converges steadily from a rough signal
         begin = 2 * quarter if facts.halvings == 2 else quarter
         add("begin", "simple", begin, min(1, facts.halvings) if taken_over else facts.halvings)
         if taken_over:
             add("go on", "simple", 2 * quarter)
-            if not facts.settled:  # blocks of one volume share the noise model that the slab has taught
+            if not facts.settled:  # blocks of one volume share the noise model of the slab
                 name = "learn noise on the volume"
                 stages.append(FitStage(name, "noise", "whole", noise, schedule.learn, standardise=True))
         elif facts.halvings == 2:
@@ -205,12 +205,12 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
 
 
 def total_steps(stages: Sequence[FitStage]) -> int:
-    """Steps of all fits that a plan expects."""
+    """Expected number of steps of all fits of a plan."""
     return sum(stage.num_steps * stage.fits for stage in stages)
 
 
 def describe(stages: Sequence[FitStage]) -> str:
-    """A plan as lines of text: where, name, kind, steps, and how."""
+    """A plan as lines of text: slab or whole, name, kind, steps and options."""
     lines = []
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"

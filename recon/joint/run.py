@@ -1,4 +1,4 @@
-"""The runner of a plan: carries its stages out one by one, each kept under its name by the journal."""
+"""The runner of a plan, which executes its stages one by one; the journal stores each under its name."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ Progress = Callable[[int, int, str], None]
 _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 _TOLERATED = (
-    0.003  # nats per pixel; what a richer noise model gains below that may be a bias of the signal that it absorbed
+    0.003  # nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 )
 _TABULATED = 0.05  # nats per pixel
 
 
 @dataclass(frozen=True)
 class _Tried:
-    """A candidate and its held-out negative log-likelihood above that of another, nats per pixel."""
+    """A candidate and its held-out negative log-likelihood relative to the best, nats per pixel."""
 
     model: nn.Module
     excess: float
-    excess_error: float = 0.0  # chance errs by less than the signal does
+    excess_error: float = 0.0  # the statistical error is smaller than that of the signal
 
 
 class RunFit(Protocol):
-    """Runs one fit; a journal also keeps what it reached under its name."""
+    """Runs one fit; a journal also stores its result under its name."""
 
     def __call__(
         self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
@@ -51,28 +51,28 @@ class RunFit(Protocol):
 def run_fit(
     name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
 ) -> FitResult:
-    """`noiseflow.fit` as a `RunFit` that keeps nothing."""
+    """`noiseflow.fit` as a `RunFit` that stores nothing."""
     del name
     return fit(noise_model, signal, observation, **options)
 
 
 class Runner:
-    """Carries out the stages of a plan.
+    """Executes the stages of a plan.
 
     Args:
-        tasks: signal models and pixels, of the ``slab`` and of the ``whole``.
-        models: the ``simple`` noise model, and the ``chosen`` one where it is known; fitted in place.
-        candidates: noise models to choose from, simplest first.
-        first_weight: where the search for a weight starts.
+        tasks: signal models and pixels of the ``slab`` and of the ``whole``.
+        models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
+        candidates: candidate noise models, simplest first.
+        first_weight: initial weight of the search.
         generator: source of the random choices.
         run_fit: runs every fit.
-        prefix: of the names under which fits are kept.
-        expected: steps of the whole plan.
-        progress: called with the steps done, those expected and a note.
+        prefix: prefix of the names of fits.
+        expected: expected steps of the whole plan.
+        progress: called with completed steps, expected steps and a note.
 
     Attributes:
-        weight_choice: the weights tried, once they were compared.
-        result: of the last fit of a signal.
+        weight_choice: the compared weights, after the comparison.
+        result: result of the last fit of a signal.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class Runner:
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
         self.result = FitResult(models["simple"])
-        self._runner_up: nn.Module | None = None  # the likeliest noise model simpler than the chosen
+        self._runner_up: nn.Module | None = None  # the most likely noise model simpler than the chosen one
         self._done, self._expected = 0, expected
 
     def run(self, stages: Sequence[FitStage]) -> None:
-        """Carry out all stages, in order."""
+        """Execute all stages in order."""
         carry_out = {
             "signal": self._signal,
             "noise": self._noise,
@@ -106,11 +106,11 @@ class Runner:
             "weights": self._weights,
         }
         for where in {stage.where for stage in stages if stage.afresh}:
-            self.tasks[where].remember()  # it takes as much memory as the field: only where it is asked for
+            self.tasks[where].remember()  # needs as much memory as the field, so only if required
         for stage in stages:
             before = self._done
             carry_out[stage.kind](stage, self.tasks[stage.where])
-            # a stage that needed more or fewer fits than expected corrects the total, not the count
+            # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
@@ -128,8 +128,11 @@ class Runner:
             self._fit_noise(stage.name, model, task, task.signal(), stage.num_steps, standardise=standardise)
 
     def _candidates(self, stage: FitStage, task: Task) -> None:
-        """The simplest that predicts held-out pixels nearly as well as the richest. One of which no table can be made is left
-        out: it has a peak for every electron, far narrower than their distance, to which noise without such peaks was bent."""
+        """Choose the simplest candidate that predicts held-out pixels nearly as well as the best.
+
+        Candidates that cannot be tabulated are excluded: they have a narrow peak for every electron, an artefact of fitting noise
+        without such peaks.
+        """
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates)
         signal, tried = task.signal(), list[_Tried]()
 
@@ -151,9 +154,11 @@ class Runner:
         self._runner_up = None if behind is None or math.isinf(behind.excess) else behind.model
 
     def _finalists(self, stage: FitStage, task: Task) -> None:
-        """Fit the volume under the noise model of choice and, from the same state, under the likeliest simpler one: a rich noise
-        model also describes what a rough signal lacks, and may seem likelier for as long as the signal has not followed. On a
-        needle with 10 counts Poisson noise was 0.007 nats behind before, and 0.08 ahead after twenty steps."""
+        """Fit the volume with the chosen noise model and, from the same state, with the most likely simpler one.
+
+        A flexible noise model also describes errors of a rough signal, and may seem better until the signal has converged. On a
+        needle with 10 counts, Poisson noise was 0.007 nats worse before, and 0.08 better after twenty steps.
+        """
         model, runner_up = task.signal_model, self._runner_up
         start = copy.deepcopy(model.state_dict()) if runner_up is not None else {}
         chosen = self._fit_signal(stage, task, stage.name)
@@ -172,8 +177,8 @@ class Runner:
             model.load_state_dict(adapted)
 
     def _weights(self, stage: FitStage, task: Task) -> None:
-        """Compare weights by fits that all begin in the same state: steps that another weight has taken count for none. The task
-        is left in the likeliest state."""
+        """Compare weights by fits from the same state, so that they are independent of each other. The task is left in the most
+        likely state."""
         model = task.signal_model
         start = likeliest = copy.deepcopy(model.state_dict())
         lowest = math.inf
@@ -193,7 +198,7 @@ class Runner:
             each.signal_model.weight = self.weight_choice.weight
 
     def _fit_signal(self, stage: FitStage, task: Task, name: str) -> FitResult:
-        """Fit volume and response under a noise model that stays as it is."""
+        """Fit volume and response with a fixed noise model."""
         noise_model, model = self.models[stage.noise], task.signal_model
         try:
             return self._run(
@@ -238,7 +243,7 @@ class Runner:
 
 
 def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
-    """The simplest that predicts held-out pixels nearly as well as the best."""
+    """The simplest model that predicts held-out pixels nearly as well as the best."""
     best = min(each.excess for each in tried)
     judged = [replace(each, excess=each.excess - best) for each in tried]
     found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
@@ -246,14 +251,14 @@ def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
 
 
 def _last_nll(result: FitResult) -> float:
-    """Of held-out pixels after the last step, nats per pixel; infinite if it is no number."""
+    """Held-out NLL after the last step, nats per pixel; infinite if it is NaN."""
     nll = list(result.history.values())[-1]
     return nll if math.isfinite(nll) else math.inf
 
 
 @torch.no_grad()
 def _tabulates(noise_model: nn.Module, task: Task, signal: Tensor) -> bool:
-    """Whether a table holds the likelihood of the observations; the fits that follow use it."""
+    """Whether the likelihood of the observations can be tabulated accurately; subsequent fits use the table."""
     observation, ends = task.observation.flatten(), [float(end) for end in torch.aminmax(signal)]
     if task.use is not None:
         observation = torch.where(task.use.flatten(), observation, task.observation[task.use].mean())

@@ -1,4 +1,4 @@
-"""A plan with its runner, and what its stages on a slab settle for all slices of a series."""
+"""A plan with its runner, and the choices on a slab for all slices of a series."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from recon.joint.weight import WeightChoice
 
 @dataclass(frozen=True)
 class Settled:
-    """What a slab has settled for all slices of a series.
+    """The choices on a slab for all slices of a series.
 
     Attributes:
-        simple: simple noise to begin with.
-        noise_model: the noise model of choice.
-        weight: of the regulariser.
-        weight_choice: the evidence for it, where it was chosen.
+        simple: simple noise model of the first fits.
+        noise_model: the chosen noise model.
+        weight: weight of the regulariser.
+        weight_choice: the evidence for the weight, if it was chosen.
         response: state of the image formation.
-        scale: of the field.
-        facts: what was known of the series.
-        start: the coarse volume that every block begins with.
-        signal_model: of these slices, as fitted; None where it was left behind.
-        fit_result: of the last fit of them.
+        scale: scale of the field.
+        facts: properties of the series.
+        start: the initial coarse volume of every block.
+        signal_model: fitted signal model of the slab; None if it was dropped.
+        fit_result: result of its last fit.
     """
 
     simple: nn.Module
@@ -44,12 +44,12 @@ class Settled:
     fit_result: FitResult
 
     def portable(self) -> Settled:
-        """The same without the projector's matrices, which every machine makes for itself."""
+        """A copy without the projector matrices, which every worker computes itself."""
         return replace(self, signal_model=None)
 
 
 class PlannedRun:
-    """A plan with its runner: choices on the slab first, then the volume."""
+    """A plan with its runner: first the choices on the slab, then the volume."""
 
     def __init__(self, facts: Facts, stages: list[FitStage], runner: Runner) -> None:
         self.facts, self.stages, self.runner = facts, stages, runner
@@ -57,32 +57,32 @@ class PlannedRun:
 
     @property
     def noise_model(self) -> nn.Module:
-        """The noise model of choice."""
+        """The chosen noise model."""
         simple = self.facts.simple_is_final and not self.facts.quiet
         return self.runner.models["simple" if simple else "chosen"]
 
     @property
     def likelihood(self) -> nn.Module:
-        """The noise model under which the volume ends; that of choice where nothing needed a step."""
+        """The noise model of the final fit of the volume; the chosen one if no fit was needed."""
         last = [stage for stage in self.stages if stage.kind == "signal"][-1:]
         return self.runner.models[last[0].noise] if last else self.noise_model
 
     def choose(self) -> None:
-        """The stages on the slab; the whole volume starts from the response found there."""
+        """Run the stages on the slab; the whole volume starts from the response found there."""
         self.runner.run([stage for stage in self.stages if stage.where == "slab"])
         self.weight_choice = self.runner.weight_choice
         slab, whole = (self.runner.tasks[where].signal_model for where in ("slab", "whole"))
         whole.image_formation.load_state_dict(copy.deepcopy(slab.image_formation.state_dict()))
 
     def fit_whole(self) -> FitResult:
-        """The stages on the whole volume."""
+        """Run the stages on the whole volume."""
         self.runner.run([stage for stage in self.stages if stage.where == "whole"])
         return self.runner.result
 
     def settled(self, start: Start) -> Settled:
-        """What some slabs have settled, which were the whole of this run."""
+        """The choices of a run on slabs only."""
         model = self.runner.tasks["whole"].signal_model
-        model.let_go()  # blocks take its place in memory
+        model.let_go()  # frees memory for the blocks
         return Settled(
             simple=self.runner.models["simple"],
             noise_model=self.noise_model,

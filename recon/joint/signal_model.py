@@ -1,4 +1,4 @@
-"""The tomography as a signal model: what the detector would read of a volume, without noise."""
+"""Tomography as a signal model: the noise-free pixel values of a volume."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from recon.projection.base import Projector, from_columns
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.tiles import Tiles
 
-_RESPONSE_RATE = 0.04  # learning rate of the detector's response, relative to the volume's
+_RESPONSE_RATE = 0.04  # learning rate of the detector response relative to that of the volume
 
 
 class TomographySignal(Described):
-    """A volume, its projections and the detector's response as one signal model, for `noiseflow.fit`.
+    """A volume, its projections and the detector response as one signal model for `noiseflow.fit`.
 
-    Pixels are numbered in the projector's native order: ``images.transpose(0, 2, 1)``, that is (tilt, u, y), made flat.
+    Pixels are numbered in the projector's native order (tilt, u, y), flat: ``images.transpose(0, 2, 1).reshape(-1)``.
 
     Args:
         field: the volume.
-        projector: line integrals along all rays.
-        image_formation: line integrals to signals, such as `Transmission` or `Linear`.
-        weight: of the total variation, nats per unit of jump in attenuation (in units of the field's scale) over one
-            voxel face.
-        regulariser: what is expected of a volume; isotropic total variation by default.
-        learning_rate: of a field of voxels.
-        occupancy: where the field is evaluated, the rest being vacuum; everywhere if None. For a projector that has parts.
+        projector: computes line integrals along all rays.
+        image_formation: converts line integrals to signals, such as `Transmission` or `Linear`.
+        weight: weight of the regulariser, nats per unit jump of attenuation (in units of the field's scale) over one voxel
+            face.
+        regulariser: regulariser of the volume; isotropic total variation by default.
+        learning_rate: learning rate of a voxel field.
+        occupancy: voxels where the field is evaluated, with vacuum elsewhere; None for all. Requires a projector with tiles.
 
     Raises:
-        ValueError: an occupancy for another projector.
+        ValueError: an occupancy is given, but the projector does not support tiles.
 
     Example:
         >>> import recon, torch
@@ -59,7 +59,7 @@ class TomographySignal(Described):
     ) -> None:
         super().__init__()
         if occupancy is not None and not projector.has_parts:
-            raise ValueError("vacuum is left out only where the projector has parts; give no occupancy with this one")
+            raise ValueError("this projector cannot skip vacuum; do not give an occupancy with it")
         self.field, self.projector, self.image_formation = field, projector, image_formation
         self.weight, self.learning_rate = weight, learning_rate
         self.regulariser = TotalVariation() if regulariser is None else regulariser
@@ -75,11 +75,11 @@ class TomographySignal(Described):
 
     @property
     def num_pixels(self) -> int:
-        """How many pixels the tilt series has."""
+        """Number of pixels of the tilt series."""
         return self.projector.num_tilts * self.projector.detector_width * self.field.height
 
     def signal(self) -> Tensor:
-        """The signal of all pixels, flat; what `forward` has just seen is taken over, with its gradient."""
+        """The signal of all pixels, flat; reuses the result of a preceding `forward`, with its gradient."""
         seen = self._seen
         if seen is not None and seen[1].requires_grad and torch.is_grad_enabled() and seen[0] == self._changes:
             self._seen = None
@@ -91,14 +91,14 @@ class TomographySignal(Described):
         return signal.reshape(-1)
 
     def _evaluate(self) -> Tensor:
-        """The field on the whole voxel grid, (depth * width, height), or as the list of `tiles`."""
+        """The field on the whole voxel grid, (depth * width, height), or on the list of `tiles`."""
         if self.occupancy is None:
             everywhere: Tensor = self.field()
             return everywhere
         return self.field.on(self.tiles) * self.field.scale
 
     def _project(self, values: Tensor) -> Tensor:
-        """Line integrals; what the data wants where the voxel grid counts as empty is tested as gradients pass."""
+        """Line integrals; unoccupied blocks are tested in the backward pass."""
         occupancy, projector = self.occupancy, self.projector
         if occupancy is None:
             return projector.project(values)
@@ -110,13 +110,13 @@ class TomographySignal(Described):
 
     @property
     def tiles(self) -> Tiles:
-        """What is occupied, as it is now.
+        """The currently occupied tiles.
 
         Raises:
             ValueError: there is no occupancy.
         """
         if self.occupancy is None:
-            raise ValueError("every voxel is evaluated: this signal model was made without an occupancy")
+            raise ValueError("this signal model has no occupancy; all voxels are evaluated, use volume() instead")
         mask = self.occupancy.mask
         known, version = self._tiles_of
         if self._tiles is None or known is not mask or version != mask._version:
@@ -126,32 +126,32 @@ class TomographySignal(Described):
         return self._tiles
 
     def volume(self) -> Tensor:
-        """The attenuation that the signal is made of, (z, y, x), detached."""
+        """The attenuation, (z, y, x), detached."""
         with torch.no_grad():
             values = self._evaluate()
             columns = values if self.occupancy is None else self.tiles.lattice(values)
             return from_columns(columns, self.field.depth).contiguous()
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """The signal of some pixels; without gradients, all are projected once for each state of the parameters. Between steps
-        their gradient is kept, for the next one begins where this look was."""
+        """The signal of some pixels. Without gradients, all pixels are projected once per state of the parameters. The graph is
+        kept between steps, because the next step starts from the same state."""
         if torch.is_grad_enabled():
             return self.signal()[pixels]
-        # a fused optimiser does not count as a new version of its tensors, but no step comes without signal()
+        # fused optimisers do not change the version of tensors, but every step calls signal()
         if self._seen is None or self._seen[0] != self._changes:
             with torch.set_grad_enabled(self._steps_follow):
-                signal = self.signal()  # which may set a response that is matched to it
+                signal = self.signal()  # may set the response
             self._seen = self._changes, signal
         return self._seen[1].detach()[pixels]
 
     def release(self) -> None:
-        """Let go of what was kept for a next step: none follows for now."""
+        """Release the cache for the next step, if none follows soon."""
         self._values, self._steps_follow = None, False
         if self._seen is not None:
             self._seen = self._seen[0], self._seen[1].detach()
 
     def let_go(self) -> None:
-        """Let go of all that can be made again, matrices of tiles above all: no fit follows, but the model may be asked."""
+        """Release everything that can be recomputed, such as matrices of tiles; the model remains usable."""
         self._values = self._seen = self._tiles = None
         self._tiles_of, self._steps_follow = (None, 0), False
         for parameter in self.parameters():
@@ -163,7 +163,7 @@ class TomographySignal(Described):
         return tuple((tensor._version, tensor.requires_grad) for tensor in tensors)
 
     def penalty(self) -> Tensor:
-        """The weighted regulariser per pixel; after `signal` it reuses the volume evaluated there."""
+        """The weighted regulariser per pixel; reuses the volume evaluated by `signal`."""
         values = self._evaluate() if self._values is None else self._values
         self._values = None
         scale = float(self.field.scale)
@@ -174,7 +174,7 @@ class TomographySignal(Described):
         return cost * (self.weight / (scale * self.num_pixels))
 
     def with_field(self, field: Field) -> TomographySignal:
-        """The same detector and response, copied, in front of another field of as many voxels along z and x."""
+        """A copy with the same detector and response, and another field with the same number of voxels along z and x."""
         response = copy.deepcopy(self.image_formation)
         return TomographySignal(
             field,
@@ -186,7 +186,7 @@ class TomographySignal(Described):
         )
 
     def response(self) -> dict[str, list[float]]:
-        """Intensity and offset of every tilt as they are; nothing for an image formation of another kind."""
+        """Current intensity and offset of every tilt; empty for other image formations."""
         formation = self.image_formation
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
@@ -194,8 +194,8 @@ class TomographySignal(Described):
         """Parameters with their learning rates, for Adam.
 
         Args:
-            rate: factor on all of them.
-            hold_response: leave the detector's response as it is.
+            rate: factor on all learning rates.
+            hold_response: do not fit the detector response.
         """
         response = [p for p in self.image_formation.parameters() if p.requires_grad and not hold_response]
         usual = self.learning_rate * rate

@@ -1,4 +1,4 @@
-"""Work in steps that can be watched, stopped between two of them, kept, and gone on with."""
+"""Computations in steps with progress, interruption, checkpoints and resumption."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from torch import Tensor
 
 
 class Stage(Protocol):
-    """Work in steps.
+    """A computation in steps.
 
     Attributes:
-        done: steps taken.
-        num_steps: of all; a stage that is finished early lowers it.
+        done: completed steps.
+        num_steps: total number of steps; a stage that finishes early reduces it.
     """
 
     done: int
     num_steps: int
 
     def step(self) -> str:
-        """Take the next step; returns a few words such as the present loss."""
+        """Take the next step. Return a short note, such as the current loss."""
         ...
 
     def state(self) -> dict[str, Any]:
-        """All that the steps to come depend on: nested dicts and lists of tensors, numbers and strings."""
+        """Everything that further steps depend on: nested dicts and lists of tensors, numbers and strings."""
         ...
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` returned."""
         ...
 
 
 RunStage = Callable[[str, Stage], None]
-"""``run_stage(title, stage)`` takes all the steps that are left."""
+"""``run_stage(title, stage)`` takes all remaining steps."""
 
 
 def run_stage(title: str, stage: Stage) -> None:
-    """Take all the steps that are left; `recon.joint.checkpoint.Journal.run_stage` also tells of them and keeps them."""
+    """Take all remaining steps; `recon.joint.checkpoint.Journal.run_stage` also reports progress and saves states."""
     del title
     while stage.done < stage.num_steps:
         stage.step()
 
 
 class Repeated:
-    """A tensor that becomes the next one at every step.
+    """Repeated application of a function to a tensor.
 
     Args:
-        start: the tensor to begin with.
-        advance: from the tensor and the number of steps done to the next tensor.
-        num_steps: how often.
+        start: initial tensor.
+        advance: function from the tensor and the number of completed steps to the next tensor.
+        num_steps: number of steps.
     """
 
     def __init__(self, start: Tensor, advance: Callable[[Tensor, int], Tensor], num_steps: int) -> None:
@@ -66,5 +66,5 @@ class Repeated:
         return {"value": self.value, "done": self.done}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore tensor and number of steps."""
         self.value, self.done = state["value"].to(self.value), state["done"]

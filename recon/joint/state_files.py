@@ -1,4 +1,4 @@
-"""States of a run in files: nested values and tensors, written whole or not at all; opening one runs no code from it."""
+"""Files of run states: nested values and tensors, written atomically; opening one runs no code from it."""
 
 from __future__ import annotations
 
@@ -16,30 +16,28 @@ FORMAT = "noiseflow state 1"
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts and lists of tensors, numbers and strings, all at once or not at all.
+    """Write nested dicts and lists of tensors, numbers and strings atomically.
 
     Raises:
-        OSError: the disk is full, the folder is gone, or the like; an earlier state stays. A file of others is not replaced.
+        OSError: the file cannot be written (an earlier state is kept), or a file of another program would be replaced.
     """
     if not is_state(path) and path.exists():
-        raise FileExistsError(
-            f"{path} was not written by noiseflow as a state of a reconstruction; move it out of this folder"
-        )
+        raise FileExistsError(f"{path} is not a reconstruction state written by noiseflow; move it out of this folder")
     tensors: dict[str, Tensor] = {}
     description = json.dumps(_packed(state, tensors))
     save_tensors(path, tensors, {"format": FORMAT, "state": description})
 
 
 def is_state(path: Path) -> bool:
-    """Whether a file was written by `write_state`; noise models and files of others are none."""
+    """Whether a file was written by `write_state`; False for noise models and files of other programs."""
     return (tensors_format(path) or "").startswith(FORMAT.rstrip("0123456789"))
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read what `write_state` wrote.
+    """Read a file that `write_state` wrote.
 
     Raises:
-        ValueError: another file, or a damaged one.
+        ValueError: it is another file, or damaged.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -49,17 +47,17 @@ def read_state(path: Path) -> dict[str, Any]:
             state: dict[str, Any] = _unpacked(packed, file)
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
-            f"checkpoint {path} is damaged ({type(error).__name__}); leave out --resume to start over"
+            f"checkpoint {path} is damaged ({type(error).__name__}); remove --resume to start over"
         ) from error
     return state
 
 
 def discard_states(folder: Path, *descriptions: str) -> None:
-    """Remove the states in a folder, and the folder where nothing else is in it; files of others stay.
+    """Remove the states in a folder, and the folder if it is then empty; other files are kept.
 
     Args:
-        folder: of the states; it need not exist.
-        descriptions: names of further files of the run.
+        folder: folder of the states; it need not exist.
+        descriptions: names of further files of the run to remove.
     """
     if not folder.is_dir():
         return

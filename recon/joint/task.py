@@ -1,4 +1,4 @@
-"""A signal model with the pixels that it is fitted to and those that judge it."""
+"""A signal model with its training and held-out pixels."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Task:
     """A signal model and its pixels.
 
     Attributes:
-        signal_model: what is fitted.
+        signal_model: the signal model to fit.
         observation: (tilt, u, y) pixel values, detector units.
-        use: (tilt, u, y) False at pixels that are left out; None uses all.
-        held_out: (tilt, u, y) True at pixels that judge and never train.
+        use: (tilt, u, y) False at excluded pixels; None uses all.
+        held_out: (tilt, u, y) True at held-out pixels.
     """
 
     signal_model: TomographySignal
@@ -38,37 +38,37 @@ class Task:
     _rough: dict[str, Any] | None = None
 
     def remember(self) -> None:
-        """Keep the volume as it is, for `restart`."""
+        """Store the current volume for `restart`."""
         self._rough = copy.deepcopy(self.signal_model.state_dict())
 
     def restart(self) -> None:
-        """Go back to the volume that was remembered; the detector's response stays as it was learnt.
+        """Restore the stored volume; the detector response is not changed.
 
         Raises:
-            ValueError: none was.
+            ValueError: no volume was stored.
         """
         if self._rough is None:
-            raise ValueError("there is no volume to go back to; call remember() first")
+            raise ValueError("there is no stored volume to restore; call remember() first")
         response = copy.deepcopy(self.signal_model.image_formation.state_dict())
         self.signal_model.load_state_dict(self._rough)
         self.signal_model.image_formation.load_state_dict(response)
 
     def tables(self, noise_model: nn.Module) -> TableKeeper:
-        """The table of the pixels under a noise model, kept until the model changes."""
+        """The table of the pixels under a noise model, stored until `forget`."""
         return self._tables.setdefault(noise_model, TableKeeper())
 
     def forget(self, noise_model: nn.Module) -> None:
-        """Let go of the table of a noise model that has changed."""
+        """Release the table of a noise model that has changed."""
         self._tables.pop(noise_model, None)
 
     @torch.no_grad()
     def signal(self) -> Tensor:
-        """The signal of all pixels as it is, (tilt, u, y)."""
+        """The current signal of all pixels, (tilt, u, y)."""
         return self.signal_model.signal().view_as(self.observation)
 
     @contextmanager
     def halved(self) -> Iterator[Task]:
-        """The same task at half the resolution; what it learns, this one has learnt."""
+        """The same task at half the resolution, with shared parameters."""
         half = HalfResolution(self.signal_model)
         use = None if self.use is None else half.pixels(self.use)
         yield Task(half.signal_model, half.pixels(self.observation), use, half.pixels(self.held_out))
@@ -76,8 +76,8 @@ class Task:
 
 
 def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
-    """Pixels (tilt, u, y) to hold out, shaped like a mask: all of two contiguous gaps of tilts, a third of the range apart, each
-    a tenth of the range and three tilts wide at least. Tilts between neighbours would be given away by them."""
+    """Mask of pixels (tilt, u, y) to hold out: two contiguous gaps of tilts, a third of the range apart, each at least a tenth of
+    the range and three tilts wide. Single tilts would be predicted by their neighbours."""
     order = np.argsort(tilt_angles, kind="stable")
     span = tilt_angles[order[-1]] - tilt_angles[order[0]]
     held_out = torch.zeros_like(like)
@@ -89,17 +89,19 @@ def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
 
 
 def noise_share(images: NDArray[Any]) -> float:
-    """Noise of single pixels relative to the contrast: the mean size of a second difference along both axes, which smooth
-    structure hardly has, over the standard deviation of the images (Immerkær 1996, doi:10.1006/cviu.1996.0060).
+    """Noise of single pixels relative to the contrast.
+
+    This is the mean absolute second difference along both axes, which is small for smooth structure, divided by the standard
+    deviation of the images (Immerkær 1996, doi:10.1006/cviu.1996.0060).
 
     Args:
-        images: (tilt, y, u) pixel values; about sixteen of them are looked at.
+        images: (tilt, y, u) pixel values; about sixteen images are used.
     """
     some = images[:: max(1, len(images) // 16)]
     if min(some.shape[1:]) < 3:
         return math.inf
     sums = np.zeros(3)
-    for image in some:  # one by one: sixteen of a large series fill gigabytes
+    for image in some:  # one by one, because sixteen images of a large series take gigabytes
         exact = image.astype(np.float64)
         second = exact[2:] - 2 * exact[1:-1] + exact[:-2]
         second = second[:, 2:] - 2 * second[:, 1:-1] + second[:, :-2]
@@ -117,14 +119,14 @@ def block_mask(
     rows: slice | None = None,
     generator: torch.Generator,
 ) -> Tensor:
-    """Pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not give them away.
+    """Mask of pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not predict them.
 
     Args:
-        shape: of all images.
-        share: of the pixels.
-        block: pixels along the edge of a block.
-        rows: of y, where only a part of the images is wanted; the same pixels as of the whole.
-        generator: source of the choice.
+        shape: shape of all images.
+        share: held-out share of the pixels.
+        block: edge length of a block, pixels.
+        rows: rows (y) of the part to return; the mask is that part of the mask of all rows.
+        generator: source of the random choice.
     """
     tilts, width, height = shape
     coarse = torch.rand((tilts, -(-width // block), -(-height // block)), generator=generator) < share

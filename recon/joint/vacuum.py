@@ -1,4 +1,4 @@
-"""Whether there is anything to fit in a block of slices."""
+"""Detection of blocks of slices that contain only vacuum."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from recon.joint.task import Task
 
 
 def stays_empty(task: Task, noise_model: nn.Module) -> bool:
-    """Whether a block that begins without an occupied voxel would stay so: a fit of it would take all its steps for nothing.
+    """Whether a block without occupied voxels would remain empty, so that fitting it is unnecessary.
 
-    It is the test of `recon.fields.occupancy.Occupancy`: no block of voxels gains more likelihood by being raised than its total
-    variation costs.
+    This is the test of `recon.fields.occupancy.Occupancy`: raising any block of voxels increases the likelihood by less than its
+    total variation costs.
 
     Args:
-        task: of the block, before any fit.
-        noise_model: that the block would be fitted with.
+        task: the task of the block, before any fit.
+        noise_model: the noise model of the fit.
     """
     model = task.signal_model
     occupancy = model.occupancy
@@ -29,7 +29,7 @@ def stays_empty(task: Task, noise_model: nn.Module) -> bool:
     signal = model.image_formation(lines)
     slope = torch.empty_like(signal)
     for image, seen, use, result in zip(signal, task.observation, train, slope, strict=True):
-        shown = image.detach().requires_grad_()  # one by one, for a likelihood takes much memory
+        shown = image.detach().requires_grad_()  # one by one, because a likelihood needs much memory
         loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
         (result[...],) = torch.autograd.grad(loss, shown)
     signal.backward(slope)

@@ -1,4 +1,4 @@
-"""The weight of a regulariser, chosen by the likelihood of pixels that the fit never saw."""
+"""Choice of the regulariser weight by the likelihood of held-out pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class WeightChoice:
     """A weight and the evidence for it.
 
     Attributes:
-        weight: the choice.
+        weight: the chosen weight.
         tried: weight → held-out negative log-likelihood, nats per pixel, in the order tried.
     """
 
@@ -26,14 +26,16 @@ class WeightChoice:
 def choose_weight(
     held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8
 ) -> WeightChoice:
-    """Find the weight of the lowest held-out NLL: a geometric ladder brackets it, then half a rung to
-    the side of the lower neighbour, then the vertex of a parabola.
+    """Find the weight with the lowest held-out NLL.
+
+    A geometric ladder of weights brackets the minimum. Half a rung towards the lower neighbour is tried next, then the vertex of
+    a parabola.
 
     Args:
-        held_out_nll: fits with a weight and returns its held-out NLL.
-        first: where to start.
-        factor: between neighbouring rungs.
-        most: fits to spend on the ladder; the lowest rung counts where they do not suffice to bracket.
+        held_out_nll: function that fits with a weight and returns the held-out NLL.
+        first: initial weight.
+        factor: ratio of neighbouring rungs.
+        most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
     """
     tried: dict[float, float] = {}
 
@@ -49,7 +51,7 @@ def choose_weight(
         middle = lowest()
         missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
         if not missing:
-            # the NLL rises faster above than below: a parabola through whole rungs would lean to weights too low
+            # the NLL rises faster above the minimum than below: a parabola through whole rungs would be biased to low weights
             visit(middle + math.copysign(0.5, tried[middle - 1] - tried[middle + 1]))
             break
         visit(missing[0])
@@ -57,7 +59,7 @@ def choose_weight(
 
 
 def _vertex(tried: dict[float, float]) -> float:
-    """Where the parabola through the lowest of the rungs and its neighbours on either side is lowest."""
+    """The vertex of the parabola through the lowest rung and its neighbours."""
     best = min(tried, key=lambda rung: tried[rung])
     below = max((rung for rung in tried if rung < best), default=None)
     above = min((rung for rung in tried if rung > best), default=None)
@@ -66,5 +68,5 @@ def _vertex(tried: dict[float, float]) -> float:
     left, right = (tried[best] - tried[below]) / (best - below), (tried[above] - tried[best]) / (above - best)
     if not right > left:
         return best
-    # where the slope, left and right half-way to the neighbours, is zero
+    # zero of the linearly interpolated slope between the midpoints to the neighbours
     return 0.5 * (below + best) - left * 0.5 * (above - below) / (right - left)

@@ -1,4 +1,4 @@
-"""Methods of reconstruction, one file each; a file without an underscore is a method."""
+"""Reconstruction methods: every file without an underscore is one method."""
 
 import lazy_loader as _lazy
 

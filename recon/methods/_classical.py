@@ -1,4 +1,4 @@
-"""Back-projection and SIRT on a tilt series as it comes, their settings chosen by tilts left out of the reconstruction."""
+"""Back-projection and SIRT of a tilt series, with settings chosen by held-out tilts."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class LineIntegralProblem:
     Attributes:
         line_integrals: (tilt, y, u).
         projector: the operator.
-        response: from line integrals to pixel values above `level`.
-        level: of linear images, detector units; kept apart because float32 cannot hold a large one beside the image.
+        response: converts line integrals to pixel values above `level`.
+        level: constant level of linear images, detector units; separate to preserve float32 precision.
     """
 
     line_integrals: Tensor
@@ -69,7 +69,7 @@ class LineIntegralProblem:
 def classical(
     name: str, problem: LineIntegralProblem, volume: Tensor, grid: VolumeGrid, choices: dict[str, float | str]
 ) -> Reconstruction:
-    """The result of a method that fits nothing."""
+    """The result of a method without a fitted noise model."""
     result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
     return Reconstruction(result, problem.predict(volume), name, choices=choices)
 
@@ -82,7 +82,7 @@ def in_blocks(
     solve_problem: Callable[[LineIntegralProblem], Tensor],
     choices: dict[str, float | str],
 ) -> Blockwise:
-    """A method whose slices do not depend on each other, block by block, under the response of the whole series."""
+    """Block-wise reconstruction by a method with independent slices, with the response of the whole series."""
     level = level_of(tilt_series)
     response = estimate_response(tilt_series, level=level).to(device)
     projector = SliceProjector(
@@ -109,7 +109,7 @@ def in_blocks(
 def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
 ) -> tuple[str, float]:
-    """Window and cutoff of the back-projection that best predicts tilts left out; with few tilts, the first and 1."""
+    """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
     if _num_views(tilt_series) < _FEWEST:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
@@ -122,9 +122,9 @@ def best_window(
 
 
 def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
-    """The number of SIRT iterations after which tilts left out are predicted best; later ones fit the noise.
+    """The number of SIRT iterations that best predicts held-out tilts; later iterations fit the noise.
 
-    With few tilts, 32.
+    It is 32 if there are few tilts.
     """
     if _num_views(tilt_series) < _FEWEST:
         return 32
@@ -134,7 +134,7 @@ def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage:
 
 
 class _IterationChoice:
-    """A stage that tries more and more iterations, until the last few numbers were no better than the best."""
+    """A stage that tries increasing numbers of iterations until the last few were not better than the best."""
 
     def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float]) -> None:
         self.rest, self.score = rest, score
@@ -159,11 +159,11 @@ class _IterationChoice:
         return f"best {self.best}"
 
     def state(self) -> dict[str, Any]:
-        """Where it is."""
+        """Current state."""
         return {"volume": self.volume, "tried": self.tried, "done": self.done, "num_steps": self.num_steps}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state."""
         self.volume, self.tried = state["volume"], state["tried"]
         self.done, self.num_steps = state["done"], state["num_steps"]
 
@@ -173,9 +173,9 @@ def _num_views(tilt_series: TiltSeries) -> int:
 
 
 def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
-    """A slab without every fifth view, and a judge: how well a volume's projections correlate with the tilts left out.
+    """A slab without every fifth view, and a score: the correlation of a volume's projections with the held-out tilts.
 
-    Views are counted by angle and left out with all their twins, for a twin that stays gives the noise away.
+    Views are counted by angle and held out with all their duplicates, because a remaining duplicate would reveal the noise.
     """
     tilt_series, _ = without_level(tilt_series)
     rows = contrast_slab(tilt_series, _SLAB)

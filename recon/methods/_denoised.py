@@ -1,4 +1,4 @@
-"""Images denoised one by one, then another method."""
+"""Reconstruction of individually denoised images by another method."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
 def after_denoising(name: str, description: str, method: Method) -> Method:
-    """A method that is another one on denoised images; a calibrated noise model tells the denoiser the noise level."""
+    """A method that applies another one to denoised images; the denoiser takes the noise level from a calibrated model."""
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
         denoiser = settings.denoiser or "nlm"

@@ -1,4 +1,4 @@
-"""What methods that fit a volume share: one joint fit with options of its own, whole or in blocks."""
+"""Shared code of methods that fit a volume: a joint fit with options, of the whole volume or in blocks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import dark_level, lowered_by
 
 Options = Callable[[Settings], dict[str, Any]]
-"""From what a user settled to further options of a `JointReconstructor`."""
+"""Function from user settings to further options of a `JointReconstructor`."""
 
 
 def fitted(
@@ -40,13 +40,13 @@ def fitted(
     keeps_noise_model: bool = False,
     refuses: tuple[str, ...] = (),
 ) -> Method:
-    """A method that is a joint fit.
+    """Create a method that is a joint fit.
 
     Args:
-        name, description: of the method.
-        options: of the joint fit, besides what a user settled.
-        keeps_noise_model: whether it takes a calibrated noise model.
-        refuses: settings that are part of the method.
+        name, description: name and description of the method.
+        options: options of the joint fit, in addition to user settings.
+        keeps_noise_model: whether it accepts a calibrated noise model.
+        refuses: settings that users cannot change.
     """
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
@@ -100,17 +100,17 @@ def fitted(
 
 @dataclass(frozen=True)
 class FittedBlock:
-    """Fits the slices of a block under what is settled for all.
+    """Fits the slices of a block with the choices made for all slices.
 
     Attributes:
         fit: the joint fit.
-        settled: by it, for all slices.
-        grid: of the whole volume.
-        level: that is taken off the images.
-        progress: called with the steps done, those expected, and a note; None on another machine.
-        near: a signal model whose projector can be used again; None on another machine.
-        num_samples: that error bars come from; 0 for none.
-        run_stage: carries them out; another machine keeps nothing of a block that is not done.
+        settled: its choices for all slices.
+        grid: grid of the whole volume.
+        level: constant level that is subtracted from the images.
+        progress: called with completed steps, expected steps and a note; None on a remote worker.
+        near: a signal model whose projector can be reused; None on a remote worker.
+        num_samples: number of posterior samples for error bars; 0 for none.
+        run_stage: runs the sampling; remote workers do not save unfinished blocks.
     """
 
     fit: JointReconstructor
@@ -139,17 +139,17 @@ class FittedBlock:
         return *arrays, bars.std.attenuation, bars.bias.attenuation, powers
 
     def prefix_of(self, block: Block) -> str:
-        """Of the names of a block's fits."""
+        """Prefix of the names of the fits of a block."""
         return f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: "
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what belongs to this process: progress bar, journal and matrices."""
+        """State without objects of this process: progress bar, journal and matrices."""
         fit = replace(self.fit, run_fit=run_fit)
         return self.__dict__ | {"progress": None, "near": None, "fit": fit, "run_stage": run_stage}
 
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
-    """The joint fit that a method makes of what a user settled."""
+    """The joint fit of a method with user settings."""
     names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
     if settings.regulariser is not None:
@@ -158,8 +158,8 @@ def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
-    """What is taken off the images before the fit; nothing under a calibrated noise model, which knows its detector's level, and
-    nothing off integers that reach the end of their type, which tells where the detector saturates."""
+    """The constant level to subtract from the images before the fit. It is 0 with a calibrated noise model, which includes the
+    level, and for integers that reach the limit of their type, which indicates saturation."""
     kind = tilt_series.images.dtype
     saturated = np.issubdtype(kind, np.integer) and tilt_series.images.max() == np.iinfo(kind).max
     return 0.0 if settings.noise_model is not None or saturated else dark_level(tilt_series)
@@ -167,8 +167,8 @@ def _level(tilt_series: TiltSeries, settings: Settings) -> float:
 
 @torch.no_grad()
 def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruction:
-    """The result of lowered images in the units of those given; noise models that were `chosen` may depend on the level.
-    Projections are raised where they are."""
+    """Convert the result of images with subtracted level to the original units. Noise models that were `chosen` may depend on
+    the level. Projections are changed in place."""
     if not level:
         return result
     for image in result.projections:
@@ -179,7 +179,7 @@ def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruc
         response.scaled_offset.add_(level / float(response.gain * response.offset_unit))
     if chosen and noise_model is not None:
         noise_model = at_level(as_noise_model(noise_model), level)
-    # the likelihood, where it is another, is least squares: the same at every level
+    # a different likelihood is least squares, which does not depend on the level
     return replace(result, noise_model=noise_model)
 
 
@@ -199,14 +199,14 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
 
 
 def _describe_defocus(defocus: float, model: TomographySignal) -> str:
-    what = "below a quarter of a pixel, left out"
+    what = "below a quarter of a pixel, ignored"
     if isinstance(model.projector, DefocusedProjector):
         what = f"blurs up to {model.projector.blurs[-1]:.2g} pixels"
     return f"{defocus:g}, {what}"
 
 
 def _describe(noise_model: nn.Module) -> str:
-    """A noise model in a few words."""
+    """A short description of a noise model."""
     if isinstance(noise_model, AtLevel):
         return _describe(noise_model.model)
     if not isinstance(noise_model, Digitised):

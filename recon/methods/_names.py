@@ -1,4 +1,4 @@
-"""The names of all methods, without importing any: every module of this folder without an underscore is one."""
+"""Names of all methods, without importing them: every module of this folder without an underscore is a method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ GROUP = "noiseflow.methods"
 
 
 def method_names() -> list[str]:
-    """All methods, without importing any: those of this package, then those of others (entry points ``noiseflow.methods``)."""
+    """All methods, not imported: those of this package, then those of other packages (entry points ``noiseflow.methods``)."""
     own = [module.name for module in iter_modules([str(Path(__file__).parent)]) if not module.name.startswith("_")]
     names = sorted(name.replace("_", "-") for name in own)
     return ["auto", *(name for name in names if name != "auto"), *sorted(plugins(GROUP))]

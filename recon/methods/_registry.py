@@ -1,4 +1,4 @@
-"""What a method of reconstruction is, and how one is found by its name."""
+"""Reconstruction methods: settings, registry, and the function `reconstruct`."""
 
 from __future__ import annotations
 
@@ -34,30 +34,31 @@ from recon.series.views import first_copies
 @described()
 @dataclass(frozen=True)
 class Settings:
-    """What a user may settle; whatever is None the method chooses by itself.
+    """User settings of a reconstruction. The method chooses the values of settings that are None.
 
     Attributes:
-        weight: of the regulariser, see `recon.joint.signal_model.TomographySignal`.
-        regulariser: what a fitted volume is expected to look like, one of `recon.fields.regularisers.regulariser_names`; None as
-            the method has it.
-        uncertainty: samples that error bars of the volume come from; 0 for none.
-        num_steps: steps or iterations.
-        noise_model: a fitted noise model to keep as it is; denoisers take the noise level from it.
-        window: of the back-projection, one of `recon.projection.wbp.WINDOWS`.
+        weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`.
+        regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
+            of the method.
+        uncertainty: number of posterior samples for error bars of the volume; 0 for none.
+        num_steps: number of steps or iterations.
+        noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
+        window: window of the back-projection, one of `recon.projection.wbp.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
-        defocus: blur that fitted methods model, pixels per voxel out of the plane of focus.
-        seed: of every random choice.
-        device: where to compute.
-        progress: called with the steps done, those expected, and a note.
-        prefix: of the names of fits, where one run makes several volumes.
-        keep: gives the folder in which finished blocks are kept for a run that resumes; by default they are kept until the volume
-            is whole. It is called with the prefix.
-        forget: removes what fits of a prefix have reached, called when their block is kept.
-        run_fit, run_stage: run every fit and every other long piece of work; a `recon.joint.checkpoint.Journal` keeps what each
-            has reached.
+        defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
+        seed: seed of all random choices.
+        device: torch device.
+        progress: called with completed steps, expected steps and a note.
+        prefix: prefix of the names of fits, if one run makes several volumes.
+        keep: function from the prefix to the folder for finished blocks, so that a run can resume; by default they are deleted
+            when the volume is complete.
+        forget: function that removes the states of fits with a prefix; called when their block is stored.
+        run_fit, run_stage: run every fit and every other long computation; a `recon.joint.checkpoint.Journal` saves the states
+            and results.
 
     Raises:
-        ValueError: a negative weight, no steps, a defocus outside 0 to 1, an unknown window or regulariser, or one sample.
+        ValueError: a value is out of range: weight, number of steps, defocus (0 to 1), number of samples (0, or 2 and more); or
+            window or regulariser is unknown.
     """
 
     weight: float | None = None
@@ -87,7 +88,7 @@ class Settings:
         if self.regulariser is not None:
             find_regulariser(self.regulariser)
         if self.uncertainty < 0 or self.uncertainty == 1:
-            raise ValueError(f"--uncertainty {self.uncertainty}: a spread needs at least 2 samples; 16 are usual")
+            raise ValueError(f"--uncertainty {self.uncertainty}: give at least 2 samples (typically 16)")
         if self.window is not None and self.window not in WINDOWS:
             raise ValueError(f"--window {self.window}: choose one of {', '.join(WINDOWS)}")
 
@@ -103,19 +104,19 @@ _OF_FITS = ("weight", "regulariser", "defocus", "uncertainty")
 @described()
 @dataclass(frozen=True)
 class Method:
-    """A method of reconstruction.
+    """A reconstruction method.
 
     Attributes:
-        name: as users give it.
+        name: name of the method.
         description: one sentence.
-        run: reconstructs a series on a grid.
-        fitted: whether it fits a volume, and so knows ``weight``, ``defocus`` and what a fit takes of memory.
-        keeps_noise_model: whether it takes a calibrated noise model; another refuses one.
+        run: function that reconstructs a series on a grid.
+        fitted: whether it fits a volume, supports ``weight`` and ``defocus``, and needs the memory of a fit.
+        keeps_noise_model: whether it accepts a calibrated noise model.
         learns_noise: whether its result has a noise model.
-        refuses: settings that it has no use for, or that are part of it.
-        plan: the stages of its fit, the slices of the slab that choices are made on, and the share of the voxels that are not
-            skipped; None where nothing is planned.
-        blockwise: settles what all slices share; None where slices cannot be reconstructed apart.
+        refuses: settings that it does not support.
+        plan: function that returns the stages of its fit, the number of slices of the slab, and the share of voxels that are not
+            skipped; None if there is no plan.
+        blockwise: function that makes the choices for all slices; None if blocks are not supported.
 
     Example:
         >>> from recon.methods import find_method
@@ -135,7 +136,7 @@ class Method:
     blockwise: SettleBlocks | None = None
 
     def takes(self, setting: str) -> bool:
-        """Whether it has a use for a setting."""
+        """Whether it supports a setting."""
         return setting not in self.refuses and (self.fitted or setting not in _OF_FITS)
 
 
@@ -144,34 +145,34 @@ _Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
 
 @cache
 def find_method(name: str) -> Method:
-    """The method of a name.
+    """Return the method with a given name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the name is unknown.
     """
     if name not in method_names():
         raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
     other = plugins(GROUP).get(name)
     found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
     if not isinstance(found, Method):
-        raise TypeError(f"method {name} is a {type(found).__name__}; a method is a recon.methods.Method")
+        raise TypeError(f"method {name} is a {type(found).__name__}; it must be a recon.methods.Method")
     return found
 
 
 def settings_of(method: str, **settings: Any) -> Settings:
-    """The settings of a method, checked before there are data.
+    """Check the settings of a method before data are read.
 
     Args:
         method: one of `method_names`.
         **settings: the attributes of `Settings`.
 
     Raises:
-        ValueError: an unknown method, or settings that make no sense.
+        ValueError: the method is unknown, or a setting is invalid or not supported.
     """
     chosen, found = Settings(**settings), find_method(method)
     if chosen.noise_model is not None and not found.keeps_noise_model:
         able = [name for name in method_names() if find_method(name).keeps_noise_model]
-        raise ValueError(f"--noise-model: method {method} takes none; use --method {', '.join(able)}")
+        raise ValueError(f"--noise-model: method {method} does not support it; use --method {', '.join(able)}")
     given = {
         "defocus": bool(chosen.defocus),
         "weight": chosen.weight is not None,
@@ -183,7 +184,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
     }
     for name in (name for name, is_given in given.items() if is_given and not found.takes(name)):
         able = [other for other in method_names() if find_method(other).takes(name)]
-        raise ValueError(f"--{name}: method {method} has no use for it; use --method {', '.join(able)}")
+        raise ValueError(f"--{name}: method {method} does not support it; use --method {', '.join(able)}")
     return chosen
 
 
@@ -201,20 +202,20 @@ def reconstruct(
     """Reconstruct a volume from a tilt series.
 
     Args:
-        tilt_series: the images; `recon.prepare` aligns, screens and checks raw ones.
-        grid: voxels and their size; by default one voxel per pixel and as deep as wide.
+        tilt_series: the images; use `recon.prepare` to align, screen and check raw series.
+        grid: voxel grid; by default one voxel per pixel, with a depth equal to the width.
         method: one of `method_names`.
-        slices_at_once: reconstruct in blocks of so many slices, where memory is short.
-        scratch: with `slices_at_once`, a new ``.npy`` or MRC file that holds the volume; the result maps it to memory.
-        client: with `slices_at_once`, a ``dask.distributed.Client`` whose workers reconstruct the blocks; they must see the
-            folder of `scratch`.
+        slices_at_once: reconstruct in blocks of this many slices, to save memory.
+        scratch: with `slices_at_once`, a new ``.npy`` or MRC file for the volume, which the result memory-maps.
+        client: with `slices_at_once`, a ``dask.distributed.Client`` whose workers reconstruct the blocks; they need access to
+            the folder of `scratch`.
         **settings: the attributes of `Settings`.
 
     Returns:
-        The volume, projections in the order of the tilts, and the response by rising angle.
+        The volume, projections in the order of the tilts, and the response by increasing angle.
 
     Raises:
-        ValueError: an unknown method, settings that make no sense, or a grid that does not match the images.
+        ValueError: the method is unknown, a setting is invalid or not supported, or the grid does not match the images.
 
     Example:
         >>> import numpy as np, recon
@@ -227,7 +228,7 @@ def reconstruct(
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
-    if (np.diff(order) != 1).any():  # the order of the tilts must not change the volume by a bit
+    if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
         result = reconstruct(
             tilt_series.select(order),
             grid,
@@ -245,15 +246,15 @@ def reconstruct(
             raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
         if found.blockwise is None:
             able = [name for name in method_names() if find_method(name).blockwise is not None]
-            raise ValueError(f"--slices-at-once does not know --method {method}: choose {', '.join(able)}")
+            raise ValueError(f"--slices-at-once: method {method} does not support it; use --method {', '.join(able)}")
         if scratch is None:
-            raise ValueError("slices_at_once needs scratch, the path of a new .npy file that holds the volume")
+            raise ValueError("slices_at_once needs scratch, the path of a new .npy file for the volume")
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found.blockwise, blocks)
     if chosen.noise_model is not None and needs_image(chosen.noise_model):
         return _of_distinct_tilts(
             run, found, tilt_series, grid, chosen
-        )  # maps of the detector's pixels stay where they are
+        )  # per-pixel maps of the detector are not transformed
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
@@ -262,7 +263,7 @@ def reconstruct(
 def _of_distinct_tilts(
     run: _Run, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
 ) -> Reconstruction:
-    """Run a method on a series by rising angle; a fit sees copies once, or their noise would count as signal."""
+    """Run a method on a series sorted by angle. Fits use duplicate images once; otherwise their noise would count as signal."""
     first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)
     kept, place = np.unique(first, return_inverse=True)
     seen = tilt_series if len(kept) == len(first) else tilt_series.select(kept)

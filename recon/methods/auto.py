@@ -1,4 +1,4 @@
-"""The method that is used where none is named."""
+"""The default method."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best."""
+"""Least squares on plain voxels without total variation, with early stopping."""
 
 from noiseflow import Gaussian
 from recon.fields.fields import VoxelField

@@ -1,4 +1,4 @@
-"""Volume and noise model together."""
+"""The joint fit of volume and noise model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joint fit's volume under a calibrated noise model."""
+"""The joint fit with a fixed, calibrated noise model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Least absolute deviations in the field of the joint fit."""
+"""Least absolute deviations with the field and the regulariser of the joint fit."""
 
 from recon.joint.laplace import Laplace
 from recon.methods._fitted import fitted

@@ -1,4 +1,4 @@
-"""Least squares in the field of the joint fit."""
+"""Least squares with the field and the regulariser of the joint fit."""
 
 from noiseflow import Gaussian
 from recon.methods._fitted import fitted

@@ -1,4 +1,4 @@
-"""Simultaneous iterative reconstruction."""
+"""Simultaneous iterative reconstruction technique (SIRT)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
 
 METHOD = Method(
     "sirt",
-    "SIRT; the number of iterations is chosen by tilts left out.",
+    "SIRT; the number of iterations is chosen by held-out tilts.",
     _run,
     refuses=("window", "denoiser"),
     blockwise=_blockwise,

@@ -35,7 +35,7 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
 
 METHOD = Method(
     "wbp",
-    "Weighted back-projection; window and cutoff are chosen by tilts left out.",
+    "Weighted back-projection; window and cutoff are chosen by held-out tilts.",
     _run,
     refuses=("steps", "denoiser"),
     blockwise=_blockwise,

@@ -1,4 +1,4 @@
-"""Images denoised one by one, then back-projection."""
+"""Weighted back-projection of individually denoised images."""
 
 from recon.methods import wbp
 from recon.methods._denoised import after_denoising

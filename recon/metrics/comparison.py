@@ -1,4 +1,4 @@
-"""A volume beside its reference: errors in three dimensions and in projections, shell correlation, and the pictures."""
+"""Comparison of a volume with a reference: errors of volume and projections, Fourier shell correlation, and figures."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
-_SLAB_VOXELS = 2**24  # that are projected at a time
-_PREVIEW = 256  # voxels along each axis at most, which set the limits of grey
+_SLAB_VOXELS = 2**24  # projected at a time
+_PREVIEW = 256  # largest number of voxels per axis for the choice of grey levels
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What there is to say of a volume and its reference.
+    """The comparison of a volume with a reference.
 
     Attributes:
-        volume: errors in three dimensions by scaling (``raw``, ``affine``, ``min-max``).
-        projections: the same of projections, image by image; empty where no angles were given.
+        volume: errors of the volume by scaling (``raw``, ``affine``, ``min-max``).
+        projections: errors of projections, image by image; empty if no angles were given.
         frequency, correlation: (N,) Fourier shell correlation, cycles per voxel.
         crossings: threshold → frequency, cycles per voxel.
-        expected: the correlation that the volume's error bars lead to expect of the truth, where they are known.
+        expected: correlation with the truth that is expected from the error bars of the volume, if known.
     """
 
     volume: dict[str, Errors]
@@ -55,7 +55,7 @@ class Comparison:
     expected: ShellBand | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for programs."""
+        """JSON-serialisable values."""
         both = {"volume": self.volume, "projections": self.projections}
         errors = {name: {scaling: asdict(e) for scaling, e in part.items()} for name, part in both.items()}
         crossings = {f"fsc_{threshold:g}": value for threshold, value in self.crossings.items()}
@@ -75,14 +75,14 @@ def compare_volumes(
     """Compare a volume with its reference.
 
     Args:
-        volume: to be judged.
+        volume: the volume to evaluate.
         reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
-        mode: what a projection is: line integrals (``linear``), or exp(−line integral).
-        progress: called with the steps done, of `NUM_STEPS`, and a note.
+        mode: type of the projections: line integrals (``linear``), or exp(−line integral) (``transmission``).
+        progress: called with the completed steps (of `NUM_STEPS`) and a note.
 
     Raises:
-        ValueError: sizes or voxel sizes differ, voxels are not finite, or the reference is flat.
+        ValueError: shapes or voxel sizes differ, voxels are not finite, or the reference is constant.
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
@@ -102,7 +102,7 @@ def compare_volumes(
 
 
 def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
-    """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmissions of an incident intensity of one."""
+    """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmission with an incident intensity of 1."""
     depth, height, width = volume.shape
     images = np.empty((len(tilt_angles), height, width), np.float32)
     rows = max(1, _SLAB_VOXELS // (depth * width))
@@ -119,30 +119,32 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
     first, second = volume.attenuation, reference.attenuation
     for name, array in (("volume", first), ("reference", second)):
         if array.ndim != 3:
-            raise ValueError(f"the {name} has shape {array.shape}; a volume (z, y, x) is needed")
+            raise ValueError(f"the {name} has shape {array.shape}; give a volume (z, y, x)")
     if first.shape != second.shape:
         sizes = [" x ".join(map(str, array.shape)) for array in (first, second)]
         raise ValueError(
-            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one of them to the other's grid"
+            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one to the grid of the other"
         )
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
             f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "
-            "resample one of them, or mend its header"
+            "resample one of them, or correct its header"
         )
 
 
 def comparison_report(volume: Array, reference: Array, comparison: Comparison, *, names: tuple[str, str]) -> Report:
-    """A page with slices of both volumes and their difference, the shell correlation and the table of errors.
+    """A page with slices of both volumes and their difference, the Fourier shell correlation and a table of errors.
 
     Args:
         volume, reference: (z, y, x).
-        comparison: of the two.
-        names: of the two, for the titles.
+        comparison: their comparison.
+        names: their names, for titles.
     """
     report = Report(f"{names[0]} compared with {names[1]}")
     header, rows = error_table(comparison)
-    report.table(header, rows, caption="MSE in squared ranges of the reference; projections are compared one by one.")
+    report.table(
+        header, rows, caption="MSE in units of the squared range of the reference; projections are compared one by one."
+    )
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume, _PREVIEW), strided(reference, _PREVIEW)
     limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
@@ -165,7 +167,7 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
 
 
 def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows of the errors, for people."""
+    """Table header and rows of the errors."""
     header = ("compared", "MSE", "PSNR (dB)", "DSSIM")
     parts = {"volume": comparison.volume, "projections": comparison.projections}
     rows: list[tuple[str, ...]] = [

@@ -1,4 +1,4 @@
-"""How far a volume or projection is from its reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
+"""Errors of a volume or projection relative to a reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from noiseflow.io.mapped import IN_MEMORY, temporary_map
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
 Array = NDArray[Any]
-_SLAB_ELEMENTS = 2**22  # of a spectrum that are held at a time: 64 MiB
+_SLAB_ELEMENTS = 2**22  # elements of a spectrum in memory at a time: 64 MiB
 
 
 @described(mse="squared ranges", psnr="dB")
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one array against its reference, both scaled by the reference's range.
+    """Errors of an array relative to a reference, both scaled by the range of the reference.
 
     Attributes:
-        mse: mean squared error, in squared ranges of the reference.
+        mse: mean squared error, in units of the squared range of the reference.
         psnr: peak signal-to-noise ratio, dB.
         dssim: (1 − SSIM) / 2, the mean over slices along the first axis.
     """
@@ -43,11 +43,11 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
     Args:
         result: (z, y, x) or (y, x), an array or a tensor.
         reference: the truth, same shape.
-        scaling: ``raw`` takes the numbers as they are; ``affine`` first fits gain and offset of `result` by least
-            squares; ``min-max`` brings both to [0, 1], as the tables of Kniesel et al. do.
+        scaling: ``raw`` uses the values unchanged; ``affine`` first fits gain and offset of `result` by least squares;
+            ``min-max`` scales both to [0, 1], as in the tables of Kniesel et al.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, the reference is flat, or images have fewer than 3 x 3 pixels.
+        ValueError: shapes differ, pixels are not finite, the reference is constant, or images have fewer than 3 x 3 pixels.
 
     Example:
         >>> import numpy as np, recon
@@ -71,13 +71,13 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
 
 
 def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
-    """`result` brought to the scale of `reference`, as `compare` does it."""
+    """`result` at the scale of `reference`, as in `compare`."""
     return matching_line(result, reference, scaling)(result)
 
 
 @dataclass(frozen=True)
 class Line:
-    """(values − centre)·gain + level."""
+    """The linear map (values − centre)·gain + level."""
 
     centre: float
     gain: float
@@ -89,7 +89,7 @@ class Line:
 
 
 def matching_line(result: Array, reference: Array, scaling: Scaling) -> Line:
-    """What brings a result to the scale of its reference; volumes are looked at section by section."""
+    """The linear map from a result to the scale of its reference; volumes are processed section by section."""
     if scaling == "raw":
         return Line(0.0, 1.0, 0.0)
     if scaling == "min-max":
@@ -119,7 +119,7 @@ def fourier_shell_correlation(first: Given, second: Given) -> tuple[Given, Given
         first, second: arrays or tensors of the same shape.
 
     Returns:
-        Frequencies in cycles per voxel up to 0.5, and the correlation at each; of the kind given.
+        Frequencies in cycles per voxel up to 0.5, and the correlation at each, of the same array type as the input.
 
     Raises:
         ValueError: shapes differ, or pixels are not finite.
@@ -140,8 +140,8 @@ def fourier_shell_correlation(first: Given, second: Given) -> tuple[Given, Given
 
 
 def _shell_sums(first: Array, second: Array, shells: int) -> Array:
-    """(3, shells + 1) of products of two spectra and of their powers; slab by slab, with the spectra in temporary files where
-    they are large."""
+    """(3, shells + 1) shell sums of the product of two spectra and of their powers, computed slab by slab; large spectra are
+    in temporary files."""
     if first.ndim == 2:
         first, second = first[None], second[None]
     depth, height, _ = first.shape
@@ -157,12 +157,12 @@ def _shell_sums(first: Array, second: Array, shells: int) -> Array:
 
 
 def shells_of(shape: tuple[int, ...], shells: int, rows: slice = slice(None)) -> tuple[NDArray[np.intp], Array]:
-    """The shell of each frequency (kz, ky, kx) of a real volume's half spectrum, and how often that half stands for it, (kx,).
+    """The shell of each frequency (kz, ky, kx) in the half spectrum of a real volume, and its multiplicity, (kx,).
 
     Args:
         shape: (z, y, x).
-        shells: up to 0.5 cycles per voxel; higher numbers lie in the corners beyond.
-        rows: along ky.
+        shells: number of shells up to 0.5 cycles per voxel; frequencies in the corners have higher indices.
+        rows: range along ky.
     """
     z, y, x = np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1])[rows], np.fft.rfftfreq(shape[2])
     squared = (z**2)[:, None, None] + (y**2)[:, None] + x**2
@@ -174,9 +174,9 @@ def shells_of(shape: tuple[int, ...], shells: int, rows: slice = slice(None)) ->
 
 
 def _section_spectra(volume: Array) -> Array:
-    """(z, ky, kx) the Fourier transform of every section of a volume, its non-negative half along x."""
+    """(z, ky, kx) Fourier transform of every section of a volume, non-negative half along x."""
     shape = (*volume.shape[:2], volume.shape[2] // 2 + 1)
-    exact = 16 * math.prod(shape) <= IN_MEMORY  # beyond, room on the disk counts for more than the eighth digit
+    exact = 16 * math.prod(shape) <= IN_MEMORY  # for larger volumes, disk space matters more than the eighth digit
     found = temporary_map(shape, np.complex128 if exact else np.complex64, in_memory=IN_MEMORY)
     for target, section in zip(found, volume, strict=True):
         target[...] = np.fft.rfft2(np.asarray(section, dtype=np.float64))
@@ -184,12 +184,12 @@ def _section_spectra(volume: Array) -> Array:
 
 
 def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
-    """Compare images with their references one by one; the mean of each error.
+    """Compare images with their references one by one, and return the mean errors.
 
     Args:
         result: (image, y, x).
         reference: the truth, same shape.
-        scaling: as `compare`, for every image by itself.
+        scaling: as in `compare`, applied to every image separately.
 
     Raises:
         ValueError: as `compare`.
@@ -208,11 +208,11 @@ def resolution(frequency: Array, correlation: Array, threshold: float) -> float:
 
     Args:
         frequency: (N,) cycles per voxel, increasing.
-        correlation: (N,) as `fourier_shell_correlation` gives them; the first shell, the mean, does not count.
-        threshold: 0.143 for two independent halves, 0.5 against a truth or between halves of old (doi:10.1016/j.jmb.2003.07.013).
+        correlation: (N,) from `fourier_shell_correlation`; the first shell, the mean, is ignored.
+        threshold: 0.143 for two independent halves (doi:10.1016/j.jmb.2003.07.013), 0.5 against the truth.
 
     Returns:
-        Cycles per voxel; 0.5 where it never falls so low, 0 where it starts there.
+        Cycles per voxel; 0.5 if it never falls below the threshold, 0 if it starts below it.
     """
     below = np.flatnonzero(correlation[1:] < threshold) + 1
     if not below.size:
@@ -225,7 +225,7 @@ def resolution(frequency: Array, correlation: Array, threshold: float) -> float:
 
 
 def reach_in_words(crossing: float, threshold: float, voxel_size: float | None) -> str:
-    """What `resolution` found, and as a length where the voxels (Å) are known."""
+    """A description of a result of `resolution`, also as a length if the voxel size (Å) is known."""
     words = f"stays above {threshold:g} up to {crossing:.3f} cycles per voxel"
     if not voxel_size or not crossing:
         return words
@@ -240,7 +240,7 @@ def _similarity(result: Array, reference: Array, span: float) -> float:
     window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)
     if window < 3:
         raise ValueError(
-            f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are needed"
+            f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are required"
         )
     return float(structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
 

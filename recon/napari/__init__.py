@@ -1,4 +1,4 @@
-"""Plugin for napari (extra ``[napari]``): opens tilt series and volumes, writes volumes, reconstructs with progress."""
+"""Plugin for napari (extra ``[napari]``): reads tilt series and volumes, writes volumes, and reconstructs."""
 
 from __future__ import annotations
 

@@ -16,17 +16,17 @@ LayerData = tuple[Any, dict[str, Any], str]
 
 
 def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerData]] | None:
-    """The reader of a path, or None where noiseflow does not read it; one path at a time."""
+    """The reader for a path, or None if noiseflow cannot read it; only single paths are supported."""
     if not isinstance(path, str) or Path(path).suffix.lower() not in io.SUFFIXES:
         return None
     return read_layers
 
 
 def read_layers(path: str | list[str]) -> list[LayerData]:
-    """Read an image, tilt series or volume as one layer, with its voxel size in Å; error bars beside it become hidden layers.
+    """Read an image, tilt series or volume as a layer, with its voxel size in Å; error bars next to it become hidden layers.
 
-    A stack with tilt angles in or beside the file keeps them in the layer's metadata as ``tilt_angles``, degrees. Its first
-    axis has no length; it steps by a pixel, so that one slider moves through it and through its volume.
+    Tilt angles in or next to the file are stored in the metadata of the layer as ``tilt_angles``, degrees. The tilt axis of the
+    stack has no length; its step is one pixel, so that one slider moves through the stack and its volume.
 
     Raises:
         FileNotFoundError, ValueError: as `noiseflow.io.read`.
@@ -50,22 +50,22 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
 
 
 def _read(path: str | Path) -> io.ImageFile:
-    """A file whose pixels stay on the disk, where they are many, until they are looked at."""
+    """Read a file; large files are memory-mapped."""
     return io.read(path, mapped=is_large(path))
 
 
 def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerData:
-    """A hidden layer of standard deviations or biases in the place of its volume's, with colours for either side of zero."""
+    """A hidden layer of standard deviations or biases at the position of its volume, with a diverging colour map."""
     reach = max(float(np.abs(section).max()) for section in values) or 1.0
     look = {"name": name, "visible": False, "colormap": "PiYG", "contrast_limits": (-reach, reach)}
     return values, {**look, "scale": volume["scale"], "metadata": dict(volume["metadata"])}, "image"
 
 
 def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:
-    """Write one layer as MRC, TIFF, NumPy or OME-Zarr; returns the path written.
+    """Write one layer as MRC, TIFF, NumPy or OME-Zarr, and return the path.
 
     Raises:
-        ValueError: an unknown suffix, or pixels the format cannot hold.
+        ValueError: the suffix is unknown, or the format cannot store the pixels.
     """
     pixels = np.asarray(data)
     size = attributes.get("metadata", {}).get("voxel_size")

@@ -1,6 +1,6 @@
-"""The widget of the napari plugin: reconstructs the chosen layer without blocking the viewer.
+"""The widget of the napari plugin: reconstructs the selected layer without blocking the viewer.
 
-Annotations are evaluated here, because magicgui makes the form from them.
+Annotations are evaluated in this module, because magicgui creates the form from them.
 """
 
 from collections.abc import Generator
@@ -13,13 +13,13 @@ from recon.napari.files import LayerData, error_bar_layer
 if TYPE_CHECKING:
     from recon.joint.run import Progress
 
-_STEPS = 0  # as many as the method plans
+_STEPS = 0  # the default number of the method
 _BUTTON = "Reconstruct"
 _SHARES = 100
 
 
 def reconstruct_layer(images: Any, metadata: dict[str, Any], **settings: Any) -> LayerData:
-    """The volume alone, (z, y, x); arguments and errors as `reconstruct_layers`."""
+    """Reconstruct only the volume, (z, y, x); arguments and errors as for `reconstruct_layers`."""
     return reconstruct_layers(images, metadata, **settings)[0]
 
 
@@ -36,22 +36,22 @@ def reconstruct_layers(
     uncertainty: int = 0,
     progress: "Progress | None" = None,
 ) -> list[LayerData]:
-    """Reconstruct a tilt series to a layer (z, y, x); with error bars, their standard deviation and bias become hidden layers.
+    """Reconstruct a tilt series as a layer (z, y, x). Standard deviation and bias of error bars become hidden layers.
 
     Args:
         images: (tilt, y, x), tilt axis along y.
-        metadata: of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used where they are there.
-        angles: angle file, in place of the layer's own.
+        metadata: metadata of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used if present.
+        angles: angle file, instead of the angles of the layer.
         mode: ``linear`` or ``transmission``.
-        method: one of `recon.methods.METHODS`.
+        method: one of `recon.methods.method_names`.
         thickness: voxels along the beam; 0 for the image width.
-        num_steps: of the fit; 0 for as many as the method plans.
+        num_steps: steps of the fit; 0 for the default of the method.
         invert_tilt: flip the sign of the angles.
-        uncertainty: samples that error bars come from; 0 for none.
-        progress: called with the steps done, those expected, and a note.
+        uncertainty: number of posterior samples for error bars; 0 for none.
+        progress: called with completed steps, expected steps and a note.
 
     Raises:
-        ValueError: no angles are known, or the series cannot be reconstructed so.
+        ValueError: there are no tilt angles, or the series cannot be reconstructed with these settings.
     """
     import numpy as np
 
@@ -82,7 +82,7 @@ def reconstruct_layers(
 
 
 def reconstruct_widget() -> Any:
-    """A form with a button; the volume becomes a new layer, and napari shows the progress."""
+    """Create the form; the volume becomes a new layer, and napari shows the progress."""
     from magicgui import magicgui
     from napari.layers import Image
     from napari.viewer import Viewer
@@ -114,18 +114,18 @@ def reconstruct_widget() -> Any:
     form: Any = magicgui(
         start,
         call_button=_BUTTON,
-        angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "where the layer has no angles"},
+        angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "required if the layer has no angles"},
         mode={"choices": ["linear", "transmission"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
         method={"choices": [name for name in method_names() if name != "joint-supervised"]},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
-        num_steps={"min": 0, "max": 10_000, "label": "steps (0: as planned)"},
-        uncertainty={"min": 0, "max": 1000, "label": "samples of error bars (0: none)"},
+        num_steps={"min": 0, "max": 10_000, "label": "steps (0: default)"},
+        uncertainty={"min": 0, "max": 1000, "label": "samples for error bars (0: none)"},
     )
     return form
 
 
 def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
-    """Add the volume, and its error bars, in place of the tilts, and go to its middle."""
+    """Replace the tilts by the volume and its error bars, and show its middle section."""
     for values, look, _ in layers:
         viewer.add_image(values, **look)
     tilts.visible = False
@@ -134,7 +134,7 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:
-    """A worker that fits in a thread of its own and yields at every step, which moves napari's progress bar."""
+    """A worker that fits in a separate thread and yields at every step to update napari's progress bar."""
     import queue
     import threading
 
@@ -158,7 +158,7 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
                         **options,
                     )
                 )
-            except Exception as error:  # handed on to the viewer, which shows it
+            except Exception as error:  # passed to the viewer, which shows it
                 found.append(error)
             finally:
                 steps.put(None)

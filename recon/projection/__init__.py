@@ -1,1 +1,1 @@
-"""From volumes to images: the slice operator, tiles, defocus, rays and the detector response."""
+"""Projection of volumes to images: slice operator, tiles, defocus, rays and detector response."""

@@ -1,4 +1,4 @@
-"""What a projector is: line integrals of a volume, and their adjoint. Kernels and geometries plug in here."""
+"""Base class of projectors: line integrals of a volume, and their adjoint."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class Projector(ABC):
-    """Line integrals along the rays of a single-axis tilt series, linear in the volume.
+    """Base class of linear operators from volumes to line integrals of a single-axis tilt series.
 
-    A projector defines `project` and `backproject` in the native layout, in which slices are columns: no copies are made. The
-    rest has defaults; `has_parts` and `half` say what a projector can do beyond that.
+    A subclass defines `project` and `backproject` in the native layout, in which slices are columns and no copies are needed.
+    Everything else has defaults; `has_parts` and `half` indicate optional capabilities.
 
     Attributes:
         tilt_angles: (tilts,) degrees.
@@ -35,12 +35,12 @@ class Projector(ABC):
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """Where the projector computes."""
+        """Device of the computation."""
 
     @property
     @abstractmethod
     def dtype(self) -> torch.dtype:
-        """Number type it computes in."""
+        """Data type of the computation."""
 
     @abstractmethod
     def project(self, columns: Tensor) -> Tensor:
@@ -52,29 +52,29 @@ class Projector(ABC):
 
     @property
     def num_tilts(self) -> int:
-        """How many tilts the series has."""
+        """Number of tilts."""
         return int(np.size(self.tilt_angles))
 
     @property
     def has_parts(self) -> bool:
-        """Whether slices are projected one by one, and `part` gives the matrix of some of their columns; False."""
+        """Whether slices are projected independently and `part` returns submatrices. Default: False."""
         return False
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose.
 
         Raises:
-            ValueError: the projector has no parts.
+            ValueError: the projector does not support submatrices.
         """
-        raise ValueError(f"{type(self).__name__} has no parts; ask has_parts first")
+        raise ValueError(f"{type(self).__name__} has no parts; check has_parts first")
 
     def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> Projector | None:
-        """The projector of a voxel grid half as fine, to every second pixel along u; None where there is none.
+        """The projector of a grid with half the resolution to every second pixel along u; None if not supported.
 
         Args:
             depth, width: voxels of that grid along z and x.
-            num_columns: pixels taken of each image.
-            first_columns: (tilts,) the first of them, 0 or 1.
+            num_columns: number of pixels of each image.
+            first_columns: (tilts,) index of the first pixel, 0 or 1.
         """
         return None
 
@@ -84,7 +84,7 @@ class Projector(ABC):
         _require(volume, "attenuation (z, y, x)", self.depth, self.width)
         return alike(from_rays(self.project(to_columns(volume)), self.num_tilts), attenuation)
 
-    def T(self, line_integrals: Given) -> Given:  # reads as the transposed operator it is
+    def T(self, line_integrals: Given) -> Given:  # named like the transposed operator
         """Back-project images (tilt, y, u) to a volume (z, y, x): the exact adjoint of calling the projector."""
         images = as_tensor(line_integrals, like=self)
         _require(images, "line_integrals (tilt, y, u)", self.num_tilts, self.detector_width)

@@ -1,4 +1,4 @@
-"""Blur that grows with the distance from the focal plane, along the beam: exactly, layer by layer, or by jittered rays."""
+"""Depth-dependent blur of a convergent beam: exact, layer by layer, or by jittered rays."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from recon.projection.rays import march, view_matrices, view_rays
 
 _SUBPIXEL = 0.25
 _MOST_LAYERS = 12
-_REACH = 6  # standard deviations at which a kernel ends
+_REACH = 6  # truncation of kernels, standard deviations
 
 
 def with_defocus(projector: SliceProjector, convergence: float) -> SliceProjector | DefocusedProjector:
-    """The projector with blur where there is any to see, or else the one in focus itself. Raises as `DefocusedProjector`."""
+    """The projector with blur if it is noticeable, otherwise the projector itself. Raises as `DefocusedProjector`."""
     blurred = DefocusedProjector(projector, convergence)
     return blurred if len(blurred.blurs) > 1 else projector
 
 
 class DefocusedProjector(Projector):
-    """Line integrals through a converging beam that is in focus on the tilt axis; takes the place of a `SliceProjector`.
+    """Line integrals of a convergent beam focused on the tilt axis; a replacement for `SliceProjector`.
 
-    What lies at distance w from the focal plane, along the beam, is blurred by a Gaussian of standard deviation
-    ``convergence``·\\|w\\| pixels along u and y. The slab is split into layers of nearly equal blur; each is projected by its
-    part of the matrix and blurred by its own separable kernel. Where the blur is below a quarter of a pixel it is left out, and
-    where that holds everywhere this is the `SliceProjector` itself. Adjoint and gradients are exact.
+    Voxels at a distance w from the focal plane, along the beam, are blurred by a Gaussian with standard deviation
+    ``convergence``·\\|w\\| pixels along u and y. The volume is split into layers of nearly equal blur. Each layer is projected by
+    its part of the matrix and blurred by its own separable kernel. Blur below a quarter of a pixel is ignored; if that is the
+    case everywhere, this equals the `SliceProjector`. Adjoint and gradients are exact.
 
     Args:
         projector: the geometry, in focus.
-        convergence: standard deviation of the beam's slopes, pixels of blur per voxel of distance; about half the semi-angle of
-            convergence, in radians.
-        most_layers: layers with a blur of their own, at most.
+        convergence: standard deviation of the beam's slopes, pixels of blur per voxel of distance; about half the convergence
+            semi-angle in radians.
+        most_layers: largest number of layers.
 
     Attributes:
         blurs: standard deviation in each layer, pixels; the first is zero.
 
     Raises:
-        ValueError: a convergence that is negative or not finite.
+        ValueError: `convergence` is negative or not finite.
     """
 
     def __init__(self, projector: SliceProjector, convergence: float, *, most_layers: int = _MOST_LAYERS) -> None:
@@ -72,7 +72,7 @@ class DefocusedProjector(Projector):
 
     @property
     def reach(self) -> int:
-        """How many slices away the blur is felt."""
+        """Range of the blur, slices."""
         return _reach(max(self.blurs))
 
     def project(self, columns: Tensor) -> Tensor:
@@ -102,15 +102,16 @@ def jittered_projection(
     num_rays: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """The same images by chance: the mean over rays of random slope through each pixel's place in the focal plane.
+    """The same images by Monte Carlo: the mean over rays with random slopes through each pixel's position in the focal plane.
 
-    Its standard error falls with the root of the number of rays; one ray per pixel and step will do for stochastic gradients.
+    The standard error decreases with the square root of the number of rays; one ray per pixel and step suffices for stochastic
+    gradients.
 
     Args:
         volume: (z, y, x) attenuation per voxel.
         tilt_angles: (tilts,) degrees.
-        convergence: as of `DefocusedProjector`.
-        num_rays: through every pixel.
+        convergence: as for `DefocusedProjector`.
+        num_rays: number of rays through every pixel.
         generator: source of the slopes.
 
     Returns:
@@ -130,7 +131,7 @@ def _reach(deviation: float) -> int:
 
 
 def gaussian_matrix(size: int, deviation: float, *, like: Tensor) -> Tensor:
-    """Symmetric (size, size): a sampled Gaussian of unit sum; what it carries over the edges is lost."""
+    """Symmetric (size, size) matrix of a sampled Gaussian with unit sum; values blurred across the edges are lost."""
     reach = torch.arange(-_reach(deviation), _reach(deviation) + 1, dtype=torch.float64)
     position = torch.arange(size, dtype=torch.float64)
     weights = torch.exp(-((position[:, None] - position) ** 2) / (2 * deviation**2))

@@ -1,4 +1,4 @@
-"""From line integrals to the signal that the detector would read without noise."""
+"""Image formation: conversion of line integrals to noise-free pixel values."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from noiseflow.models.base import Described
 
 
 class Transmission(Described):
-    """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 per tilt or for all.
+    """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 for each tilt or for all tilts.
 
     Args:
-        intensity: incident intensity, detector units; a number, or one for each tilt.
+        intensity: incident intensity, detector units; a number, or one per tilt.
         offset: detector units; kept fixed.
-        estimate: whether the intensity is learnt.
+        estimate: whether to fit the intensity.
 
     Raises:
-        ValueError: an intensity that is not positive.
+        ValueError: an intensity is not positive.
 
     Example:
         >>> import recon, torch
@@ -34,23 +34,23 @@ class Transmission(Described):
         start = torch.as_tensor(intensity, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
         if not bool((start > 0).all()):
             raise ValueError(
-                "the incident intensity must be positive; is the contrast inverted or the offset too high?"
+                "the incident intensity must be positive; check whether the contrast is inverted or the offset is too high"
             )
         self.log_intensity = nn.Parameter(start.log(), requires_grad=estimate)
         self.register_buffer("offset", torch.tensor(float(offset)))
 
     def forward(self, line_integrals: Tensor) -> Tensor:
-        """Line integrals (tilt, u, y) to signals of the same shape."""
+        """Convert line integrals (tilt, u, y) to signals of the same shape."""
         return torch.exp(self.log_intensity - line_integrals) + self.offset
 
     def invert(self, signal: Tensor) -> Tensor:
-        """Line integrals of signals; pixel values below a thousandth of the incident intensity count as that much."""
+        """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
         return -torch.log(share.clamp_min(1e-3))
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
-        """Set the intensity, one or each, to the least-squares match of images (tilt, u, y), where `use`, by line integrals."""
+        """Fit the intensity (common or per tilt) to images (tilt, u, y) by least squares at the pixels `use`."""
         share = torch.exp(-line_integrals) * use
         dims = (0, 1, 2) if self.log_intensity.numel() == 1 else (1, 2)
         intensity = ((images - self.offset) * share).sum(dims, keepdim=True) / (share**2).sum(dims, keepdim=True)
@@ -73,18 +73,18 @@ class Transmission(Described):
 class Linear(Described):
     """HAADF or EDX: signal = gain·beam·line integral + offset.
 
-    The gain is a unit, not a parameter: it fixes the scale of the volume. The offset (detector pedestal, thin support) is
-    learnt for each tilt or for all, and so are the beam's changes from tilt to tilt, where there are any.
+    The gain is a unit, not a parameter: it sets the scale of the volume. The offset (detector pedestal, thin support) is fitted
+    for each tilt or for all tilts, as are changes of the beam between tilts, if given.
 
     Args:
         gain: detector units per unit of line integral.
-        offset: detector units; a number, or one for each tilt.
-        beam: (tilts,) incident intensities; only their ratios count. None where they are all the same.
-        offset_unit: line integral in units of which the offset is learnt: one of those in the data.
-        estimate: whether offset and beam are learnt.
+        offset: detector units; a number, or one per tilt.
+        beam: (tilts,) incident intensities, of which only the ratios matter; None if they are equal.
+        offset_unit: unit of the offset parameter, a line integral of typical size in the data.
+        estimate: whether to fit offset and beam.
 
     Raises:
-        ValueError: a gain or unit of zero, or one that is not finite.
+        ValueError: gain or offset unit is zero or not finite.
 
     Example:
         >>> import recon, torch
@@ -116,7 +116,7 @@ class Linear(Described):
         self.register_parameter("log_beam", log_beam)
 
     def forward(self, line_integrals: Tensor) -> Tensor:
-        """Line integrals (tilt, u, y) to signals of the same shape."""
+        """Convert line integrals (tilt, u, y) to signals of the same shape."""
         if self.log_beam is not None:
             line_integrals = line_integrals * _relative(self.log_beam)
         return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
@@ -128,7 +128,7 @@ class Linear(Described):
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
-        """Set one offset to the least-squares match of images (tilt, u, y), where `use`, by their line integrals."""
+        """Fit a common offset to images (tilt, u, y) by least squares at the pixels `use`."""
         scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
         self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean() / self.offset_unit))
 
@@ -139,11 +139,11 @@ class Linear(Described):
 
     @property
     def offset(self) -> Tensor:
-        """Detector units, (1,) or (tilts,)."""
+        """Offset, detector units, (1,) or (tilts,)."""
         return (self.gain * self.offset_unit * self.scaled_offset.detach()).reshape(-1)
 
     def per_tilt(self, num_tilts: int) -> dict[str, list[float]]:
-        """Relative intensity (geometric mean one) and offset, detector units, of every tilt."""
+        """Relative intensity (geometric mean 1) and offset (detector units) of every tilt."""
         beam = torch.ones(1) if self.log_beam is None else _relative(self.log_beam.detach()).reshape(-1)
         return {"relative intensity": _each(beam, num_tilts), "offset": _each(self.offset, num_tilts)}
 
@@ -158,5 +158,5 @@ def _range(values: Tensor) -> str:
 
 
 def _relative(log_beam: Tensor) -> Tensor:
-    """The beam with a geometric mean of one: a brighter beam could not be distinguished from a denser volume."""
+    """The beam with geometric mean 1, because a brighter beam cannot be distinguished from a denser volume."""
     return torch.exp(log_beam - log_beam.mean())

@@ -1,4 +1,4 @@
-"""The shared slice operator: around one tilt axis, every y-slice is projected by the same small sparse matrix."""
+"""The slice operator: for a single tilt axis, every y-slice is projected by the same small sparse matrix."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _PANEL = 32  # layers along z, or tilts
 class SliceProjector(Projector):
     """Line integrals of a volume along all rays of a single-axis tilt series.
 
-    A point (x, z) relative to the volume's centre lands on the detector at u = x cos θ + z sin θ; y does not change.
-    The matrix holds Joseph's interpolation (two voxels per ray and row; doi:10.1109/TMI.1982.4307572), once for all
-    slices. The tilt axis passes through the volume's centre and, but for ``detector_offset``, the detector's middle.
+    A point (x, z) relative to the volume's centre is projected to u = x cos θ + z sin θ; y does not change. The matrix uses
+    Joseph's interpolation (two voxels per ray and row; doi:10.1109/TMI.1982.4307572) and is shared by all slices. The tilt axis
+    passes through the centre of the volume and, except for ``detector_offset``, through the centre of the detector.
 
     Args:
         tilt_angles: (tilts,) degrees.
-        depth: voxels along z, the beam's direction at zero tilt.
+        depth: voxels along z, the beam direction at zero tilt.
         width: voxels along x.
         detector_width: detector pixels along u; `width` if None.
-        detector_offset: pixels; where the detector's middle lies on the u axis, one number or one for each tilt.
-        dtype: number type of the matrix and of what it is applied to.
-        device: where the matrix lives.
+        detector_offset: position of the detector centre on the u axis, pixels; a number, or one per tilt.
+        dtype: data type of the matrix and of the arrays it is applied to.
+        device: device of the matrix.
 
     Raises:
-        ValueError: no angles, angles that are not finite, sizes below one, or offsets that match no tilt.
+        ValueError: there are no angles, angles are not finite, sizes are below one, or the number of offsets is wrong.
 
     Example:
         >>> import recon, torch
@@ -61,7 +61,7 @@ class SliceProjector(Projector):
         angles = np.atleast_1d(np.asarray(tilt_angles, dtype=np.float64))
         detector_width = width if detector_width is None else detector_width
         if angles.ndim != 1 or angles.size == 0 or not np.isfinite(angles).all():
-            raise ValueError("tilt_angles must be a list of finite degrees, one for each tilt")
+            raise ValueError("tilt_angles must be a list of finite angles in degrees, one per tilt")
         if min(depth, width, detector_width) < 1:
             raise ValueError(
                 f"depth {depth}, width {width} and detector_width {detector_width} must be at least one voxel"
@@ -91,7 +91,7 @@ class SliceProjector(Projector):
         )
 
     def _by_panels(self, dtype: torch.dtype) -> PanelledMatrix:
-        """The transposed matrix from a few tilts at a time: all entries at once would take several times its memory."""
+        """The transposed matrix, built from a few tilts at a time; all at once would need several times its memory."""
         size = (self.depth, self.width, self.detector_width)
         parts = [slice(start, start + _PANEL) for start in range(0, self.num_tilts, _PANEL)]
         entries = (_joseph(self.tilt_angles[part], self.detector_offset[part], *size) for part in parts)
@@ -104,7 +104,7 @@ class SliceProjector(Projector):
 
     @cached_property
     def matrix(self) -> PanelledMatrix:
-        """From a slice's voxels to its rays; made when it is first needed, which it is not where vacuum is left out."""
+        """The matrix from the voxels of a slice to its rays; created on first use (not needed if vacuum is skipped)."""
         return self.transposed.turned(_PANEL * self.width)
 
     def _set_entries(
@@ -118,16 +118,16 @@ class SliceProjector(Projector):
 
     @property
     def device(self) -> torch.device:
-        """Where the matrix lives."""
+        """Device of the matrix."""
         return self.transposed.panels[0].device
 
     @property
     def dtype(self) -> torch.dtype:
-        """Number type of the matrix."""
+        """Data type of the matrix."""
         return self.transposed.panels[0].dtype
 
     def project(self, columns: Tensor) -> Tensor:
-        """Native layout, no copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
+        """Native layout without copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
         result: Tensor = _Product.apply(columns, self, False)  # type: ignore[no-untyped-call]
         return result
 
@@ -137,10 +137,10 @@ class SliceProjector(Projector):
         return result
 
     def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
-        """Operators of layers across the beam, which add up to this one.
+        """Operators of layers perpendicular to the beam, whose sum is this operator.
 
         Args:
-            layer_of: from distances along the beam beyond the tilt axis, voxels, to the numbers of layers, 0 and up.
+            layer_of: function from distances to the tilt axis along the beam, voxels, to indices of layers from 0.
         """
         rays, voxels, weights = self.matrix.entries()
         theta = np.deg2rad(self.tilt_angles)[rays // self.detector_width]
@@ -164,9 +164,9 @@ class SliceProjector(Projector):
         return matrix, transposed
 
     def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> SliceProjector:
-        """The projector of a voxel grid half as fine, see `Projector.half`."""
+        """The projector of a voxel grid with half the resolution, see `Projector.half`."""
         key = (depth, width, num_columns, *first_columns.tolist())
-        if key not in self._halves:  # blocks of one volume ask for the same one
+        if key not in self._halves:  # cached, because blocks of one volume need the same one
             middle = first_columns + num_columns - 1 - (self.detector_width - 1) / 2
             self._halves[key] = SliceProjector(
                 tilt_angles=self.tilt_angles,
@@ -181,7 +181,7 @@ class SliceProjector(Projector):
 
 
 class _Product(torch.autograd.Function):
-    """Sparse times dense; its gradient is the transposed product, and the gradient's gradient the product again."""
+    """Sparse times dense product; its gradient is the product with the transpose, and vice versa."""
 
     @staticmethod
     def forward(ctx: Any, dense: Tensor, projector: SliceProjector, transposed: bool) -> Tensor:
@@ -197,14 +197,14 @@ class _Product(torch.autograd.Function):
 def _joseph(
     angles: NDArray[np.float64], offsets: NDArray[np.float64], depth: int, width: int, detector_width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Row (ray), column (voxel) and weight of every non-zero of the matrix."""
+    """Row (ray), column (voxel) and weight of every non-zero element of the matrix."""
     rays, voxels, weights = [], [], []
     x, z = np.arange(width) - (width - 1) / 2, np.arange(depth) - (depth - 1) / 2
     for tilt, (angle, offset) in enumerate(zip(np.deg2rad(angles), offsets, strict=True)):
         u = np.arange(detector_width) - (detector_width - 1) / 2 + offset
         cosine, sine = np.cos(angle), np.sin(angle)
         along_z = abs(cosine) >= abs(sine)
-        if along_z:  # one step per z row: where does the ray cross it along x?
+        if along_z:  # one step per row along z: position along x where the ray crosses it
             crossing = (u[:, None] - z * sine) / cosine + (width - 1) / 2
             step, size = 1 / abs(cosine), width
         else:

@@ -1,4 +1,4 @@
-"""Rays through a volume in any direction: X-tilt, dual axis, jitter. Slower than the slice operator, and agrees with it."""
+"""Rays through a volume in any direction: x-tilt, dual axis, jitter. Slower than the slice operator; the results agree."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 
 Angles = float | Sequence[float] | NDArray[np.floating]
 _AT_ONCE = 2**21
-_ORDER = (0, 2, 1)  # among equally steep axes z comes first, then x
+_ORDER = (0, 2, 1)  # precedence of equally steep axes: z, then x, then y
 
 
 def view_matrices(tilt_angles: Angles, *, x_tilt: Angles = 0.0, in_plane: Angles = 0.0) -> NDArray[np.float64]:
-    """Rotations from the specimen (z, y, x) to the microscope (beam, v, u), for every tilt.
+    """Rotation matrices from the specimen (z, y, x) to the microscope (beam, v, u), for every tilt.
 
-    The specimen is turned in its plane, about z; then tilted about x; then about the tilt axis, y. Dual-axis series are two with
-    90° between their `in_plane`. Without either, u = x·cos θ + z·sin θ and v = y.
+    The specimen is rotated in its plane (about z), then tilted about x, then about the tilt axis y. A dual-axis series consists
+    of two series whose `in_plane` differs by 90°. With both at 0, u = x·cos θ + z·sin θ and v = y.
 
     Args:
         tilt_angles: (tilts,) degrees.
-        x_tilt: degrees, one or one for each tilt.
-        in_plane: degrees, one or one for each tilt.
+        x_tilt: degrees; a number, or one per tilt.
+        in_plane: degrees; a number, or one per tilt.
 
     Returns:
         (tilts, 3, 3).
@@ -45,15 +45,15 @@ def view_rays(
     """One ray through every pixel of every view.
 
     Args:
-        views: (tilts, 3, 3) of `view_matrices`.
-        height, width: of the detector, pixels.
-        offset: pixels; where the detector's middle lies on the u axis.
-        jitter: (tilt, v, u, 2) pixels along (v, u) from each pixel's middle.
-        spread: (tilt, v, u, 2) slopes along (v, u), pixels per voxel of depth, about the focal plane through the middle.
+        views: (tilts, 3, 3) from `view_matrices`.
+        height, width: size of the detector, pixels.
+        offset: position of the detector centre on the u axis, pixels.
+        jitter: (tilt, v, u, 2) pixels along (v, u) from each pixel's centre.
+        spread: (tilt, v, u, 2) slopes along (v, u), pixels per voxel of depth, about the focal plane through the centre.
 
     Returns:
-        Origins and directions, (tilt, v, u, 3) each, voxels along (z, y, x) from the volume's middle. One unit of a direction
-        is one voxel along the beam.
+        Origins and directions, (tilt, v, u, 3) each, voxels along (z, y, x) from the centre of the volume. Directions have a
+        length of one voxel along the beam.
     """
     turned = torch.from_numpy(np.asarray(views, dtype=np.float64))
     v = torch.arange(height, dtype=torch.float64) - (height - 1) / 2
@@ -63,26 +63,26 @@ def view_rays(
     slopes = torch.zeros_like(places) if spread is None else spread.double()
     origins = torch.cat([torch.zeros_like(places[..., :1]), places], -1)
     directions = torch.cat([torch.ones_like(slopes[..., :1]), slopes], -1)
-    back = turned[:, None]  # a row vector times a rotation is turned back by it
+    back = turned[:, None]  # a row vector times a rotation matrix is rotated back
     return origins @ back, directions @ back
 
 
 def march(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
     """Line integrals along rays by Joseph's method in three dimensions (doi:10.1109/TMI.1982.4307572).
 
-    One step for each layer of voxels across the axis along which the ray is steepest; four voxels are interpolated at each.
-    Autograd gives the adjoint.
+    There is one step for each layer of voxels perpendicular to the steepest axis of the ray, with interpolation between four
+    voxels. Autograd provides the adjoint.
 
     Args:
         volume: (z, y, x) attenuation per voxel.
-        origins, directions: (..., 3) voxels along (z, y, x) from the volume's middle; a direction's length is the unit in which
-            the integral is measured.
+        origins, directions: (..., 3) voxels along (z, y, x) from the centre of the volume; the length of the direction is the
+            unit of the integral.
 
     Returns:
-        (...) integrals in the volume's number type.
+        (...) integrals in the data type of the volume.
 
     Raises:
-        ValueError: a direction of no length, or shapes that do not match.
+        ValueError: a direction has zero length, or shapes do not match.
     """
     if volume.ndim != 3 or origins.shape != directions.shape or origins.shape[-1] != 3:
         raise ValueError(
@@ -92,7 +92,7 @@ def march(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
     start, along = origins.reshape(-1, 3).to(volume.device), directions.reshape(-1, 3).to(volume.device)
     steepness = along.abs()
     if not bool((steepness.amax(1) > 0).all()):
-        raise ValueError("a ray needs a direction of more than no length")
+        raise ValueError("directions of rays must not have zero length")
     steepest = torch.tensor(_ORDER, device=volume.device)[steepness[:, list(_ORDER)].argmax(1)]
     integrals = volume.new_zeros(len(start))
     for axis in range(3):
@@ -105,7 +105,7 @@ def march(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def _march_across(layers: Tensor, start: Tensor, along: Tensor) -> Tensor:
-    """Rays, with their steepest axis first, through layers (steepest, row, column) of voxels."""
+    """Integrate along rays with their steepest axis first, through layers (steepest, row, column) of voxels."""
     count, *sides = layers.shape
     flat = layers.reshape(-1)
     level = torch.arange(count, device=start.device) - (count - 1) / 2
@@ -125,7 +125,7 @@ def _march_across(layers: Tensor, start: Tensor, along: Tensor) -> Tensor:
 
 
 def _rotation(angle: NDArray[np.float64], plane: tuple[int, int], sense: int) -> NDArray[np.float64]:
-    """(tilts, 3, 3) turning the first of two axes (of z, y, x) towards the second, or away from it."""
+    """(tilts, 3, 3) matrices that rotate the first of two axes (of z, y, x) towards the second, or away from it."""
     matrix = np.tile(np.eye(3), (len(angle), 1, 1))
     first, second = plane
     matrix[:, first, first] = matrix[:, second, second] = np.cos(angle)

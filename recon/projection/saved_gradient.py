@@ -1,4 +1,4 @@
-"""What costs of a volume have in common that find their gradient in the same pass as their value."""
+"""Base class of volume costs that compute value and gradient in one pass."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class SavedGradient(torch.autograd.Function):
-    """A scalar function whose ``forward`` saves the gradient with respect to its first argument, the only one that has one."""
+    """A scalar function whose ``forward`` saves the gradient with respect to its first argument, the only differentiable one."""
 
     @staticmethod
     def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:

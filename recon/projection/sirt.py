@@ -1,4 +1,4 @@
-"""Simultaneous iterative reconstruction technique (doi:10.1016/0022-5193(72)90180-4), in its weighted modern form."""
+"""Simultaneous iterative reconstruction technique (doi:10.1016/0022-5193(72)90180-4), in its modern weighted form."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def sirt(
     Args:
         line_integrals: (tilt, y, u) measured line integrals, a tensor or an array.
         projector: the operator A.
-        num_iterations: iterations; noise grows with them.
-        start: (z, y, x) volume to go on from; zero if None. Thirty iterations are ten and twenty.
+        num_iterations: number of iterations; noise increases with it.
+        start: (z, y, x) initial volume; zero if None. Thirty iterations are equivalent to ten followed by twenty.
         minimum: lower bound applied after every iteration, or None.
 
     Returns:
-        (z, y, x) attenuation per voxel, of the kind given.
+        (z, y, x) attenuation per voxel, of the same array type as the input.
 
     Example:
         >>> import recon, torch

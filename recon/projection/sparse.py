@@ -1,4 +1,4 @@
-"""A sparse matrix that is multiplied panel by panel, so that what a row gathers stays within reach."""
+"""A sparse matrix that is multiplied panel by panel for better cache use."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _WIDEST = 256
 
 
 class PanelledMatrix:
-    """Panels of neighbouring columns in compressed rows, stored one by one; together they are the matrix.
+    """A matrix stored as panels of neighbouring columns, each in CSR format.
 
-    A row of the whole matrix would gather lines from all over a volume larger than any cache, each from another page of memory.
-    A row of a panel gathers from few, and its neighbour gathers from nearly the same ones: at 256³ that is four times faster.
+    A row of the whole matrix would access elements scattered over a volume larger than the cache, in different memory pages. A
+    row of a panel accesses few elements, and its neighbour nearly the same ones. At 256³ this is four times faster.
 
     Args:
-        panels: sparse CSR tensors of as many rows, side by side.
+        panels: sparse CSR tensors with equal numbers of rows, side by side.
     """
 
     def __init__(self, panels: Sequence[Tensor]) -> None:
@@ -40,7 +40,7 @@ class PanelledMatrix:
         *,
         panel: int,
     ) -> PanelledMatrix:
-        """The matrix of some entries, those of the same place added up, in panels of `panel` columns."""
+        """The matrix of the given entries, in panels of `panel` columns; entries at the same position are added."""
         from scipy.sparse import csr_array
 
         number, panels = columns // panel, []
@@ -57,17 +57,17 @@ class PanelledMatrix:
 
     @property
     def num_entries(self) -> int:
-        """How many entries are stored."""
+        """Number of stored entries."""
         return sum(panel.values().numel() for panel in self.panels)
 
     def to(self, *, device: torch.device | str, dtype: torch.dtype) -> PanelledMatrix:
-        """The same on another device, with numbers of another type."""
+        """A copy on another device, with another data type."""
         return PanelledMatrix([panel.to(device=device, dtype=dtype) for panel in self.panels])
 
     def __matmul__(self, dense: Tensor) -> Tensor:
         """(columns, n) -> (rows, n)."""
         if dense.shape[0] != self.shape[1]:
-            raise ValueError(f"{dense.shape[0]} rows do not match the matrix's {self.shape[1]} columns")
+            raise ValueError(f"{dense.shape[0]} rows do not match the {self.shape[1]} columns of the matrix")
         result = dense.new_empty(self.shape[0], dense.shape[1])
         widest = _WIDEST if dense.device.type == "cpu" else sys.maxsize
         for start in range(0, dense.shape[1], widest):
@@ -77,7 +77,7 @@ class PanelledMatrix:
         return result
 
     def turned(self, panel: int) -> PanelledMatrix:
-        """The transpose, in panels of `panel` columns, made panel by panel."""
+        """The transpose in panels of `panel` columns, built panel by panel."""
         from scipy.sparse import vstack
 
         own = [_scipy(each) for each in self.panels]
@@ -96,7 +96,7 @@ class PanelledMatrix:
         return rows, columns, values.astype(np.float64)
 
     def some_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The matrix of some rows, (n,) indices, and its transpose; CSR tensors in one piece, for few rows reach few lines."""
+        """The submatrix of some rows, (n,) indices, and its transpose, as single CSR tensors."""
         from scipy.sparse import hstack
 
         whole = hstack([_scipy(panel)[rows.cpu().numpy()] for panel in self.panels], format="csr")
@@ -111,13 +111,13 @@ Entries = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.floating[Any]]]
 def panelled_by_groups(
     groups: Iterable[Entries], shape: tuple[int, int], *, panel: int, dtype: torch.dtype
 ) -> PanelledMatrix:
-    """A matrix from groups of entries, whose memory is let go of one by one.
+    """Build a matrix from groups of entries, whose memory is released group by group.
 
     Args:
-        groups: entries of the columns of one panel after the other; columns are counted from the first of the panel.
+        groups: entries of one panel after the other; column indices start at the first column of the panel.
         shape: rows and columns.
-        panel: columns of a panel.
-        dtype: of the values.
+        panel: number of columns of a panel.
+        dtype: data type of the values.
     """
     from scipy.sparse import csr_array
 
@@ -129,12 +129,12 @@ def panelled_by_groups(
 
 
 def index_type(*counts: int) -> type[np.signedinteger[Any]]:
-    """The smaller type of index that holds all these counts: entries, rows and columns of a large matrix pass 2³¹."""
+    """The smallest index type for these counts; large matrices exceed 2³¹."""
     return np.int32 if max(counts) < 2**31 else np.int64
 
 
 def _scipy(matrix: Tensor) -> Any:
-    """A CSR tensor as SciPy's, of the same memory where that is the processor's."""
+    """Convert a CSR tensor to a SciPy matrix, with shared memory on the CPU."""
     from scipy.sparse import csr_array
 
     parts = tuple(part.cpu().numpy() for part in (matrix.values(), matrix.col_indices(), matrix.crow_indices()))
@@ -142,10 +142,10 @@ def _scipy(matrix: Tensor) -> Any:
 
 
 def csr_tensor(matrix: Any) -> Tensor:
-    """A SciPy CSR matrix as a tensor."""
+    """Convert a SciPy CSR matrix to a tensor."""
     matrix.sort_indices()
     kind = index_type(matrix.nnz, *matrix.shape)
-    with warnings.catch_warnings():  # torch announces that CSR is in beta
+    with warnings.catch_warnings():  # torch warns that CSR is in beta
         warnings.simplefilter("ignore")
         return torch.sparse_csr_tensor(
             torch.from_numpy(matrix.indptr.astype(kind, copy=False)),

@@ -1,4 +1,4 @@
-"""A few neighbouring slices of a voxel grid, those of its columns that hold anything there, and where their neighbours stand."""
+"""A tile: neighbouring slices of a voxel grid with their occupied columns, and the indices of neighbouring columns."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Where the neighbours of a tile's columns stand, its own first and then the rim: empty ones from which a difference leads to
-    a listed one. The number of all these, C, stands for an empty one that is not among them.
+    """Indices of the neighbours of a tile's columns.
+
+    The columns of the tile come first, followed by its rim: empty columns whose next neighbour is in the tile. The total number C
+    is the index of any other empty column.
 
     Attributes:
-        following: (2, C) the next one along z and x, or the column itself at an edge.
-        preceding: (2, n) the one before each of its own.
-        above: (C,) among the next tile's own, whose number stands for an empty one; None at the edge.
-        below: (n,) among the tile's before, own and rim; None at the edge.
+        following: (2, C) next column along z and x, or the column itself at an edge.
+        preceding: (2, n) previous column of each column of the tile.
+        above: (C,) index in the columns of the next tile, whose number denotes an empty column; None at the edge.
+        below: (n,) index in the columns and rim of the previous tile; None at the edge.
     """
 
     following: Tensor
@@ -29,7 +31,7 @@ class Neighbours:
 
 
 def neighbours_of(columns: Sequence[Tensor], shape: tuple[int, int]) -> list[Neighbours]:
-    """Of every tile, given its columns, indices of the flat (depth, width)."""
+    """The neighbours of every tile, given its columns as flat indices of (depth, width)."""
     total, steps, found, below = math.prod(shape), (shape[1], 1), [], None
     for tile, own in enumerate(columns):
         following_tile = columns[tile + 1] if tile + 1 < len(columns) else None
@@ -61,7 +63,7 @@ def neighbours_of(columns: Sequence[Tensor], shape: tuple[int, int]) -> list[Nei
 
 
 def _positions(columns: Tensor, total: int) -> Tensor:
-    """(total,) where each column stands among `columns`, or their number."""
+    """(total,) index of each column in `columns`, or their number if it is not among them."""
     at = torch.full((total,), columns.numel(), device=columns.device)
     at[columns] = torch.arange(columns.numel(), device=columns.device)
     return at
@@ -69,12 +71,12 @@ def _positions(columns: Tensor, total: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Tile:
-    """Neighbouring slices `rows` of the voxel grid, and those of its `columns` that hold anything there.
+    """Neighbouring slices `rows` of the voxel grid, with their occupied `columns`.
 
     Attributes:
-        part: where in the list their values stand, column by column.
-        neighbours: of its columns.
-        matrix, transposed: the projector's part.
+        part: range of their values in the list, column by column.
+        neighbours: neighbours of the columns.
+        matrix, transposed: the corresponding part of the projector matrix.
     """
 
     rows: slice
@@ -85,5 +87,5 @@ class Tile:
     transposed: Tensor
 
     def of(self, values: Tensor) -> Tensor:
-        """The tile's part of a list as (columns, slices)."""
+        """The part of a list that belongs to the tile, (columns, slices)."""
         return values[self.part].view(self.columns.numel(), self.rows.stop - self.rows.start)

@@ -1,4 +1,4 @@
-"""Total variation of the occupied part of a voxel grid, as if all the rest were there and empty."""
+"""Total variation of a voxel grid given on its occupied tiles, with empty voxels elsewhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.projection.tile import Tile
 
 
 class TileVariation(SavedGradient):
-    """The sum over all voxels, of which only listed ones and the empty ones just before them add anything."""
+    """The sum over all voxels; only listed voxels and the empty ones just before them contribute."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, smoothing: float, tiles: Iterable[Tile]) -> Tensor:
@@ -39,7 +39,7 @@ class TileVariation(SavedGradient):
 
 
 def _differences(values: Tensor, tile: Tile, above: Tile | None) -> list[Tensor]:
-    """Forward differences along z, x and y of a tile's columns, its rim and, last, the empty one, (C + 1, slices) each."""
+    """Forward differences along z, x and y of a tile's columns, its rim and finally an empty column, (C + 1, slices) each."""
     near, own = tile.neighbours, tile.of(values)
     count, height = near.following.shape[1], own.shape[1]
     padded = values.new_zeros(count + 1, height + 1)

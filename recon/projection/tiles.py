@@ -1,4 +1,4 @@
-"""The occupied part of a voxel grid: projected, and regularised, as if all the rest were there and empty."""
+"""The occupied tiles of a voxel grid: projection and regularisation with empty voxels elsewhere."""
 
 from __future__ import annotations
 
@@ -19,30 +19,29 @@ from recon.projection.tile import Tile, neighbours_of
 from recon.projection.tile_variation import TileVariation
 
 _TOGETHER, _MOST_TILES = 16, 8
-_ALIKE = 32  # slices fewer apart than this part of the width hold nearly the same columns; each tile copies a part of the matrix
+_ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
 
 
 def slices_of_a_tile(height: int, width: int) -> int:
-    """How many neighbouring slices share the columns that they list, for a voxel grid of so many slices and columns along x."""
+    """Number of slices per tile, for a voxel grid with this number of slices and columns along x."""
     return max(_TOGETHER, -(-height // _MOST_TILES), width // _ALIKE)
 
 
 class Tiles:
-    """The columns (z, x) of a voxel grid in which neighbouring slices hold anything, tile by tile of such slices.
+    """Occupied columns (z, x) of a voxel grid, by tiles of neighbouring slices.
 
-    Every tile has its own small part of the projector's matrix: the columns that are occupied in any of its slices. They are
-    listed whole, so that memory is read in runs. A list of values counts as a volume that is empty wherever the list has no
-    voxel.
+    Every tile has its own small part of the projector matrix, for the columns that are occupied in any of its slices. Columns are
+    listed completely, for contiguous memory access. A list of values represents a volume that is empty at all other voxels.
 
     Args:
         mask: (depth, width, height) of the voxel grid, True where occupied.
-        projector: of the whole voxel grid.
-        known: tiles of another mask of the voxel grid, for the same projector; what is the same is taken over, the rest let
-            go of, and they cannot be used any more.
+        projector: projector of the whole voxel grid.
+        known: tiles of another mask for the same projector. Their common parts are reused and the rest is released; they
+            cannot be used afterwards.
 
     Attributes:
-        mask: as given.
-        filled: (N,) 1 where the listed voxel is occupied, else 0.
+        mask: the given mask.
+        filled: (N,) 1 if the listed voxel is occupied, otherwise 0.
     """
 
     def __init__(self, mask: Tensor, projector: Projector, *, known: Tiles | None = None) -> None:
@@ -68,17 +67,17 @@ class Tiles:
 
     @property
     def share(self) -> float:
-        """The share of the voxel grid that is listed."""
+        """The listed share of the voxel grid."""
         return self.filled.numel() / math.prod(self.shape)
 
     @cached_property
     def occupied(self) -> Tensor:
-        """(M,) where in the list the occupied voxels stand."""
+        """(M,) indices of the occupied voxels in the list."""
         return self.filled.nonzero()[:, 0]
 
     @cached_property
     def voxels(self) -> Tensor:
-        """(M,) flat voxel grid indices (z, x, y) of the occupied voxels."""
+        """(M,) flat indices of the occupied voxels in the voxel grid (z, x, y)."""
         height, device = self.shape[2], self.filled.device
         spans = [torch.arange(tile.rows.start, tile.rows.stop, device=device) for tile in self._tiles]
         listed = [
@@ -87,27 +86,27 @@ class Tiles:
         return torch.cat(listed)[self.occupied]
 
     def project(self, values: Tensor) -> Tensor:
-        """Values (N,) to line integrals (tilts * detector_width, height), in the projector's native order."""
+        """Project values (N,) to line integrals (tilts * detector_width, height), in the projector's native order."""
         rays: Tensor = _Projection.apply(values, self)  # type: ignore[no-untyped-call]
         return rays
 
     def total_variation(self, values: Tensor, *, smoothing: float) -> Tensor:
-        """Of the whole voxel grid, see `recon.fields.regularisers.total_variation`."""
+        """Total variation of the whole voxel grid, see `recon.fields.regularisers.total_variation`."""
         variation: Tensor = TileVariation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
         return variation
 
     def gathered(self, lattice: Tensor) -> Tensor:
-        """The list, (N,), of a whole voxel grid, (z, x, y)."""
+        """The list (N,) of a voxel grid (z, x, y)."""
         values: Tensor = _Gathering.apply(lattice, self)  # type: ignore[no-untyped-call]
         return values
 
     def upsampled(self, grid: Tensor) -> Tensor:
-        """The list, (N,), of a grid half as fine as the voxel grid, (z, x, y), interpolated: see `recon.fields.upsampling`."""
+        """The list (N,) of a grid (z, x, y) with half the resolution, interpolated as in `recon.fields.upsampling`."""
         values: Tensor = _Upsampling.apply(grid, self)  # type: ignore[no-untyped-call]
         return values
 
     def upsampling(self, size: tuple[int, ...]) -> list[_TileUpsampling]:
-        """Of a grid of that size, for every tile."""
+        """Interpolation operators from a grid of that size, for every tile."""
         if self._upsampling is None or self._upsampling[0] != size:
             depth, width, height = self.shape
             across = _between_columns((depth, width), size[:2])
@@ -119,16 +118,16 @@ class Tiles:
         return self._upsampling[1]
 
     def lattice(self, values: Tensor) -> Tensor:
-        """The whole voxel grid, (depth * width, height), without gradient."""
+        """The voxel grid (depth * width, height) of a list, without gradient."""
         return self.scattered(values.detach()).view(-1, self.shape[2])
 
     def spread(self, values: Tensor) -> Tensor:
-        """The voxel grid, (z, x, y), of a list, differentiable."""
+        """The voxel grid (z, x, y) of a list, differentiable."""
         lattice: Tensor = _Spreading.apply(values, self)  # type: ignore[no-untyped-call]
         return lattice
 
     def scattered(self, values: Tensor) -> Tensor:
-        """The voxel grid, (z, x, y), of a list: the adjoint of `gathered`."""
+        """The voxel grid (z, x, y) of a list: the adjoint of `gathered`."""
         lattice = values.new_zeros(self.shape)
         for tile in self._tiles:
             lattice.view(-1, self.shape[2])[:, tile.rows].index_copy_(0, tile.columns, tile.of(values))
@@ -138,7 +137,8 @@ class Tiles:
         return iter(self._tiles)
 
     def _given_up(self) -> list[Tile]:
-        """The tiles, which are as large as several matrices of the projector; without them, nothing here can be used."""
+        """Give the tiles to another object; this one cannot be used afterwards. Tiles can be several times the size of the
+        projector matrix."""
         tiles = self._tiles
         del self._tiles, self._upsampling
         return tiles
@@ -152,7 +152,7 @@ def _matrices(projector: Projector, columns: Tensor, known: Tile | None) -> tupl
 
 @dataclass(frozen=True)
 class _TileUpsampling:
-    """From a coarse grid to the columns of one tile: between columns by a sparse matrix, along them by a small dense one."""
+    """Interpolation from a coarse grid to the columns of a tile: sparse matrix across columns, small dense one along them."""
 
     across: Tensor
     across_transposed: Tensor

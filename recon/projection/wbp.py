@@ -19,26 +19,26 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
     "hamming": lambda share: 0.54 + 0.46 * torch.cos(math.pi * share),
     "hann": lambda share: 0.5 + 0.5 * torch.cos(math.pi * share),
 }
-"""What multiplies the ramp, by name: functions of frequency over cutoff, in [0, 1]."""
+"""Window functions by name; their argument is frequency over cutoff, in [0, 1]."""
 
 
 def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Given:
     """Reconstruct by filtered back-projection.
 
-    The ramp is the transform of the band-limited kernel of Ramachandran and Lakshminarayanan, so that constants are
-    kept; each tilt weighs as much as the angle it stands for.
+    The ramp is the Fourier transform of the band-limited kernel of Ramachandran and Lakshminarayanan, which preserves constants.
+    Each tilt is weighted by its angular share.
 
     Args:
         line_integrals: (tilt, y, u), a tensor or an array.
         projector: the operator whose adjoint back-projects.
-        window: one of `WINDOWS`; it tames the ramp's gain of fine noise.
-        cutoff: fraction of the Nyquist frequency at which the window ends and beyond which nothing passes.
+        window: one of `WINDOWS`; it reduces high-frequency noise.
+        cutoff: fraction of the Nyquist frequency above which frequencies are removed.
 
     Returns:
-        (z, y, x) attenuation per voxel, not clamped; of the kind given.
+        (z, y, x) attenuation per voxel, not clamped, of the same array type as the input.
 
     Raises:
-        ValueError: an unknown window, or a cutoff outside (0, 1].
+        ValueError: the window is unknown, or the cutoff is outside (0, 1].
 
     Example:
         >>> import recon, torch
@@ -62,9 +62,9 @@ def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp
 def angular_shares(
     tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """The angle (radians) that each tilt stands for: half the way to each neighbour, at the ends as much as inside.
+    """The angular share (radians) of each tilt: half the distance to each neighbour; at the ends as much as inside.
 
-    Directions count modulo half a turn, where the view repeats; the widest step is the missing wedge, which no tilt stands for.
+    Directions are taken modulo 180°. The largest gap is the missing wedge, which belongs to no tilt.
     """
     directions = np.round(np.asarray(tilt_angles, dtype=np.float64) % 180, 9) % 180
     values, back, counts = np.unique(directions, return_inverse=True, return_counts=True)

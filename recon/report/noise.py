@@ -1,4 +1,4 @@
-"""Charts of the noise that a reconstruction learnt or assumed, with the data on top."""
+"""Charts of the fitted or given noise model of a reconstruction, compared with the data."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Pixels = NDArray[np.float32]
 
 
 def noise_charts(noise_model: nn.Module, signal: Pixels, observation: Pixels) -> list[Figure]:
-    """Quantiles of the noise along the signal, then histograms at a few signals: data, and the model's exact figures.
+    """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
-        noise_model: the model.
-        signal, observation: (N,) predicted clean pixels and their pixel values, detector units.
+        noise_model: the noise model.
+        signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
     """
     stride = -(-signal.size // _MOST_PIXELS)
     signal, observation = signal[::stride], observation[::stride]
@@ -40,7 +40,7 @@ def noise_charts(noise_model: nn.Module, signal: Pixels, observation: Pixels) ->
 
 
 def _by_signal(signal: Pixels, count: int) -> list[NDArray[np.intp]]:
-    """Pixels in equal steps of the signal, where there are enough of them to draw."""
+    """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
     low, high = (float(end) for end in np.quantile(signal, (0.001, 0.999)))
     edges = np.linspace(low, high, count + 1)
     step = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, count - 1)

@@ -1,4 +1,4 @@
-"""The report of a reconstruction: a page to look at, that also says why it may be believed."""
+"""The report of a reconstruction: volume, data, diagnostics, settings and provenance."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from recon.verdict.verdict import Verdict
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
-_PREVIEW = 256  # pixels along each axis at most, that limits of grey and charts of the noise are made from
-_MOST_PIXELS = 2**24  # that correlations of residuals come from: their errors are far below what matters
+_PREVIEW = 256  # largest number of pixels per axis for grey levels and charts of the noise
+_MOST_PIXELS = 2**24  # for correlations of residuals, whose errors are then negligible
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -49,17 +49,17 @@ def reconstruction_report(
     reference: Volume | None = None,
     verdict: Verdict | None = None,
 ) -> Report:
-    """A page with slices, the tilt series against its prediction, the noise, the fit's course, settings and provenance.
+    """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
 
     Args:
         tilt_series: the data.
-        outcome: what was reconstructed from it.
+        outcome: the reconstruction.
         figures: rows of the table, (name, value).
-        inputs: files that were read, for their checksums.
-        seed: of the random choices.
-        halves: reconstructions of the even and of the odd tilts, for the Fourier shell correlation.
-        reference: a volume to correlate with instead.
-        verdict: stands first, with its pictures.
+        inputs: input files, for their checksums.
+        seed: seed of the random choices.
+        halves: reconstructions of the even and the odd tilts, for the Fourier shell correlation.
+        reference: a reference volume for the Fourier shell correlation instead.
+        verdict: the verdict, shown first with its charts.
     """
     name = Path(inputs[0]).name if inputs else "tilt series"
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
@@ -84,22 +84,22 @@ def reconstruction_report(
 
 
 def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
-    """The series of every other tilt, in the order of the stack, then of those between.
+    """Two series of every other tilt, even tilts first, in the order of the stack.
 
     Raises:
-        ValueError: fewer than four tilts.
+        ValueError: there are fewer than four tilts.
     """
     if tilt_series.num_tilts < 4:
-        raise ValueError(f"{tilt_series.num_tilts} tilts cannot be halved for --fsc; leave it out")
+        raise ValueError(f"{tilt_series.num_tilts} tilts are too few to split for --fsc; remove --fsc")
     yield from (tilt_series.select(slice(first, None, 2)) for first in (0, 1))
 
 
 def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
-    """A volume to correlate with.
+    """Read a reference volume for the Fourier shell correlation.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or is no volume on this grid.
+        FileNotFoundError: the file does not exist.
+        ValueError: it cannot be read, or is not a volume on this grid.
     """
     image = io.read(path, mapped=True)
     if image.data.shape != grid.shape:
@@ -109,7 +109,7 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
 
 
 def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
-    """Rows (setting, value, evidence): what the user gave, what was left at its default, what the data decided."""
+    """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [
         (name.replace("_", " "), _text(value), "given" if given else "default")
@@ -120,7 +120,7 @@ def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str
         rows = [row for row in rows if row[0] != "denoiser"]
     depth = outcome.volume.attenuation.shape[0]
     if not any(name == "thickness" for name, _, _ in rows):
-        rows.append(("thickness", f"{depth} voxels", "default: as deep as the images are wide"))
+        rows.append(("thickness", f"{depth} voxels", "default: equal to the image width"))
     return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
 
 
@@ -134,11 +134,11 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
     if name == "noise model" and outcome.method == "joint":
         return "clipping and rounding detected from the pixel values; the candidate that predicts held-out pixels best"
     if name in ("intensity", "offset"):
-        return "estimated from the images, then learnt in the fit"
+        return "estimated from the images, then refined in the fit"
     if name in ("tilts left out", "beam drift"):
         return "comparison of each tilt with a coarse volume of the others"
     if name in ("tilt axis (°)", "axis offset (pixels)", "largest shift (pixels)"):
-        return "volumes with this axis explain left-out tilts best"
+        return "volumes with this axis explain held-out tilts best"
     return "set by the method" if outcome.method != "joint" else "found from the data"
 
 
@@ -189,7 +189,7 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
 
 
 def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
-    """Charts of what differs from tilt to tilt; what is one for all stands among the choices."""
+    """Charts of response parameters that differ between tilts; common parameters are listed with the choices."""
     order, charts = np.argsort(tilt_series.tilt_angles), []
     for name, values in outcome.response.items():
         if len(set(values)) > 1:
@@ -205,7 +205,7 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
             charts.append(figure)
     if charts:
         report.heading("Beam and detector")
-        report.charts(charts, caption="Estimated from the images, and then learnt in the fit.")
+        report.charts(charts, caption="Estimated from the images, then refined in the fit.")
 
 
 def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
@@ -228,7 +228,7 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
 
 
 def _in_words(structure: SpatialStructure) -> str:
-    """What the residuals share; of so many pixels every trace of the volume's own smoothness stands out from chance."""
+    """Description of correlations in the residuals; with many pixels, even negligible ones are statistically significant."""
     correlations = np.abs([structure.horizontal, structure.vertical, structure.pattern])
     words = structure.in_words()
     if (
@@ -237,14 +237,14 @@ def _in_words(structure: SpatialStructure) -> str:
         or max(structure.rows, structure.columns) > 1 + 10 * _MATTERS
     ):
         return words
-    return words.partition("; a per-pixel")[0] + "; this is more than chance, but too small to matter"
+    return words.partition("; a per-pixel")[0] + "; this is statistically significant, but too small to matter"
 
 
 def _add_course(report: Report, outcome: Reconstruction) -> None:
     charts = []
     if outcome.fit_result is not None and outcome.fit_result.history:
         history = outcome.fit_result.history
-        figure, axis = new_chart("Course of the fit", x="step", y="held-out NLL, nats per pixel")
+        figure, axis = new_chart("Progress of the fit", x="step", y="held-out NLL, nats per pixel")
         axis.plot(list(history), list(history.values()), color=COLOURS["accent"], marker="o", markersize=2.5)
         charts.append(figure)
     if outcome.weights_tried:
@@ -257,7 +257,7 @@ def _add_course(report: Report, outcome: Reconstruction) -> None:
         charts.append(figure)
     if charts:
         report.heading("Convergence")
-        report.charts(charts, caption="Negative log-likelihood of pixels that the fit never saw; lower is better.")
+        report.charts(charts, caption="Negative log-likelihood of held-out pixels; lower is better.")
 
 
 def _add_resolution(

@@ -1,4 +1,4 @@
-"""Error bars in the report: standard deviation and bias beside the volume, on one colour scale."""
+"""Error bars in the report: standard deviation and bias next to the volume, with a common colour scale."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from recon.uncertainty.result import Uncertainty
     from recon.uncertainty.shell_band import ShellBand
 
-_REACH = 99.8  # percentile: a few voxels of the edge must not set the scale
+_REACH = 99.8  # percentile: a few voxels at edges must not determine the scale
 
 
 def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars: Uncertainty, unit: str) -> None:
-    """A section with slices across y and z, and the directions that no tilt saw."""
+    """Add a section with slices across y and z, and the directions without tilts."""
     report.heading("Error bars")
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
@@ -41,7 +41,7 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
 
 
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
-    """Volume, standard deviation and bias, (z, x) through the middle above (y, x); the last two share colours and their bar."""
+    """Middle slices (z, x) and (y, x) of volume, standard deviation and bias; the last two share a colour scale."""
     parts = [each.attenuation for each in (volume, bars.std, bars.bias)]
     reach = max(float(np.percentile(np.abs(part), _REACH)) for part in parts[1:])
     reach = reach or max(float(np.abs(part).max()) for part in parts[1:]) or 1.0

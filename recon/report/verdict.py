@@ -1,4 +1,4 @@
-"""The verdict on top of a report: its grade, its reasons and the pictures that show them."""
+"""The verdict at the top of a report: grade, reasons and charts."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
     """Add heading, grade, reasons and charts of a verdict to a report.
 
     Args:
-        report: the page so far.
-        verdict: to show.
-        tilt_series: what was reconstructed.
-        result: whose projections are compared with it.
+        report: the page.
+        verdict: the verdict.
+        tilt_series: the data.
+        result: the reconstruction, whose projections are compared with the data.
     """
     report.heading("Verdict")
     report.text(_WORDS[verdict.grade])
@@ -45,8 +45,8 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
         _chart("Residual of each tilt", "rms, detector units", angles, {"residual": residuals.residual.std((1, 2))}),
     ]
     caption = (
-        "Difference of each image from the projection of the volume, by linear regression. Scatter about zero is chance; "
-        "waves and steps indicate shifts, wrong angles, or a specimen that changes. The volume follows part of each difference."
+        "Difference of each image from the projection of the volume, by linear regression. Scatter about zero is random; "
+        "waves and steps indicate shifts, wrong angles, or a changing specimen. The volume absorbs a part of each difference."
     )
     report.charts(charts, caption=caption)
 

@@ -1,1 +1,1 @@
-"""Volumes larger than memory."""
+"""Volumes larger than memory, clusters, and batches of series."""

@@ -1,8 +1,8 @@
-"""A volume of any height, block of slices by block: memory for one block.
+"""Reconstruction of volumes of any height in blocks of slices, with the memory of one block.
 
-What all slices share is settled once, on a slab and a coarse volume of all of them. A block is fitted with a halo of slices that
-its neighbours fit too; around each border one block fades into the next. A finished block is a file, which is never computed
-twice, wherever and in whatever order blocks are computed.
+Choices for all slices are made once, on a slab and a coarse volume. A block is fitted with a halo of slices that overlaps its
+neighbours; around each border the blocks are blended. A finished block is stored in a file and not computed again, independent of
+where and in what order blocks are computed.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 Images = NDArray[np.float32]
 
 HALO = 12
-"""Slices on either side of a block that a fit sees too. Of a slab of 128³ that fills the field, 32 slices in the middle lose 0.09
-dB with 8 or 10 of them beside the whole volume, 0.04 with 4 or 14, and nothing with 12, 16 or 20."""
+"""Halo: slices on each side of a block that are fitted too. For a slab of 128³ that fills the field, 32 slices in the middle lose
+0.09 dB with a halo of 8 or 10 compared with the whole volume, 0.04 dB with 4 or 14, and nothing with 12, 16 or 20."""
 
-_FADE = 4  # slices on either side of a border; the outer half of the halo feels where its block ends
+_FADE = 4  # slices on each side of a border; the outer half of the halo is affected by the end of the block
 SETTLED_ON = 48
-"""Slices on which what all blocks share is settled."""
+"""Slices for the choices that all blocks share."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Block:
     """Slices that are reconstructed together.
 
     Attributes:
-        rows: the block's own.
-        wide: these and their halo.
-        height: slices of the whole volume.
-        overlap: slices on either side of a border that belong to two blocks, and to no third.
+        rows: slices of the block.
+        wide: slices of the block and its halo.
+        height: number of slices of the whole volume.
+        overlap: slices on each side of a border that belong to exactly two blocks.
     """
 
     rows: slice
@@ -55,7 +55,7 @@ class Block:
     overlap: int
 
     def shares(self) -> Images:
-        """(y,) how much of each `wide` slice is this block's, neighbours having the rest: the squares of all add up to one."""
+        """(y,) blending weight of each `wide` slice; the squared weights of all blocks sum to 1."""
         place = np.arange(self.wide.start, self.wide.stop) + 0.5
         found = np.ones(len(place), dtype=np.float32)
         for border, inward in ((self.rows.start, 1), (self.rows.stop, -1)):
@@ -66,15 +66,15 @@ class Block:
 
 @dataclass(frozen=True)
 class Blockwise:
-    """A method that reconstructs slices apart.
+    """A method that reconstructs blocks of slices independently.
 
     Attributes:
-        solve: from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
-            (tilt, y, u), and where `num_samples` says so of standard deviation and bias, and the table of `ShellPowers`.
-        finish: makes the result of the whole volume and its projections.
-        halo: slices that a block sees beyond its own.
-        forget: called with every block that is kept, for what only an unfinished one wants.
-        num_samples: that error bars come from; 0 for none.
+        solve: function from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
+            (tilt, y, u), and, if `num_samples` is positive, of standard deviation and bias, and the table of `ShellPowers`.
+        finish: function that creates the result from the whole volume and its projections.
+        halo: slices of the halo on each side.
+        forget: called with every stored block, to remove the states of its fits.
+        num_samples: number of posterior samples for error bars; 0 for none.
     """
 
     solve: Callable[[TiltSeries, Block], tuple[Images, ...]]
@@ -85,7 +85,7 @@ class Blockwise:
 
 
 def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
-    """Blocks of nearly equal height, of so many slices at most."""
+    """Blocks of nearly equal height, with at most `slices_at_once` slices."""
     count = -(-height // slices_at_once)
     ends = [round(number * height / count) for number in range(count + 1)]
     overlap = min(halo, int(np.diff(ends).min()) // 2)
@@ -96,7 +96,7 @@ def blocks(height: int, slices_at_once: int, halo: int) -> list[Block]:
 
 
 def fitted_slices(height: int, slices_at_once: int) -> int:
-    """Slices that are fitted where a volume is fitted in blocks: those with their halo, and what is settled first."""
+    """Total number of slices to fit for a volume in blocks, including halos and the slab for choices."""
     wide: int = sum(part.wide.stop - part.wide.start for part in blocks(height, slices_at_once, HALO))
     return wide + min(height, SETTLED_ON)
 
@@ -106,8 +106,8 @@ class BlockFiles:
     """The finished blocks of one volume.
 
     Attributes:
-        folder: theirs alone.
-        error_bars: whether each has them.
+        folder: folder that contains only these blocks.
+        error_bars: whether blocks have error bars.
     """
 
     folder: Path
@@ -115,37 +115,37 @@ class BlockFiles:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What a block gives, one file each."""
+        """Names of the results of a block, one file each."""
         return ("volume", "projections", "std", "bias", "shells") if self.error_bars else ("volume", "projections")
 
     def finished(self, block: Block) -> bool:
-        """Whether a block need not be computed again."""
-        return self._path("projections", block).is_file()  # which is written last
+        """Whether a block is complete."""
+        return self._path("projections", block).is_file()  # written last
 
     def write(self, block: Block, *arrays: Images) -> None:
-        """Keep what a block gave, in the order of `names`; each file is whole or not there."""
+        """Store the results of a block, in the order of `names`; each file is written atomically."""
         for name, array in sorted(zip(self.names, arrays, strict=True), key=lambda pair: pair[0] == "projections"):
             with atomic_path(self._path(name, block)) as partial:
                 write_npy(partial, np.asarray(array, dtype=np.float32))
 
     def read(self, block: Block) -> list[Images]:
-        """What has a value for each voxel or pixel, mapped to memory."""
+        """The results with one value per voxel or pixel, memory-mapped."""
         return [np.load(self._path(name, block), mmap_mode="r") for name in self.names if name != "shells"]
 
     def powers(self, parts: list[Block]) -> ShellPowers:
-        """Of the whole volume and its samples, from those of all blocks."""
+        """Shell powers of the whole volume and its samples, from those of all blocks."""
         tables = (np.load(self._path("shells", part)).astype(np.float64) for part in parts)
         return ShellPowers.of(np.sum(list(tables), axis=0))
 
     def _path(self, name: str, block: Block) -> Path:
-        # by the block's own slices: those with the halo may be the same of two blocks of a low volume
+        # named by the block's own slices; with halo, two blocks of a low volume may have the same slices
         return self.folder / f"{name}-{block.rows.start:07d}-{block.rows.stop:07d}.npy"
 
 
 def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files: BlockFiles) -> None:
-    """Reconstruct one block, where that is not done."""
+    """Reconstruct one block, unless it is complete."""
     if not files.finished(block):
-        hand_back()  # after other blocks, or what was settled, whose arrays have other sizes: they would add up
+        hand_back()  # earlier blocks and fits used arrays of other sizes; kept memory would accumulate
         files.write(block, *method.solve(tilt_series.rows(block.wide), block))
         if method.forget is not None:
             method.forget(block)
@@ -154,11 +154,11 @@ def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files:
 def assemble(
     parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
 ) -> tuple[Images, list[Volume]]:
-    """The projections (tilt, y, u), in a file that is gone when they are let go of, and the volume in a new one; where blocks
-    have error bars, standard deviation and bias follow in files beside it.
+    """Combine the blocks. Return the projections (tilt, y, u), in a temporary file, and the volume in the file `scratch`. If
+    blocks have error bars, standard deviation and bias follow, in files next to it.
 
     Raises:
-        OSError: the disk has no room for them.
+        OSError: the disk does not have enough space.
     """
     size = grid.voxel_size
     voxel = None if size is None else (size, size, size)
@@ -180,7 +180,7 @@ def assemble(
 
 
 def _fade_in(target: Images, found: Images, block: Block, fade: int) -> None:
-    """From the block below, which stands there already, to this one, about their border."""
+    """Blend this block with the previous one, which is already in `target`, around their border."""
     rows = slice(block.rows.start - fade, block.rows.start + fade)
     share = ((np.arange(2 * fade) + 0.5) / (2 * fade)).astype(np.float32)[:, None]
     above = found[:, rows.start - block.wide.start : rows.stop - block.wide.start]
@@ -191,6 +191,6 @@ def _fade_in(target: Images, found: Images, block: Block, fade: int) -> None:
 def block_memory(
     tilt_series: TiltSeries, grid: VolumeGrid, slices_at_once: int, *, fitted: bool
 ) -> tuple[TiltSeries, VolumeGrid]:
-    """What is in memory at a time, for `recon.scale.memory.needed_memory`: one block of the series and of the grid."""
+    """The part of series and grid in memory at a time, one block, for `recon.scale.memory.needed_memory`."""
     rows = min(grid.height, max(slices_at_once + 2 * HALO, SETTLED_ON) if fitted else slices_at_once)
     return tilt_series.rows(slice(0, rows)), replace(grid, height=rows)

@@ -1,4 +1,4 @@
-"""A Dask client on workers of this machine, or on those of a scheduler anywhere (extra ``[distributed]``)."""
+"""Dask clients with local workers, or with the workers of a scheduler (extra ``[distributed]``)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from contextlib import contextmanager
 from typing import Any
 
 _ONE_AT_A_TIME = threading.Lock()
-_PATIENCE = 20  # s; a scheduler that is there answers within one
+_PATIENCE = 20  # s; a running scheduler answers within one
 
 
 @contextmanager
 def all_threads_of_worker() -> Iterator[int]:
-    """The number of threads of the Dask worker that runs this; it gives them all to one task, for a second one would need its
-    memory again."""
+    """Use all threads of this Dask worker for one task, because a second task would need its own memory. Yield their number."""
     import dask.distributed
 
     library: Any = dask.distributed  # it has no types
@@ -24,21 +23,21 @@ def all_threads_of_worker() -> Iterator[int]:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A ``dask.distributed.Client``, closed at the end; None where neither workers nor a scheduler are asked for.
+    """Yield a ``dask.distributed.Client``, closed at the end; None if neither workers nor a scheduler are given.
 
     Args:
-        workers: processes on this machine, which share its cores.
+        workers: number of local processes, which share the cores of this machine.
         scheduler: address of a scheduler, ``tcp://HOST:PORT``.
 
     Raises:
         ModuleNotFoundError: dask.distributed is not installed.
-        ConnectionError: no scheduler answers there.
+        ConnectionError: no scheduler answers at this address.
     """
     if workers is None and scheduler is None:
         yield None
@@ -55,7 +54,7 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             client = library.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConnectionError(
-                f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or mend --scheduler"
+                f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or correct --scheduler"
             ) from error
         with client:
             yield client
@@ -68,7 +67,7 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     ):
         for number, worker in enumerate(
             client.scheduler_info(-1)["workers"]
-        ):  # while the client settles what all blocks share
+        ):  # while this process makes the choices for all blocks
             library.fire_and_forget(client.submit(_import_what_blocks_need, number, workers=[worker]))
         yield client
 

@@ -1,4 +1,4 @@
-"""How long a planned reconstruction will take on this machine."""
+"""Estimate of the run time of a planned reconstruction on this machine."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from recon.joint.plan import FitStage
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-_SLICES = 4  # that are projected to see how fast this machine is
-_REPEATS = 5  # the fastest counts: the first makes room
-# a step, in projections of the whole slice: likelihood, interpolation and regulariser, and what grows with the voxels that are
-# not skipped (shells of 256³, of which 0.13 are, take 0.7, and a slab of 512³ that fills the field 1.5)
+_SLICES = 4  # slices projected to measure the speed of this machine
+_REPEATS = 5  # the fastest counts; the first one allocates memory
+# time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
+# occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
 _ALWAYS, _OCCUPIED = 0.6, 0.9
-_NOISE_STEP = 0.012  # s, of a batch of 4096 pixels; it hardly depends on the series
-_START = 2.0  # s, of the coarse reconstruction before the first stage
+_NOISE_STEP = 0.012  # s, for a batch of 4096 pixels; hardly depends on the series
+_START = 2.0  # s, for the coarse reconstruction before the first stage
 
 
 def expected_seconds(
@@ -28,15 +28,15 @@ def expected_seconds(
     share: float = 1.0,
     num_slices: int | None = None,
 ) -> float:
-    """Seconds that stages will take where nothing else runs, within a factor of two or so.
+    """Expected run time of stages on an idle machine, in seconds, within about a factor of two.
 
     Args:
-        stages: of a plan.
+        stages: stages of a plan.
         tilt_series: the images.
-        grid: of the volume.
-        slab_height: slices of the slab that choices are made on.
-        share: of the voxels that are not skipped.
-        num_slices: that are fitted, those counted twice that two blocks share; by default all of the volume.
+        grid: grid of the volume.
+        slab_height: number of slices of the slab.
+        share: share of voxels that are not skipped.
+        num_slices: number of fitted slices, counting slices in two blocks twice; by default those of the volume.
     """
     num_slices = grid.height if num_slices is None else num_slices
     slice_step = (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
@@ -51,7 +51,7 @@ def expected_seconds(
 
 
 def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
-    """Projecting one slice to all tilts, and back."""
+    """Seconds for the projection of one slice to all tilts, and back."""
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=grid.depth,
@@ -60,7 +60,7 @@ def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
     )
     columns = torch.rand(grid.depth * grid.width, _SLICES)
     threads, seconds = torch.get_num_threads(), list[float]()
-    torch.set_num_threads(1)  # whose processor time is that of a machine that does nothing else
+    torch.set_num_threads(1)  # the CPU time of one thread does not depend on the load
     try:
         with torch.no_grad():
             for _ in range(_REPEATS):

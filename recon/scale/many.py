@@ -1,4 +1,4 @@
-"""Many tilt series, each reconstructed by a process of its own: what one of them breaks, the others do not notice."""
+"""Batches of tilt series, each reconstructed in a separate process, so that failures do not affect others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.scale.cluster import all_threads_of_worker, usable_cores
 
 Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "seconds")
-"""First columns of the table of results; the figures of `noiseflow reconstruct` follow."""
+"""First columns of the table of results, followed by the values of `noiseflow reconstruct`."""
 _NOT_OPTIONS = ("tilts", "out")
 _PARENT_DEATH_SIGNAL = 1  # of prctl(2)
 _OUTPUT = ("-o", "--out", "--output")
@@ -33,12 +33,12 @@ _JSON_START = '{\n "written_by": "noiseflow'
 
 @dataclass(frozen=True)
 class Job:
-    """One series.
+    """One series to reconstruct.
 
     Attributes:
-        tilts: its stack.
+        tilts: the stack.
         out: the volume to write.
-        words: further words of the command ``noiseflow reconstruct``.
+        words: further arguments of ``noiseflow reconstruct``.
     """
 
     tilts: Path
@@ -47,23 +47,23 @@ class Job:
 
     @property
     def command(self) -> list[str]:
-        """What reconstructs it."""
+        """The command that reconstructs the series."""
         return ["reconstruct", str(self.tilts), "-o", str(self.out), *self.words]
 
 
 def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
-    """The series of a folder, or of a table.
+    """The series of a folder or of a table.
 
     Args:
-        source: a folder, of which every stack with tilt angles counts, or a CSV table with a column ``tilts``; a column ``out``
-            names volumes, and others are options of ``noiseflow reconstruct``, as they are written, without the dashes.
-        out: folder of the volumes that no table names.
-        words: options of all series; those of a table come after them.
+        source: a folder, whose stacks with tilt angles are used, or a CSV table with a column ``tilts``. A column ``out`` names
+            volumes; other columns are options of ``noiseflow reconstruct`` without the dashes.
+        out: folder for volumes that the table does not name.
+        words: options for all series; options in a table follow them.
 
     Raises:
-        FileNotFoundError: there is no such folder or table, or no series in it.
-        ValueError: a table without the column, two series of the same volume, a volume that would replace another series or a
-            file among its options, or an option that names the volume.
+        FileNotFoundError: the folder or table does not exist, or has no series.
+        ValueError: the table has no column ``tilts``, two series have the same volume, a volume would replace another series or
+            an input file, or an option names the volume.
     """
     if source.is_dir():
         jobs = [
@@ -74,12 +74,12 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
     else:
         raise FileNotFoundError(f"{source} does not exist; give a folder of tilt series, or a CSV table of them")
     if not jobs:
-        raise FileNotFoundError(f"{source} holds no stack with tilt angles, beside it or of its own")
+        raise FileNotFoundError(f"{source} holds no stack with tilt angles, in the stack or next to it")
     targets = [job.out for job in jobs]
     named = next((word for job in jobs for word in job.words if word.partition("=")[0] in _OUTPUT), None)
     if named is not None:
         raise ValueError(
-            f"{named} among the options would be the volume of every series; name volumes in the column 'out'"
+            f"{named} in the options would name the same volume for every series; name volumes in the column 'out'"
         )
     _require_apart(jobs)
     twice = next((target for target in targets if targets.count(target) > 1), None)
@@ -89,7 +89,7 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
 
 
 def _require_apart(jobs: Sequence[Job]) -> None:
-    """Each series refuses itself as its volume; here it is another's, read before or after."""
+    """Check that no volume replaces an input of another series; the command checks the inputs of its own series."""
     read: dict[tuple[int, int], Job] = {}
     for job in jobs:
         for path in (job.tilts, *map(Path, job.words)):
@@ -100,7 +100,7 @@ def _require_apart(jobs: Sequence[Job]) -> None:
             other = read.get(_identity(job.out))
             if other is not None and _identity(job.tilts) != _identity(job.out):
                 raise ValueError(
-                    f"{job.out} would be lost: it is read for {other.tilts}; name another volume for {job.tilts}"
+                    f"{job.out} is an input of {other.tilts} and would be overwritten; name another volume for {job.tilts}"
                 )
 
 
@@ -110,12 +110,12 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 def reconstruct_all(jobs: Sequence[Job], *, workers: int, client: Any = None) -> Iterator[Row]:
-    """Rows of the table, as series are done.
+    """Reconstruct all series, and yield the rows of the table as they finish.
 
     Args:
         jobs: the series.
-        workers: processes at a time, which share the cores of this machine.
-        client: a Dask client whose workers do it; they must see the files.
+        workers: number of simultaneous processes, which share the cores of this machine.
+        client: a Dask client whose workers reconstruct the series; they need access to the files.
     """
     if client is not None:
         import dask.distributed
@@ -138,7 +138,7 @@ def reconstruct_all(jobs: Sequence[Job], *, workers: int, client: Any = None) ->
 
 
 def read_table(path: Path) -> list[Row]:
-    """The rows of a table of results that `write_table` wrote; none where there is no such file."""
+    """The rows of a table that `write_table` wrote; empty if the file does not exist."""
     if not path.is_file():
         return []
     if path.suffix.lower() == ".json":
@@ -148,16 +148,16 @@ def read_table(path: Path) -> list[Row]:
 
 
 def require_own_table(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a table that `write_table` did not write.
+    """Check that a table does not replace a file that `write_table` did not write.
 
     Raises:
-        FileExistsError: the file is another's.
+        FileExistsError: it would replace such a file.
     """
     if overwrite or not path.exists() or path.stat().st_size == 0:
         return
     with path.open("rb") as stream:
         head = stream.read(200)
-    # CSV has no place for a mark: the columns are ours
+    # CSV has no room for a mark; our files are recognised by their columns
     if not head.startswith((_JSON_START.encode(), ",".join(COLUMNS).encode()[:200])):
         raise FileExistsError(
             f"{path} exists and was not written by noiseflow; name another --table, or replace it with --overwrite"
@@ -165,7 +165,7 @@ def require_own_table(path: Path, *, overwrite: bool) -> None:
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows to a CSV or JSON file, all at once or not at all."""
+    """Write rows to a CSV or JSON file, atomically."""
     with io.atomic_path(path) as partial:
         if path.suffix.lower() == ".json":
             partial.write_text(
@@ -182,14 +182,14 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
 
 
 def left_out(source: Path) -> list[str]:
-    """Names of the images of a folder that are no series, since no tilt angles lie beside them or in them."""
+    """Names of images in a folder that are skipped, because they have no tilt angles."""
     if not source.is_dir():
         return []
     return [path.name for path in sorted(source.iterdir()) if path.suffix.lower() in SUFFIXES and not _is_series(path)]
 
 
 def _is_series(path: Path) -> bool:
-    """Whether a file is a stack whose angles are known: they lie beside it, or in it."""
+    """Whether a file is a stack with tilt angles, in the file or next to it."""
     if path.suffix.lower() not in SUFFIXES:
         return False
     if io.angle_file_of(path) is not None:
@@ -205,9 +205,7 @@ def _rows(path: Path) -> list[Row]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             return list(csv.DictReader(stream))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{path} is no CSV table ({error}); give a folder of tilt series, or a table of them"
-        ) from error
+        raise ValueError(f"{path} is not a CSV table ({error}); give a folder or a CSV table of tilt series") from error
 
 
 def _job_of_row(row: Row, folder: Path, out: Path, words: Sequence[str]) -> Job:
@@ -224,13 +222,13 @@ def _job_of_row(row: Row, folder: Path, out: Path, words: Sequence[str]) -> Job:
 
 
 class _Running:
-    """The processes that run now."""
+    """The running processes."""
 
     def __init__(self) -> None:
         self.lock, self.processes, self.stopped = Lock(), set[subprocess.Popen[bytes]](), False
 
     def stop(self) -> None:
-        """End them, each of which saves its state first, and begin no other."""
+        """Stop all processes, which save their states first, and start no others."""
         with self.lock:
             self.stopped = True
             for process in self.processes:
@@ -243,7 +241,7 @@ def _on_worker(job: Job) -> Row:
 
 
 def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | None, str]:
-    """What a command answered, and the last line of what it printed; no answer where it failed."""
+    """The result of a command (None if it failed), and the last line of its output."""
     command = [sys.executable, "-m", "noiseflow", *words, "--json"]
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     with running.lock:
@@ -262,7 +260,7 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
     running.processes.discard(process)
     lines = [
         text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))
-    ]  # a box of usage
+    ]  # lines of the frame around usage errors
     last = lines[-1].removeprefix("noiseflow: ") if lines else ""
     if process.returncode:
         return None, last or f"exit {process.returncode}"
@@ -270,10 +268,11 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
 
 
 def _ending_with_this() -> Callable[[], None] | None:
-    """What lets a new process end, its state saved, when this one is killed; else it would hold its output from the next run.
+    """A function for new processes that ends them, with saved state, when this process is killed; otherwise they would keep the
+    lock of their output.
 
-    Only Linux tells processes that their parent has died. The library is loaded here, for a new process of a program with
-    threads may do little before it starts.
+    Only Linux can notify processes that their parent has died. The library is loaded here, because a forked process of a program
+    with threads may do little before it executes another program.
     """
     if not sys.platform.startswith("linux"):
         return None

@@ -1,4 +1,4 @@
-"""How much memory a reconstruction needs, and how much there is."""
+"""Memory required by a reconstruction, and available memory."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
-_TILE = 0.3  # of the projector's matrix, that each tile of slices copies (`recon.projection.tiles`): 512³, shells and a full slab
-_BASE = 400 * 2**20
-_MOST = 0.7  # of the free memory: the estimate is right within some 20 %, and files that are mapped want room, too
-_PLEASANT = (
-    0.5  # of the free memory, where blocks need not be less than half as high for it: other programs want room, too
+_TILE = (
+    0.3  # share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 )
-_STEP = 8  # slices: blocks of a few more or fewer cost as much
+_BASE = 400 * 2**20
+_MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
+_PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
+_STEP = 8  # slices: smaller differences in height do not affect the cost
 PLENTY = 4 * 2**30
-"""Bytes: a whole volume that needs more is reconstructed in blocks, as good and hardly slower (at 256³, 55 s of processor time in
-four blocks, 48 s whole), so that 512³ leaves room for other programs."""
+"""Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
+time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
 _TALL = (
     64  # slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
 )
 
 
 def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
-    """Bytes that a reconstruction takes at its peak, within some 20 % (measured on 48³ to 1000³ voxels).
+    """Peak memory of a reconstruction, bytes, within about 20 % (measured for 48³ to 1000³ voxels).
 
     Args:
         tilt_series: the images.
         grid: the voxel grid.
-        fitted: whether a field is fitted, with its optimiser's moments and best state; else SIRT or back-projection.
+        fitted: whether a field is fitted, with optimiser moments and best state; otherwise SIRT or back-projection.
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
@@ -54,18 +54,18 @@ def choose_slices(
     workers: int = 1,
     plenty: float = math.inf,
 ) -> int | None:
-    """Slices of a block that fit into memory, or None where the whole volume does.
+    """Number of slices per block that fits into memory, or None if the whole volume fits.
 
     Args:
         tilt_series: the images.
-        grid: of the whole volume.
-        available: bytes.
-        fitted: as of `needed_memory`.
-        workers: blocks at a time.
-        plenty: bytes that a whole volume may take, however many are available.
+        grid: grid of the whole volume.
+        available: available memory, bytes.
+        fitted: as in `needed_memory`.
+        workers: number of simultaneous blocks.
+        plenty: largest memory of a whole volume, bytes, even if more is available.
 
     Raises:
-        MemoryError: not even a few slices fit.
+        MemoryError: even a few slices do not fit.
     """
     room = int(_MOST * available / workers)
     if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted) <= min(room, plenty):
@@ -81,13 +81,13 @@ def choose_slices(
         if fitting:
             return fitting[0]
     raise MemoryError(
-        f"not even {_STEP} slices of this reconstruction fit into {_human(room)}; give a smaller --thickness, fewer --workers, "
-        "or bin or crop the images"
+        f"even {_STEP} slices of this reconstruction do not fit into {_human(room)}; use a smaller --thickness or fewer "
+        "--workers, or bin or crop the images"
     )
 
 
 def available_memory(device: Any = "cpu") -> int | None:
-    """Bytes free for this process on a device; None where the system does not say."""
+    """Memory available to this process on a device, bytes; None if unknown."""
     import torch
 
     if torch.device(device).type == "cuda":
@@ -98,10 +98,10 @@ def available_memory(device: Any = "cpu") -> int | None:
 
 
 def require_memory(needed: int, device: Any = "cpu") -> str:
-    """One line about memory needed and available.
+    """One line about required and available memory.
 
     Raises:
-        MemoryError: it does not fit.
+        MemoryError: the memory does not suffice.
     """
     available = available_memory(device)
     if available is None:
@@ -109,7 +109,7 @@ def require_memory(needed: int, device: Any = "cpu") -> str:
     if needed > available:
         raise MemoryError(
             f"this reconstruction needs about {_human(needed)} of memory and {_human(available)} are available; "
-            "give --slices-at-once 32 (or fewer), a smaller --thickness, or bin or crop the images"
+            "use --slices-at-once 32 (or fewer), or a smaller --thickness, or bin or crop the images"
         )
     return f"memory: about {_human(needed)} needed, {_human(available)} available"
 
@@ -123,7 +123,7 @@ def _linux_available() -> int | None:
 
 
 def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """What a control group, such as a container's, leaves; cached contents of files it has read count as free."""
+    """Memory left in the control group (for example of a container); cached file contents count as free."""
     try:
         limit, used, parts = (
             (folder / f"memory.{name}").read_text(encoding="ascii").split() for name in ("max", "current", "stat")

@@ -1,4 +1,4 @@
-"""Runs the blocks of a volume: one after the other in this process, or as tasks of a Dask cluster."""
+"""Execution of the blocks of a volume: sequentially in this process, or as tasks on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def reconstruct_in_blocks(
     slices_at_once: int,
     client: Any = None,
 ) -> Reconstruction:
-    """Reconstruct block by block.
+    """Reconstruct a volume block by block.
 
     Args:
-        method: what reconstructs a block.
-        tilt_series: the images; a memory-mapped array will do.
-        grid: of the whole volume.
-        scratch: a new ``.npy`` or MRC file that holds the volume, which the result maps to memory; error bars lie beside it.
-        folder: keeps the finished blocks, and those of a former run are taken from there; None keeps none.
-        slices_at_once: slices of a block, at most.
-        client: a Dask client whose workers see `folder`; None computes here.
+        method: the method that reconstructs blocks.
+        tilt_series: the images; they may be memory-mapped.
+        grid: grid of the whole volume.
+        scratch: a new ``.npy`` or MRC file for the volume, which the result memory-maps; error bars are written next to it.
+        folder: folder for finished blocks, from which existing ones are used; None to keep none.
+        slices_at_once: largest number of slices of a block.
+        client: a Dask client whose workers have access to `folder`; None to compute in this process.
 
     Raises:
-        OSError: the disk has no room.
+        OSError: the disk does not have enough space.
     """
     parts = blocks(grid.height, slices_at_once, method.halo)
     with _folder(folder, scratch.parent) as kept:
@@ -74,11 +74,11 @@ def _folder(folder: Path | None, beside: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class StoredSeries:
-    """A tilt series whose images lie in a file that every worker sees.
+    """A tilt series whose images are in a file that all workers can read.
 
     Attributes:
         path: the ``.npy`` file of the images.
-        series: all else, of two rows only.
+        series: the rest of the series, with only two rows of pixels.
         mask: the ``.npy`` file of the mask, or None.
     """
 
@@ -88,7 +88,7 @@ class StoredSeries:
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, folder: Path) -> StoredSeries:
-        """Write the images, and the mask, where they are not there."""
+        """Write images and mask unless the files exist."""
         path, mask = folder / "series.npy", None if tilt_series.mask is None else folder / "mask.npy"
         _store(path, tilt_series.images)
         if mask is not None and tilt_series.mask is not None:
@@ -97,17 +97,17 @@ class StoredSeries:
         return cls(path, few.with_images(np.array(few.images), None), mask)
 
     def open(self) -> TiltSeries:
-        """The series, mapped to memory.
+        """The memory-mapped series.
 
         Raises:
-            FileNotFoundError: this machine does not see the file.
+            FileNotFoundError: this machine cannot read the file.
         """
         try:
             images = np.load(self.path, mmap_mode="r")
             mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"a worker does not see {self.path}; write the output to a disk that all workers share"
+                f"a worker cannot read {self.path}; write the output to a disk that all workers share"
             ) from error
         return self.series.with_images(images, mask)
 
@@ -119,7 +119,7 @@ def _store(path: Path, array: NDArray[Any]) -> None:
 
 
 def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: list[Block], files: BlockFiles) -> None:
-    """Blocks as tasks, each of which writes its own file: nothing large travels, and another worker does what a dead one had."""
+    """Run blocks as tasks that write their own files, so that no large data is transferred and lost tasks are repeated."""
     import dask.distributed
 
     source = StoredSeries.of(tilt_series, files.folder.absolute())
@@ -136,10 +136,10 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
 
 
 def _require_done(task: Any) -> None:
-    """Raise what a task raised, in words where its workers or the scheduler are gone.
+    """Raise the error of a task, with an explanation if its workers or the scheduler are lost.
 
     Raises:
-        ConnectionError: they are.
+        ConnectionError: workers or scheduler are lost.
     """
     from dask.distributed import CancelledError, KilledWorker
 
@@ -147,15 +147,17 @@ def _require_done(task: Any) -> None:
         task.result()
     except KilledWorker as error:
         raise ConnectionError(
-            "every worker that fitted one of the blocks died, most likely for want of memory; take fewer workers, or lower "
-            "blocks (--slices-at-once)"
+            "all workers that tried one of the blocks died, most likely because of insufficient memory; use fewer workers, or "
+            "smaller blocks (--slices-at-once)"
         ) from error
     except CancelledError as error:
-        raise ConnectionError("the Dask scheduler is gone, and what its workers were fitting with it") from error
+        raise ConnectionError(
+            "the Dask scheduler is lost, with all unfinished blocks; restart it and resume"
+        ) from error
 
 
 def _no_result(*_: Any) -> Any:
-    raise RuntimeError("a worker makes blocks, and the client makes the result of them")
+    raise RuntimeError("workers compute only blocks; the client assembles the result")
 
 
 def _solve_stored(method: Blockwise, source: StoredSeries, block: Block, files: BlockFiles) -> None:

@@ -1,1 +1,1 @@
-"""Tilt series: read, aligned, screened and checked."""
+"""Tilt series: reading, alignment, screening and checks."""

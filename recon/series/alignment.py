@@ -1,4 +1,4 @@
-"""Where the tilt axis lies in raw images and how far each image is shifted; images moved so that the axis runs along y."""
+"""Alignment of a tilt series: tilt axis and image shifts, and their application so that the axis is along y."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _OUTSIDE = "parts of them are outside the raw images and are left out of the fit
 @described(tilt_axis="°", shifts="px", tilt_angles="°")
 @dataclass(frozen=True)
 class Alignment:
-    """The way from aligned to raw images: a rotation about the middle, then a shift.
+    """The transformation from aligned to raw images: a rotation about the centre, then a shift.
 
     Attributes:
-        tilt_axis: degrees from y towards −x, anticlockwise where y points up (IMOD's rotation angle).
-        shifts: (tilt, 2) pixels of the raw images, in the order (y, x): where the aligned middle lies from the raw one.
+        tilt_axis: degrees from y towards −x, anticlockwise if y points up (IMOD's rotation angle).
+        shifts: (tilt, 2) shift (y, x) of the aligned centre from the raw centre, pixels of the raw images.
         tilt_angles: (tilt,) degrees.
-        evidence: for this axis and then for the other candidates, best first; empty where the axis was given without a search.
+        evidence: evidence for this axis, then for other candidates, best first; empty if the axis was given without a search.
     """
 
     tilt_axis: float
@@ -35,18 +35,18 @@ class Alignment:
     evidence: tuple[Evidence, ...] = ()
 
     def apply(self, tilt_series: TiltSeries) -> TiltSeries:
-        """The series with the axis along y through the middle; what is not in the raw images is masked.
+        """Align a series so that the axis is along y through the centre; regions outside the raw images are masked.
 
-        Cubic splines interpolate, once, which correlates the noise of neighbouring pixels. Within 45° of x, height and width
-        are swapped. Without rotation and fraction of a pixel, pixel values stay what they are. Large series go to a
-        temporary file.
+        Images are interpolated once, with cubic splines, which correlates the noise of neighbouring pixels. If the axis is
+        within 45° of x, height and width are swapped. Without rotation and fractional shifts, pixel values do not change. Large
+        series are written to a temporary file.
 
         Raises:
-            OSError: the disk has no room for that file.
-            ValueError: another number of shifts than of tilts, or nothing of an image is left in view.
+            OSError: the disk does not have enough space for that file.
+            ValueError: the numbers of shifts and tilts differ, or an image is moved out of view.
         """
         if self.shifts.shape != (tilt_series.num_tilts, 2):
-            raise ValueError(f"{len(self.shifts)} shifts do not belong to {tilt_series.num_tilts} tilts")
+            raise ValueError(f"{len(self.shifts)} shifts do not match {tilt_series.num_tilts} tilts")
         shape = (tilt_series.num_tilts, *self._shape(tilt_series.images.shape[1:]))
         images, mask = (
             mapped.temporary_map(shape, kind, in_memory=mapped.IN_MEMORY) for kind in (np.float32, np.bool_)
@@ -55,9 +55,7 @@ class Alignment:
             use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
             images[number], mask[number] = self._moved(image, use, shift)
         if not mask.any((1, 2)).all():
-            raise ValueError(
-                "an image was moved out of view entirely; give --tilt-axis, or leave out --refine-alignment"
-            )
+            raise ValueError("an image was moved out of view entirely; give --tilt-axis, or remove --refine-alignment")
         given = tilt_series.images.dtype
         if not np.issubdtype(given, np.floating) and all(np.array_equal(image, np.round(image)) for image in images):
             images = mapped.mapped_copy(
@@ -68,7 +66,7 @@ class Alignment:
         return replace(tilt_series, images=images, mask=None if mask.all() else mask, tilt_axis=None)
 
     def _shape(self, raw: tuple[int, ...]) -> tuple[int, ...]:
-        """Of aligned images."""
+        """Shape of aligned images."""
         theta = np.deg2rad(self.tilt_axis)
         return raw if abs(np.cos(theta)) >= abs(np.sin(theta)) else raw[::-1]
 
@@ -86,7 +84,7 @@ class Alignment:
         mask = seen > 0.99
         exact = self.tilt_axis % 90 == 0 and np.array_equal(
             start, np.round(start)
-        )  # pixels on pixels: values are copied
+        )  # whole-pixel shift: values are copied
         moved = affine_transform(
             image.astype(np.float64),
             back,
@@ -100,17 +98,17 @@ class Alignment:
 
     @property
     def residual(self) -> float | None:
-        """Share of the variance of tilts in contiguous gaps that no volume of the others explains; None without a search."""
+        """Unexplained share of the variance of tilts in contiguous gaps, given the other tilts; None without a search."""
         return self.evidence[0].residual if self.evidence else None
 
     @property
     def margin(self) -> float | None:
-        """Standard errors by which the axis explains more than the best other direction; None where there is no other."""
+        """Lead of the axis over the best other direction, in standard errors; None if there is no other."""
         return self.evidence[0].lead_over(self.evidence[1]) if len(self.evidence) > 1 else None
 
     @property
     def axis_offset(self) -> float:
-        """Pixels from the raw middle to the tilt axis: the shift across it that no place of the object accounts for."""
+        """Distance of the tilt axis from the raw centre, pixels: the shift not explained by the position of the object."""
         theta, axis = np.deg2rad(self.tilt_angles), np.deg2rad(self.tilt_axis)
         across = self.shifts @ np.array([np.sin(axis), np.cos(axis)])
         design = np.stack([np.ones_like(theta), np.cos(theta), np.sin(theta)], 1)
@@ -124,13 +122,13 @@ class Alignment:
             f"{largest:.1f} pixels, {rms:.2f} rms"
         )
         if self.residual is not None:
-            words += f"; gaps of tilts left out are explained to {1 - self.residual:.1%}"
+            words += f"; {1 - self.residual:.1%} of held-out gaps of tilts explained"
         if self.margin is not None:
-            words += f", at {self.evidence[1].axis:.1f}° to {1 - self.evidence[1].residual:.1%}"
+            words += f", {1 - self.evidence[1].residual:.1%} at {self.evidence[1].axis:.1f}°"
         return words
 
     def choices(self) -> dict[str, float | str]:
-        """What a table of results shows of it."""
+        """Values for a table of results."""
         found: dict[str, float | str] = {"tilt axis (°)": f"{self.tilt_axis:.2f}"}
         if self.residual is not None:
             found["axis offset (pixels)"] = f"{self.axis_offset:.2f}"

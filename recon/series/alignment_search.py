@@ -1,4 +1,4 @@
-"""The alignment of a raw tilt series, found together with a coarse volume of it, or declared unknown."""
+"""Search for the alignment of a raw tilt series jointly with a coarse volume."""
 
 from __future__ import annotations
 
@@ -21,31 +21,33 @@ from recon.series.views import without_level
 Progress = Callable[[str, int, int, str], None]
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
 _SPACING = 15.0
-_KEPT = (6, 3)  # directions after the smallest size, and after the next ones
-_SAME = 20.0  # degrees: nearer axes are one solution in two states of convergence, and differ little in the volume
-_EDGE = 1.4  # pixels by which a trial turn moves the edge of an image
+_KEPT = (6, 3)  # number of directions kept after the smallest size, and after the next ones
+_SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
+_EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
 _ROUNDS, _FEWER_ROUNDS = 15, 5
-_AGAIN = 3  # times that equal directions are refined before they count as equal: wrong ones move towards the true one
+_AGAIN = (
+    3  # refinements before equally good directions are declared equal, because wrong ones move towards the true one
+)
 
 
 class AxisUndetermined(ValueError):
-    """The images fit several directions of the tilt axis about equally well.
+    """The images are consistent with several directions of the tilt axis.
 
     Attributes:
-        candidates: the evidence for each, best first.
+        candidates: evidence for each direction, best first.
     """
 
     def __init__(self, candidates: Sequence[Evidence]) -> None:
         self.candidates = tuple(candidates)
         first, second = self.candidates[:2]
         super().__init__(
-            f"the images do not determine the tilt axis: {_words(first)}, {_words(second)}; give its rough direction, as the "
-            f"microscope states it: --tilt-axis {first.axis:.0f} or --tilt-axis {second.axis:.0f}"
+            f"the images do not determine the tilt axis: {_words(first)}, {_words(second)}; give its approximate direction "
+            f"from the microscope: --tilt-axis {first.axis:.0f} or --tilt-axis {second.axis:.0f}"
         )
 
 
 def _words(evidence: Evidence) -> str:
-    return f"{evidence.axis:.1f}° explains {1 - evidence.residual:.1%} of tilts left out"
+    return f"{evidence.axis:.1f}° explains {1 - evidence.residual:.1%} of held-out tilts"
 
 
 def find_alignment(
@@ -55,25 +57,25 @@ def find_alignment(
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Alignment:
-    """Find the tilt axis and every image's shift together with a volume, from 16 pixels wide up to full size or 160.
+    """Find the tilt axis and the shift of every image jointly with a volume, at widths from 16 pixels to full size, at most 160.
 
-    At each size, iterations of SIRT on the images as they are aligned so far take turns with a Gauss-Newton step of all shifts,
-    and of the axis, towards the volume's projections. At the smallest size this is tried for directions all around, from no
-    shifts and from those that cross-correlation of neighbours finds. Three directions are kept through the next sizes and
-    compared by contiguous gaps of tilts that are left out; the best one must stand clear of the others.
+    At each size, SIRT iterations with the current alignment alternate with Gauss–Newton steps of all shifts and the axis towards
+    the projections of the volume. At the smallest size, directions all around are tried, starting without shifts and with shifts
+    from cross-correlation of neighbours. Three directions are refined at the next sizes and compared by held-out contiguous gaps
+    of tilts. The best one must be significantly better than the others.
 
     Args:
         tilt_series: raw images, in any orientation.
-        tilt_axis: degrees from y towards −x, where it is known to some degrees; searched if None.
-        device: where to compute.
-        progress: called with every size.
+        tilt_axis: degrees from y towards −x, if known to a few degrees; searched if None.
+        device: torch device.
+        progress: called at every size.
 
     Raises:
-        AxisUndetermined: the images fit several directions, and none was given; a `ValueError`.
-        ValueError: fewer than five tilts.
+        AxisUndetermined: several directions fit equally well and none was given (a `ValueError`).
+        ValueError: there are fewer than five tilts.
     """
     if tilt_series.num_tilts < 5:
-        raise ValueError(f"{tilt_series.num_tilts} tilts are too few to align; leave out --refine-alignment")
+        raise ValueError(f"{tilt_series.num_tilts} tilts are too few to align; remove --refine-alignment")
     with torch.no_grad():
         search = _Search(tilt_series, tilt_axis, device, progress)
         match, evidence = search.run()
@@ -83,7 +85,7 @@ def find_alignment(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A direction that is tried; `known` if it was stated by somebody, or is near to one that was."""
+    """A candidate direction; `known` if it was given or is in the metadata, or is close to such a direction."""
 
     match: Match
     evidence: Evidence
@@ -109,7 +111,7 @@ class _Search:
         self.searched = min(binning for binning in self.binnings if size // binning <= _SEARCHED)
 
     def run(self) -> tuple[Match, list[Evidence]]:
-        """The alignment, and the evidence for its axis and for the other candidates."""
+        """Return the alignment, and the evidence for its axis and for the other candidates."""
         candidates: list[_Candidate] = []
         decided = False
         for done, binning in enumerate(self.binnings):
@@ -130,19 +132,19 @@ class _Search:
         return matcher.centred(candidates[0].match), [self._evidence(each) for each in candidates]
 
     def stated(self, degrees: float) -> float:
-        """Of the two directions of a line, which differ in the handedness of the volume: the known one, or within 90° of y."""
+        """The direction of a line, which determines the handedness: the known one, or the one within 90° of y."""
         return degrees + 180 * round(((self.known or 0.0) - degrees) / 180)
 
     def _evidence(self, candidate: _Candidate) -> Evidence:
         return replace(candidate.evidence, axis=self.stated(candidate.evidence.axis))
 
     def _first(self, matcher: Matcher) -> list[_Candidate]:
-        """Directions all around from two starts, at the smallest size."""
+        """Candidates all around from two starting points, at the smallest size."""
         ranked = np.argsort(self.angles, kind="stable").tolist()
         upright = int(np.argmin(np.abs(self.angles[ranked])))
         up, down = (matcher.neighbours_correlated(half) for half in (ranked[upright:], ranked[upright::-1]))
         directions = {float(degrees): False for degrees in np.arange(-90, 90, _SPACING)}
-        if self.given is not None:  # three others check it
+        if self.given is not None:  # three other directions as a check
             directions = {self.given + turn: turn == 0 for turn in (0.0, 45.0, 90.0, 135.0)}
         elif self.known is not None:
             directions[self.known] = True
@@ -154,7 +156,7 @@ class _Search:
         return [_weighed(matcher, match, known) for match, known in tried]
 
     def _refined(self, matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
-        """Shifts and axes at a finer size, best first; all but the best few are dropped."""
+        """Refine shifts and axes at a larger size; return the best few, best first."""
         best, *others = _distinct([self._matched(matcher, each) for each in candidates], _KEPT[1], _SAME)
         rivals = self._equal([best, *others])
         beaten = [each for each in others if each not in rivals]
@@ -175,34 +177,36 @@ class _Search:
         return _weighed(matcher, matcher.match(back, old.shifts, rounds=_ROUNDS), candidate.known)
 
     def _strayed(self, candidate: _Candidate) -> float | None:
-        """The stated direction, radians, where a candidate that began there has gone elsewhere."""
+        """The stated direction, radians, if a candidate that started there has moved away; otherwise None."""
         if self.known is None or not candidate.known or _between(candidate.match.degrees, self.known) < _SAME:
             return None
         return math.radians(self.known)
 
     def _ranked(self, candidates: list[_Candidate]) -> list[_Candidate]:
-        """The candidates, the one that is decided for before the others. Raises as `_decided`."""
+        """The candidates, with the chosen one first. Raises as `_decided`."""
         chosen = self._decided(candidates)
         return [chosen, *(each for each in candidates if each is not chosen)]
 
     def _equal(self, candidates: list[_Candidate]) -> list[_Candidate]:
-        """Those that the best one does not stand clear of."""
+        """The candidates that are not significantly worse than the best."""
         best, *others = candidates
         return [each for each in others if not best.evidence.is_clear_of(each.evidence)]
 
     def _decided(self, candidates: list[_Candidate]) -> _Candidate:
-        """The candidate that stands clear of all others, or that is known beforehand.
+        """The candidate that is significantly better than all others, or that is known.
 
         Raises:
-            AxisUndetermined: there is none.
+            AxisUndetermined: there is no such candidate.
         """
         best = candidates[0]
         known = next((each for each in candidates if each.known), None)
         equal = self._equal(candidates)
         if known is not None and known is not best and known not in equal:
-            advice = "the given direction is kept" if self.given is not None else "the images are believed"
+            advice = (
+                "the given direction is used" if self.given is not None else "the direction from the images is used"
+            )
             warnings.warn(
-                f"the tilt axis is stated to be at {self.known:.0f}°, but {_words(self._evidence(best))} and "
+                f"the stated tilt axis is {self.known:.0f}°, but {_words(self._evidence(best))} and "
                 f"{_words(self._evidence(known))}; {advice}",
                 stacklevel=5,
             )
@@ -213,7 +217,7 @@ class _Search:
 
 
 def _distinct(candidates: list[_Candidate], count: int, apart: float) -> list[_Candidate]:
-    """The best of those nearer than `apart` to each other, best first; the known and the most compact one are among them."""
+    """The best candidates at least `apart` from each other, best first; includes the known and the most compact one."""
     kept: list[_Candidate] = []
     compact = min(candidates, key=lambda candidate: candidate.evidence.occupied)
     for each in sorted(candidates, key=lambda candidate: candidate.residual):
@@ -231,7 +235,7 @@ def _apart(one: _Candidate, other: _Candidate) -> float:
 
 
 def _between(one: float, other: float) -> float:
-    """Degrees between two lines."""
+    """Angle between two lines, degrees."""
     return abs((one - other + 90) % 180 - 90)
 
 
@@ -240,7 +244,7 @@ def _weighed(matcher: Matcher, match: Match, known: bool) -> _Candidate:
 
 
 def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
-    """The axis where the parabola through three directions leaves the least unexplained in every second tilt."""
+    """The axis at the minimum of a parabola through three directions, by the unexplained share of every second tilt."""
     found, step = candidate.match, 2 * _EDGE / matcher.size
 
     def tried(start: Match, turn: float) -> tuple[float, Match]:
@@ -265,7 +269,7 @@ def _line_integrals(tilt_series: TiltSeries) -> Tensor:
 
 
 def _binnings(size: int) -> list[int]:
-    """From about 16 pixels wide, finer by two each, to full size or to what is at most 160 wide."""
+    """Binning factors for widths from about 16 pixels, doubling each time, to full size or at most 160."""
     binnings = [max(1, round(size / _COARSEST))]
     while binnings[-1] > max(1, math.ceil(size / _FINEST)):
         binnings.append(max(math.ceil(binnings[-1] / 2), math.ceil(size / _FINEST)))

@@ -1,4 +1,4 @@
-"""Whether bright and dark are what the mode of a tilt series says."""
+"""Check whether the contrast of a tilt series matches its mode."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, block_means
 
 _COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
-_MARGIN = 0.05  # right and inverted phantoms differ by 0.12 or more in what a coarse volume explains
+_MARGIN = 0.05  # the explained shares of correct and inverted phantoms differ by at least 0.12
 _BRIGHTER = 1.5
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
-    """Swap bright and dark: every pixel value becomes largest + smallest − reading, in the same number type."""
+    """Invert the contrast: every pixel value becomes largest + smallest − value, in the same data type."""
     images = tilt_series.images
     largest, smallest = images.max(), images.min()
-    # in this order integers stay within their type
+    # this order avoids integer overflow
     swapped = ((largest - image) + smallest for image in images)
     return replace(
         tilt_series, images=mapped.mapped_copy(swapped, images.shape, images.dtype, in_memory=mapped.IN_MEMORY)
@@ -33,8 +33,8 @@ def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
 
 
 def check_contrast(tilt_series: TiltSeries) -> None:
-    """Warn where a coarse non-negative volume explains the images better with bright and dark swapped, or where bright-field
-    images are far brighter than the vacuum that they show."""
+    """Warn if a coarse non-negative volume explains the images better with inverted contrast, or if parts of bright-field
+    images are much brighter than vacuum."""
     images = _coarse(tilt_series.images)
     series = replace(tilt_series, images=images, mask=None)
     as_given, swapped = explained(series), explained(invert_contrast(series))
@@ -44,7 +44,7 @@ def check_contrast(tilt_series: TiltSeries) -> None:
             given, other = ("HAADF or EDX", "--mode transmission if these are bright-field images")
         warnings.warn(
             f"the contrast looks inverted for {given}: a coarse volume explains {max(as_given, 0):.0%} of the images, and "
-            f"{swapped:.0%} with bright and dark swapped; give {other}, otherwise --invert-contrast",
+            f"{swapped:.0%} with inverted contrast; give {other}, otherwise --invert-contrast",
             stacklevel=2,
         )
     elif tilt_series.mode == "transmission":
@@ -52,11 +52,11 @@ def check_contrast(tilt_series: TiltSeries) -> None:
 
 
 def explained(tilt_series: TiltSeries) -> float:
-    """Share of the images' variance that a non-negative volume explains after a few iterations of SIRT."""
+    """Share of the variance of the images that a non-negative volume explains after a few iterations of SIRT."""
     images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
     try:
         response = estimate_response(tilt_series)
-    except ValueError:  # no positive incident intensity, so no such volume
+    except ValueError:  # no positive incident intensity, so there is no such volume
         return 0.0
     width = images.shape[2]
     projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=width, width=width)
@@ -74,13 +74,13 @@ def _check_intensity(tilt_series: TiltSeries) -> None:
     brightest = float(np.quantile(tilt_series.images, 0.999))
     if brightest > _BRIGHTER * intensity:
         warnings.warn(
-            f"parts of the images reach {brightest:.4g}, and the incident intensity is about {intensity:.4g}: no object is "
-            "brighter than vacuum in bright field; give --mode linear if these are HAADF or EDX images, or mask those parts",
+            f"parts of the images reach {brightest:.4g}, but the incident intensity is about {intensity:.4g}; bright-field "
+            "images cannot be brighter than vacuum: give --mode linear for HAADF or EDX images, or mask those parts",
             stacklevel=3,
         )
 
 
 def _coarse(images: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Block averages, at most so many pixels wide and high."""
+    """Binned images of limited width and height."""
     _, height, width = images.shape
     return block_means(images, -(-height // _COARSE_HEIGHT), -(-width // _COARSE_WIDTH))

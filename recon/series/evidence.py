@@ -1,4 +1,4 @@
-"""What speaks for a tilt axis: gaps of tilts left out, mass conserved along the axis, and how compact the volume is."""
+"""Evidence for a tilt axis: held-out gaps of tilts, conservation of mass along the axis, and compactness of the volume."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from recon.projection.defocused_projector import gaussian_matrix
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
 from recon.series.views import view_numbers
 
-_GAP = 15.0  # degrees; neighbours nearer than this give each other away, whatever the axis
-_FEWEST_GAPS = 5  # three between the outer two, the fewest that show a spread
-_FOLDS = 3  # a gap has two gaps of tilts that stay between it and the next
-_DETERMINED = 4.0  # standard errors; true axes of simulated series are ahead by 5 or more, equal ones by up to 2.4
-_MORE_COMPACT = 1.2  # volumes of one object about axes that are equally good differ by up to 1.1
-_CONVERGED = 90  # iterations of SIRT; after 30, what is missing of the volume moves the best axis by more than a degree
+_GAP = 15.0  # degrees; closer neighbours predict each other for any axis
+_FEWEST_GAPS = 5  # three between the outer two, the smallest number with a spread
+_FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
+_DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
+_MORE_COMPACT = 1.2  # volumes of one object with equally good axes differ by up to 1.1
+_CONVERGED = 90  # iterations of SIRT; after 30, the best axis is still wrong by more than a degree
 _SMOOTHED = (
-    2.0  # pixels; the noise that a volume has fitted differs with the axis: unsmoothed, a noisy slab's was 12° off
+    2.0  # pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
 )
-_SEEN = 0.95  # of a row, for its sum to count
+_SEEN = 0.95  # visible share of a row that is required for its sum
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How well one tilt axis explains a series. Shares are of the images' variance.
+    """Evidence for one tilt axis of a series. Shares are relative to the variance of the images.
 
     Attributes:
         axis: degrees from y towards −x.
-        unexplained: (tilt,) share that a volume of the tilts outside a contiguous gap does not explain in its tilts.
-        unchanged: (tilt,) the same of images interpolated across the gap, without any volume.
+        unexplained: (tilt,) share that a volume from the tilts outside a contiguous gap does not explain in the gap.
+        unchanged: (tilt,) the same for images interpolated across the gap without a volume.
         unconserved: (tilt,) share of the profile along the axis (row sums over u) that differs from the mean profile.
-        occupied: share of the voxels that the volume fills.
-        gaps: (tilt,) number of the gap each tilt is in.
+        occupied: share of voxels that the volume fills.
+        gaps: (tilt,) index of the gap of each tilt.
     """
 
     axis: float
@@ -48,23 +48,24 @@ class Evidence:
 
     @property
     def residual(self) -> float:
-        """Share of the variance that is left unexplained in gaps between other tilts."""
+        """Unexplained share of the variance in gaps between other tilts."""
         return float(self.unexplained[self._between].mean())
 
     @property
     def images_hardly_change(self) -> bool:
-        """Whether images interpolated across the gaps are nearer to those left out than any volume's projections."""
+        """Whether images interpolated across the gaps predict the held-out ones better than projections of a volume."""
         return _standard_errors(self.unexplained - self.unchanged, self) > 0
 
     def lead_over(self, other: Evidence) -> float:
-        """By how many standard errors, over the gaps, this axis leaves less unexplained than another."""
+        """Lead over another axis in the unexplained share, in standard errors over the gaps."""
         return _standard_errors(other.unexplained - self.unexplained, self)
 
     def is_clear_of(self, other: Evidence) -> bool:
-        """Whether the images decide for this axis and against the other one.
+        """Whether the images favour this axis significantly over the other one.
 
-        A body of revolution gives nearly equal images at all angles, which suit any axis: what a volume leaves unexplained
-        is then mostly its own faults, and the axis is doubtful if the other one makes a more compact volume.
+        A rotationally symmetric object has nearly equal images at all angles, which are consistent with any axis. The
+        unexplained share then mostly reflects errors of the volume, and the axis is doubtful if the other one gives a more
+        compact volume.
         """
         if self.images_hardly_change and self.occupied > _MORE_COMPACT * other.occupied:
             return False
@@ -87,9 +88,9 @@ class Evidence:
 def weigh(matcher: Matcher, found: Match) -> Evidence:
     """Collect the evidence for an alignment.
 
-    Pixels of the raw images are compared, which no interpolation has smoothed: otherwise a direction along the rows, which
-    smooths noise least and fits it best, would win too often. The outer gaps are left out by turns like the others, but they are
-    extrapolated, and do not count.
+    The comparison uses pixels of the raw images, which are not smoothed by interpolation. Otherwise directions along the rows,
+    which smooth the noise least and fit it best, would be preferred. The outer gaps are held out like the others, but are not
+    counted, because they are extrapolated.
     """
     angles = np.asarray(matcher.projector.tilt_angles)
     gaps, view = _gaps(angles), _View.of(matcher, found)
@@ -104,7 +105,7 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
 
 
 def unexplained_in_halves(matcher: Matcher, found: Match) -> float:
-    """Share of the variance that volumes of every second view leave in the others: it finds degrees, not directions."""
+    """Unexplained share of the variance when volumes of every second view predict the others; refines directions locally."""
     view, angles = _View.of(matcher, found), np.asarray(matcher.projector.tilt_angles)
     rank = view_numbers(angles) % 2
     return float(
@@ -115,7 +116,7 @@ def unexplained_in_halves(matcher: Matcher, found: Match) -> float:
 
 @dataclass(frozen=True)
 class _View:
-    """Aligned images and where raw pixels are in them."""
+    """Aligned images and the positions of raw pixels in them."""
 
     matcher: Matcher
     images: Tensor
@@ -135,19 +136,19 @@ class _View:
         return cls(matcher, images, seen, there, inside)
 
     def predicted_without(self, out: NDArray[np.bool_], num_iterations: int = 3 * ITERATIONS) -> Tensor:
-        """All images, by a volume of those that are not `out`."""
+        """Predict all images by a volume of those that are not `out`."""
         kept = torch.from_numpy(~out).to(self.images.device)[:, None, None]
         return self.matcher.projector(self.matcher.sirt(self.images, self.seen * kept, None, num_iterations))
 
     def errors(self, predicted: Tensor) -> NDArray[np.float64]:
-        """(tilt,) squared errors in raw pixels over the mean variance of an image, both of smoothed images."""
+        """(tilt,) squared errors at raw pixels relative to the mean variance of an image, both for smoothed images."""
         measured = self.matcher.images
         squares = self._squares(sampled(predicted, self.there)[0] - measured)
         whole = self._squares(measured - measured.mean()).mean()
         return np.asarray((squares / whole.clamp_min(1e-30)).double().cpu().numpy())
 
     def _squares(self, difference: Tensor) -> Tensor:
-        """(tilt,) sums of squares of what is left when noise is smoothed away."""
+        """(tilt,) sums of squares after smoothing."""
         down, across = (gaussian_matrix(size, _SMOOTHED, like=difference) for size in difference.shape[1:])
         return ((down @ (difference * self.inside) @ across).square() * self.inside).sum((1, 2))
 
@@ -160,7 +161,7 @@ def _gaps(angles: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(tilt, tilt) weights of the kept tilts on both sides of each one, by their distance in angle."""
+    """(tilt, tilt) weights for linear interpolation in angle from the kept tilts on both sides of each tilt."""
     order = np.flatnonzero(~out)[np.argsort(angles[~out], kind="stable")]
     place = np.interp(angles, angles[order], np.arange(len(order)))
     low = np.minimum(place.astype(np.int64), len(order) - 2)
@@ -171,7 +172,7 @@ def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArr
 
 
 def _unconserved(images: Tensor, seen: Tensor) -> NDArray[np.float64]:
-    """Per tilt: the square of its row sums minus their mean over the tilts, over the mean square; rows in full view."""
+    """Per tilt: squared difference of row sums from their mean over the tilts, relative to the mean square; visible rows only."""
     whole = (seen.mean(2) > _SEEN).double()
     rows = (images * seen).double().sum(2) / seen.double().mean(2).clamp_min(_SEEN)
     mean = (rows * whole).sum(0) / whole.sum(0).clamp_min(1)
@@ -180,7 +181,7 @@ def _unconserved(images: Tensor, seen: Tensor) -> NDArray[np.float64]:
 
 
 def _standard_errors(difference: NDArray[np.float64], evidence: Evidence) -> float:
-    """The mean over the gaps between other tilts, in standard errors of it."""
+    """The mean over gaps between other tilts, divided by its standard error."""
     numbers = range(1, int(evidence.gaps.max()))
     means = [difference[evidence.gaps == gap].mean() for gap in numbers if (evidence.gaps == gap).any()]
     error = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else np.inf

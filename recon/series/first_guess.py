@@ -1,5 +1,4 @@
-"""What a look at a tilt series tells before any fit: the detector's response, its clipping limits and steps, the scale of
-attenuation."""
+"""Initial estimates from a tilt series before any fit: detector response, scale of attenuation, slabs."""
 
 from __future__ import annotations
 
@@ -18,15 +17,15 @@ from recon.series.tilt_series import TiltSeries, block_means
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
-    """A first guess of the detector's response: vacuum is brightest in bright field, darkest in HAADF.
+    """Initial estimate of the detector response: vacuum is brightest in bright field and darkest in HAADF.
 
     Args:
         tilt_series: the data.
-        estimate: whether a fit shall refine the guess.
-        level: detector units, of linear images; the response is that of pixel values above it.
+        estimate: whether the fit refines the response.
+        level: constant level of linear images, detector units; the response is that of pixel values above it.
 
     Raises:
-        ValueError: bright-field images that are nowhere positive.
+        ValueError: bright-field images have no positive values.
     """
     images = tilt_series.images
     beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
@@ -41,7 +40,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     intensity = float(np.quantile(means, 0.95))
     if intensity <= 0:
         raise ValueError(
-            "a transmission series is brightest where there is vacuum; these images are negative: try --mode linear"
+            "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
         )
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
@@ -55,13 +54,13 @@ def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, proje
 
 
 def attenuation_scale(volume: Tensor) -> float:
-    """Attenuation per voxel of what is not vacuum: the mean that weighs each voxel by its square."""
+    """Typical attenuation per voxel outside vacuum: the mean weighted by the squared attenuation."""
     power = (volume**2).sum()
     return float((volume**3).sum() / power) if power > 0 else 1.0
 
 
 def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
-    """The run of `num_slices` neighbouring slices in which the images vary most."""
+    """The `num_slices` neighbouring slices with the largest variation of the images."""
     height = tilt_series.images.shape[1]
     if num_slices >= height:
         return slice(0, height)
@@ -70,7 +69,7 @@ def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
 
 
 def calm_slab(tilt_series: TiltSeries, num_slices: int, apart_from: slice) -> slice:
-    """The run of at most `num_slices` neighbouring slices in which the images vary least, none of them in another run."""
+    """At most `num_slices` neighbouring slices with the smallest variation of the images, outside `apart_from`."""
     num_slices = min(num_slices, max(apart_from.start, tilt_series.images.shape[1] - apart_from.stop))
     if num_slices == 0:
         return slice(0, 0)
@@ -81,6 +80,6 @@ def calm_slab(tilt_series: TiltSeries, num_slices: int, apart_from: slice) -> sl
 
 
 def _variation(tilt_series: TiltSeries, num_slices: int) -> NDArray[np.float64]:
-    """How much the mean image varies in every run of so many neighbouring slices, by its first."""
+    """Variation of the mean image in every range of `num_slices` neighbouring slices, by its first slice."""
     energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
     return np.convolve(energy, np.ones(num_slices), mode="valid")

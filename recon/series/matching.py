@@ -1,4 +1,4 @@
-"""Images of a raw tilt series matched with a coarse volume of them: the shift of every image, and the tilt axis."""
+"""Matching of raw images with a coarse volume: the shift of every image, and the tilt axis."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from torch.nn import functional
 from recon.projection.projector import SliceProjector
 
 ITERATIONS = 10
-_FARTHEST = 3.0  # pixels in one step: beyond, the slopes of an image that is blurred by a pixel no longer hold
-_MOST_TURN = math.radians(3)  # moves the edge of 64 pixels by about as much
+_FARTHEST = 3.0  # pixels per step; for larger shifts the linearisation of an image blurred by one pixel is not valid
+_MOST_TURN = math.radians(3)  # displaces the edge of 64 pixels by about as much
 
 
 @dataclass(frozen=True)
 class Match:
-    """A tilt axis and shifts, and the volume that the images make with them.
+    """A tilt axis and shifts, with the volume reconstructed from the images aligned by them.
 
     Attributes:
         axis: radians from y towards −x.
-        shifts: (tilt, (y, x)) raw pixels: where the aligned middle lies from the raw one.
-        volume: (z, y, x) of the size it was matched at.
+        shifts: (tilt, (y, x)) shift of the aligned centre from the raw centre, raw pixels.
+        volume: (z, y, x) at the size of the match.
     """
 
     axis: float
@@ -40,19 +40,19 @@ class Match:
 
     @property
     def occupied(self) -> float:
-        """Share of the voxels that the volume fills: its sum squared over its sum of squares; small where it is compact."""
+        """Share of voxels that the volume fills: its squared sum over its sum of squares; small for compact volumes."""
         squares = self.volume.square().sum() * self.volume.numel()
         return float(self.volume.sum() ** 2 / squares) if squares > 0 else 1.0
 
 
 class Matcher:
-    """Images averaged over squares of `binning` pixels, and the projector of a cube as wide as they are.
+    """Binned images, and the projector of a cube of their width.
 
     Args:
         images: (tilt, y, x) line integrals.
         tilt_angles: (tilt,) degrees.
-        binning: raw pixels along the edge of a coarse one.
-        used: (tilt, y, x) 1 for the pixels to use, 0 for the others; None for all.
+        binning: binning factor.
+        used: (tilt, y, x) 1 for pixels to use, 0 for others; None for all.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Matcher:
         self._moves = torch.from_numpy(np.stack([np.sin(theta), np.cos(theta)], 1)).float().to(images.device)
 
     def match(self, axis: float, shifts: Tensor, *, rounds: int, free_axis: bool = False) -> Match:
-        """Iterations of SIRT take turns with a Gauss-Newton step of all shifts, and of the axis, towards its projections."""
+        """Alternate SIRT iterations with Gauss–Newton steps of all shifts, and of the axis, towards the projections."""
         shifts = self.in_own_pixels(shifts)
         volume = torch.zeros(self.size, self.size, self.size, device=self.images.device)
         for _ in range(rounds):
@@ -82,11 +82,11 @@ class Matcher:
         return Match(axis, shifts * self.binning - self._middle, volume)
 
     def in_own_pixels(self, shifts: Tensor) -> Tensor:
-        """Shifts of raw images, in pixels of these."""
+        """Convert shifts from raw pixels to binned pixels."""
         return (shifts + self._middle) / self.binning
 
     def aligned(self, axis: float, shifts: Tensor) -> tuple[Tensor, Tensor]:
-        """Images (tilt, y, u) of the aligned frame, and 1 where a used pixel of the raw ones is; shifts in own pixels."""
+        """Aligned images (tilt, y, u), and 1 where there is a used raw pixel; shifts in binned pixels."""
         raw = places(torch.Size([self.size, self.size]), shifts) @ frame(axis, shifts) + shifts[:, None, None, :]
         values, inside = sampled(self.images, raw)
         if self.used is not None:
@@ -94,11 +94,11 @@ class Matcher:
         return values, inside
 
     def centred(self, found: Match) -> Match:
-        """The same with the object in the middle of the volume's width and depth.
+        """The match with the object centred in width and depth of the volume.
 
-        Shifts determine an object up to its place. In the middle it fits a thin volume, and its shifts do not depend on the scale
-        of the stated tilt angles, as those of an object far from the axis do. Voxels count by their squares: noise, which SIRT
-        keeps positive, fills the field with mass of its own.
+        Shifts determine an object except for its position. If it is centred, it fits into a thin volume, and its shifts do not
+        depend on the scale of the tilt angles, unlike those of an object far from the axis. Voxels are weighted by their squares,
+        because SIRT with non-negativity turns noise into mass everywhere.
         """
         place = torch.tensor([_middle(found.volume.square().sum(other)) for other in ((1, 2), (0, 1))]) * self.binning
         across = self._moves @ place.to(self._moves)
@@ -106,15 +106,15 @@ class Matcher:
         return replace(found, shifts=found.shifts + moves @ frame(found.axis, moves))
 
     def about_mass(self, found: Match, turn: float) -> tuple[float, Tensor]:
-        """Axis and shifts after a turn about the place on the axis where most of the mass is: the least disturbance."""
-        mass = found.volume.sum((0, 2))  # perhaps of a coarser size
+        """Axis and shifts after a rotation about the centre of mass along the axis, which changes the images least."""
+        mass = found.volume.sum((0, 2))  # may be at a coarser size
         height = _middle(mass) * self.size * self.binning / len(mass)
         place = torch.tensor([height, 0.0], device=mass.device)
         moved = place @ (frame(found.axis, place) - frame(found.axis + turn, place))
         return found.axis + turn, found.shifts + moved
 
     def neighbours_correlated(self, order: list[int]) -> Tensor:
-        """Shifts, in raw pixels, that fit every image to its neighbour in angle, from the first of `order` outwards."""
+        """Shifts, raw pixels, by cross-correlation of every image with its neighbour, outwards from the first of `order`."""
         window = torch.outer(*(torch.hann_window(size, periodic=False) for size in self.images.shape[1:]))
         flat = (self.images - self.images.mean((1, 2), keepdim=True)) * window.to(self.images.device)
         spectra = torch.fft.fft2(flat)
@@ -128,7 +128,7 @@ class Matcher:
         return shifts * self.binning
 
     def sirt(self, images: Tensor, seen: Tensor, volume: Tensor | None, num_iterations: int) -> Tensor:
-        """Iterations of SIRT in which pixels outside the raw images do not count; nothing is negative."""
+        """SIRT iterations with non-negativity that ignore pixels outside the raw images."""
         A = self.projector
         if volume is None:
             volume = torch.zeros(A.depth, images.shape[1], A.width, device=images.device)
@@ -141,19 +141,19 @@ class Matcher:
 
 
 def frame(axis: float, like: Tensor) -> Tensor:
-    """Rows: the aligned frame's y and u directions in raw (y, x)."""
+    """Matrix whose rows are the y and u directions of the aligned frame in raw (y, x)."""
     cosine, sine = math.cos(axis), math.sin(axis)
     return torch.tensor([[cosine, -sine], [sine, cosine]], dtype=like.dtype, device=like.device)
 
 
 def places(shape: torch.Size, like: Tensor) -> Tensor:
-    """Places (y, x) of all pixels, from the middle, (height, width, 2)."""
+    """Positions (y, x) of all pixels relative to the centre, (height, width, 2)."""
     sides = (torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2 for size in shape)
     return torch.stack(torch.meshgrid(*sides, indexing="ij"), -1)
 
 
 def sampled(images: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Images (tilt, y, x) at places (tilt, ..., 2) from their middle, and 1 where these are inside."""
+    """Images (tilt, y, x) at positions (tilt, ..., 2) relative to their centre, and 1 where these are inside."""
     extent = torch.tensor(images.shape[1:], device=images.device)
     grid = (2 * where / extent).flip(-1)
     values = functional.grid_sample(images[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False)
@@ -161,7 +161,7 @@ def sampled(images: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _gauss_newton(images: Tensor, predicted: Tensor, seen: Tensor, *, free_axis: bool) -> tuple[Tensor, float]:
-    """Moves (tilt, (y, u)) and turn (radians) of the sampling points that bring the images nearest to the predicted ones."""
+    """Shifts (tilt, (y, u)) and rotation (radians) of the sampling points that best match images and predictions."""
     down, across = torch.zeros_like(predicted), torch.zeros_like(predicted)
     down[:, 1:-1] = (predicted[:, 2:] - predicted[:, :-2]) / 2
     across[:, :, 1:-1] = (predicted[:, :, 2:] - predicted[:, :, :-2]) / 2
@@ -182,13 +182,13 @@ def _gauss_newton(images: Tensor, predicted: Tensor, seen: Tensor, *, free_axis:
 
 
 def _middle(mass: Tensor) -> float:
-    """Where the middle of a mass is from the middle of its extent, in its own pixels."""
+    """Centre of mass relative to the centre of the array, in its pixels."""
     position = torch.arange(len(mass), device=mass.device) - (len(mass) - 1) / 2
     return float((mass * position).sum() / mass.sum().clamp_min(1e-30))
 
 
 def _blurred(images: Tensor) -> Tensor:
-    """A little, so that interpolation changes the noise hardly any more."""
+    """Blur images slightly, so that interpolation hardly changes their noise."""
     kernel = torch.tensor([0.25, 0.5, 0.25], device=images.device)
     padded = functional.pad(images, (1, 1, 1, 1), mode="replicate")
     return functional.conv2d(padded, torch.outer(kernel, kernel)[None, None])

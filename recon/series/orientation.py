@@ -1,4 +1,4 @@
-"""The one orientation that a series and its mirror images are reconstructed in, so that all of them give the same volume."""
+"""Standard orientation of a series for reconstruction, so that a series and its mirror images give the same volume."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.series.tilt_series import TiltSeries
 
 @dataclass(frozen=True)
 class Orientation:
-    """Flips that leave the geometry what it is: the volume is flipped alike. Each of them undoes itself.
+    """Flips that preserve the geometry; the volume is flipped accordingly. Each flip is its own inverse.
 
     Attributes:
         upside_down: whether images are flipped along y.
@@ -30,10 +30,10 @@ class Orientation:
 
     @classmethod
     def of(cls, tilt_series: TiltSeries) -> Orientation:
-        """The flips that bring most contrast to greater y, greater u and positive angles.
+        """The flips that move the highest contrast to larger y, larger u and positive angles.
 
-        The square of a pixel's distance from the mean tells, in used pixels: a constant, a scale, the order of the tilts
-        and full turns of their angles do not change it.
+        Contrast is the squared deviation of used pixels from the mean. The result does not depend on an added constant, a scale,
+        the order of the tilts, or full turns of their angles.
         """
         _, height, width = tilt_series.images.shape
         total, count = np.sum([(part.sum(), used.sum()) for part, used in _used(tilt_series)], axis=0)
@@ -45,7 +45,7 @@ class Orientation:
         return cls(*(bool(moment < 0) for moment in moments))
 
     def series(self, tilt_series: TiltSeries) -> TiltSeries:
-        """A series in this orientation, its tilts in their order."""
+        """Convert a series to this orientation, with its tilts in the same order."""
         if self == Orientation():
             return tilt_series
         images = self._stack(tilt_series.images)
@@ -60,21 +60,21 @@ class Orientation:
         return mapped.mapped_copy((self.images(image) for image in images), images.shape, images.dtype)
 
     def images(self, images: NDArray[Any]) -> NDArray[Any]:
-        """Images (..., y, u), there or back."""
+        """Flip images (..., y, u), in either direction."""
         axes = [axis for axis, flip in ((-2, self.upside_down), (-1, self.mirrored)) if flip]
         return np.ascontiguousarray(np.flip(images, tuple(axes)))
 
     def projections(self, images: NDArray[Any]) -> NDArray[Any]:
-        """Images (tilt, y, u) by rising angle, there or back. Those in a file are flipped there."""
+        """Flip images (tilt, y, u) sorted by angle, in either direction. Mapped images are flipped in their file."""
         return _flipped(images, {0: self.negated, 1: self.upside_down, 2: self.mirrored})
 
     def volume(self, volume: NDArray[Any]) -> NDArray[Any]:
-        """A volume (z, y, x), there or back: u = x cos θ + z sin θ. One that lies in a file is flipped there."""
+        """Flip a volume (z, y, x), in either direction (u = x cos θ + z sin θ). A mapped volume is flipped in its file."""
         return _flipped(volume, {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored})
 
 
 def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
-    """Image by image, zero where it is masked, and where it is not."""
+    """Yield each image, zero at masked pixels, with its mask of used pixels."""
     for number, image in enumerate(tilt_series.images):
         used = np.ones(image.shape) if tilt_series.mask is None else tilt_series.mask[number]
         yield image.astype(np.float64) * used, used

@@ -1,4 +1,4 @@
-"""From a tilt series as it was read to one that can be fitted: aligned, in order of angle, screened and checked."""
+"""Preparation of a tilt series for reconstruction: checks, alignment, sorting and screening."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from recon.series.screening import Screening, screen
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
-_ALONG_Y = 3.0  # degrees from y: a volume about an axis so near still explains its images
+_ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
 
 Progress = Callable[[str, int, int, str], None]
 """``progress(title, done, total, note)``."""
@@ -29,12 +29,12 @@ Progress = Callable[[str, int, int, str], None]
 @described()
 @dataclass(frozen=True)
 class Prepared:
-    """A tilt series ready to reconstruct, and what was found on the way.
+    """A prepared tilt series, with the results of alignment and screening.
 
     Attributes:
-        tilt_series: aligned, by rising angle, without the tilts that do not belong.
-        screening: how well every tilt fits the others, in the order of the series as given.
-        alignment: of the raw images, in the order of the series as given; None where they were not moved.
+        tilt_series: the aligned series, sorted by angle, without rejected tilts.
+        screening: consistency of every tilt with the others, in the order of the given series.
+        alignment: alignment of the raw images, in the order of the given series; None if they were not transformed.
 
     Example:
         >>> import numpy as np, recon
@@ -52,11 +52,11 @@ class Prepared:
 
     @property
     def choices(self) -> dict[str, float | str]:
-        """What a table of results shows."""
+        """Values for a table of results."""
         return ({} if self.alignment is None else self.alignment.choices()) | self.screening.choices()
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, tilt by tilt, for programs."""
+        """All results per tilt, JSON-serialisable."""
         return {
             "screening": self.screening.as_dict(),
             "alignment": None if self.alignment is None else self.alignment.as_dict(),
@@ -72,21 +72,21 @@ def prepare(
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Prepared:
-    """Do all that comes between reading a tilt series and fitting it: checks, alignment, screening, drift of the beam.
+    """Prepare a tilt series for reconstruction: checks, alignment, screening, and estimation of beam drift.
 
-    What is doubtful is reported as a `UserWarning`; what was found is in the result.
+    Doubtful results are reported as `UserWarning`.
 
     Args:
-        tilt_series: as read.
-        tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to have it found.
+        tilt_series: the series as read.
+        tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to search it.
         refine_alignment: find the axis and the shift of every image.
-        keep_tilts: keep tilts that do not fit the others, with a warning.
-        device: where to compute.
-        progress: called with each step of the alignment.
+        keep_tilts: keep tilts that are inconsistent with the others, with a warning.
+        device: torch device.
+        progress: called at each step of the alignment.
 
     Raises:
-        ValueError: a tilt axis that is no number, too few tilts to align, or images moved out of view entirely; or the images
-            contradict each other about y, and their file states another tilt axis.
+        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, or the
+            images are inconsistent with an axis along y and their file states another tilt axis.
 
     Example:
         >>> import numpy as np, recon
@@ -96,7 +96,7 @@ def prepare(
         >>> recon.prepare(series).tilt_series.tilt_angles[0].item()  # by rising angle
         -60.0
     """
-    if tilt_axis is not None and not abs(tilt_axis) <= 360:  # a full turn; more is no angle but a slip
+    if tilt_axis is not None and not abs(tilt_axis) <= 360:  # more than a full turn is a mistake
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
     _warn_of_outliers(tilt_series)
     _warn_of_order(tilt_series.tilt_angles)
@@ -104,7 +104,9 @@ def prepare(
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
     check_contrast(tilt_series)
-    found = screen(Orientation.of(tilt_series).series(tilt_series))  # mirror images are screened alike, to the last bit
+    found = screen(
+        Orientation.of(tilt_series).series(tilt_series)
+    )  # the standard orientation gives identical results for mirror images
     _require_axis(tilt_series, found, tilt_axis)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
@@ -129,7 +131,7 @@ def _warn_of_order(angles: NDArray[np.float64]) -> None:
     steps = np.diff(angles)
     if (steps > 0).any() and (steps < 0).any():
         warnings.warn(
-            "the tilt angles are not in order; each image keeps its own angle, which is all that counts", stacklevel=3
+            "the tilt angles are not sorted; this has no effect, because each image keeps its own angle", stacklevel=3
         )
 
 
@@ -140,38 +142,40 @@ def _warn_of_outliers(series: TiltSeries) -> None:
     found = np.abs(np.concatenate(far))
     if high > low and found.size:
         warnings.warn(
-            f"{found.size} pixels are a hundred times farther out than the others (up to {found.max():.3g}) and would "
-            "spoil the volume; leave them out with --mask FILE, or replace them",
+            f"{found.size} pixels deviate a hundred times more than the others (up to {found.max():.3g}) and would "
+            "corrupt the volume; exclude them with --mask FILE, or replace them",
             stacklevel=3,
         )
 
 
 def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
-    """The pixel values to use, image by image."""
+    """Yield the used pixel values, image by image."""
     for number, image in enumerate(series.images):
         yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
 
 
 def _require_axis(series: TiltSeries, found: Screening, given: float | None) -> None:
-    """Where a file states another axis than y and nobody said what to do: an aligned series may still carry it, a raw one may
-    not be taken as aligned."""
+    """Handle a file that states another axis than y if the user gave none: warn if the images are consistent with y, because
+    aligned series may keep the entry; otherwise raise ValueError."""
     stated = series.tilt_axis
     if given is not None or stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
         return
-    words = f"the file states the tilt axis at {stated:g}°, and images are taken as aligned, with the axis along y"
-    advice = f"give --refine-alignment, which starts there, --tilt-axis {stated:g} if only the direction is off, or --tilt-axis 0"
+    words = (
+        f"the file states a tilt axis of {stated:g}°, but the images are assumed to be aligned, with the axis along y"
+    )
+    advice = f"give --refine-alignment to start from it, --tilt-axis {stated:g} if only the direction is wrong, or --tilt-axis 0"
     if found.suspect.any():
         misfits = f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others"
-        raise ValueError(f"{words}, but {misfits}; {advice} if they are aligned")
+        raise ValueError(f"{words}, and {misfits}; {advice} if they are aligned")
     warnings.warn(f"{words}; if they are not, {advice} to silence this", stacklevel=3)
 
 
 def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> None:
     if found.suspect.any():
         warnings.warn(
-            f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others, too many for exceptions: "
+            f"{found.suspect.sum()} of {series.num_tilts} tilts do not fit the volume of the others, too many to exclude: "
             "the alignment, the tilt axis or the tilt angles are probably wrong; give --refine-alignment, --tilt-axis or the "
-            "right --angles",
+            "correct --angles",
             stacklevel=3,
         )
     if not found.bad.any():
@@ -179,5 +183,5 @@ def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> Non
     angles = series.tilt_angles[found.bad]
     named = ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
     what = f"{len(angles)} of {series.num_tilts} tilts do not fit the volume of the others: {named}"
-    advice = "kept (--keep-tilts)" if keep else "left out (--keep-tilts keeps them)"
+    advice = "kept (--keep-tilts)" if keep else "excluded (--keep-tilts keeps them)"
     warnings.warn(f"{what}; {advice}", stacklevel=3)

@@ -1,4 +1,4 @@
-"""A look at every tilt against the others before a reconstruction: drift of the beam, and tilts that do not belong."""
+"""Screening of tilts before a reconstruction: beam drift, and tilts that are inconsistent with the others."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-_LEAST_DRIFT = 0.04  # steady beams seem to drift by 0.004 to 0.035, by noise and by what lies outside the volume
+_LEAST_DRIFT = (
+    0.04  # constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
+)
 _FEWEST = 8
-_EXCEPTIONS = 0.1  # of the tilts: more, and it is not the tilts that are wrong but what they are compared by
+_EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
 
 @described()
 @dataclass(frozen=True)
 class Screening:
-    """What a coarse reconstruction says of every tilt.
+    """Comparison of every tilt with a coarse reconstruction.
 
     Attributes:
-        beam: (tilts,) incident intensity relative to the median tilt's.
-        excess: (tilts,) negative log-likelihood of the coarse image above that of its neighbours in angle, nats per pixel.
+        beam: (tilts,) incident intensity relative to the median.
+        excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
-        suspect: (tilts,) the same where there are so many that the alignment or the angles of all are in doubt; none is bad then.
+        suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
         unexplained: (tilts,) share of the variance of each coarse image that the volume does not explain.
     """
 
@@ -49,21 +51,21 @@ class Screening:
 
     @property
     def drift(self) -> float:
-        """Standard deviation of the beam over the good tilts, as a fraction."""
+        """Relative standard deviation of the beam over the good tilts."""
         return float(np.std(np.log(self.beam[~self.bad])))
 
     @property
     def beam_drifts(self) -> bool:
-        """Whether the drift is more than a coarse volume mistakes for one."""
+        """Whether the drift is significant, given the accuracy of a coarse volume."""
         return self.drift > _LEAST_DRIFT
 
     def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
-        """The tilts that belong, or all; with their beam, where it drifts."""
+        """The good tilts, or all if `keep`, with their beam if it drifts."""
         series = replace(tilt_series, beam=self.beam) if self.beam_drifts else tilt_series
         return series.select(~self.bad) if self.bad.any() and not keep else series
 
     def choices(self) -> dict[str, float | str]:
-        """What a table of results shows of it."""
+        """Values for a table of results."""
         found: dict[str, float | str] = {}
         if self.bad.any():
             found["tilts left out"] = str(int(self.bad.sum()))
@@ -72,7 +74,7 @@ class Screening:
         return found
 
     def as_dict(self) -> dict[str, list[Any]]:
-        """All of it, tilt by tilt, for programs."""
+        """All results per tilt, JSON-serialisable."""
         return {
             "beam": self.beam.tolist(),
             "excess_nll": self.excess.tolist(),
@@ -83,13 +85,13 @@ class Screening:
 
 
 def screen(tilt_series: TiltSeries) -> Screening:
-    """Judge every tilt by a coarse volume of the others; with few tilts, all are good.
+    """Compare every tilt with a coarse volume of the others; if there are few tilts, all are good.
 
-    A few rounds of SIRT alternate with the intensity of each tilt that suits the volume. The tilts whose residual
-    likelihood stands out most from their neighbours' are taken out and the rest is done again, until none stands out.
+    SIRT iterations alternate with fits of the intensity of each tilt. The tilts whose residual likelihood deviates most from that
+    of their neighbours are removed, and the procedure is repeated until none deviates.
 
     Raises:
-        ValueError: half of the images or more are blank.
+        ValueError: at least half of the images are blank.
     """
     count = tilt_series.num_tilts
     none = np.zeros(count, dtype=np.bool_)
@@ -98,7 +100,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
     blank = int(sum(np.ptp(image) == 0 for image in tilt_series.images))
     if 2 * blank >= count:
         raise ValueError(
-            f"{blank} of {count} images are blank, the same value in all pixels; give the tilts with a specimen"
+            f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
         )
     lowered, _ = without_level(tilt_series)
     coarse = replace(lowered, images=coarse_images(lowered, _WIDTH, _HEIGHT), mask=None, beam=None)
@@ -114,12 +116,12 @@ def screen(tilt_series: TiltSeries) -> Screening:
             many = bad.sum() > max(1, count * _EXCEPTIONS)
             return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
         bad = bad | (excess > _OF_WORST * worst)
-        if bad.sum() > count // 4:  # nothing is gained by going on
+        if bad.sum() > count // 4:  # too many to continue
             return Screening(beam, excess, none, bad, unexplained)
 
 
 def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
-    """Block averages, at most so many pixels wide and high."""
+    """Binned images of limited width and height."""
     _, rows, columns = tilt_series.images.shape
     return block_means(tilt_series.images, -(-rows // height), -(-columns // width))
 
@@ -127,7 +129,7 @@ def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[n
 def _fit_beam(
     series: TiltSeries, bad: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-    """Relative intensities of all tilts, residuals of their images at equal intensity, and what a volume of the good predicts."""
+    """Relative intensities of all tilts, residuals of their normalised images, and predictions by a volume of the good tilts."""
     images, good = torch.from_numpy(series.images), torch.from_numpy(~bad)
     width = images.shape[2]
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
@@ -151,12 +153,12 @@ def _even(images: Tensor, beam: Tensor, pedestal: float) -> Tensor:
 
 
 def _pedestal(series: TiltSeries) -> float:
-    """The reading without any beam: in HAADF the darkest areas stand for it."""
+    """The pixel value without beam; in HAADF it is estimated from the darkest areas."""
     return float(np.quantile(series.images, 0.02)) if series.mode == "linear" else 0.0
 
 
 def _first_beam(series: TiltSeries) -> Tensor:
-    """From the vacuum of bright-field images, or from the total signal of HAADF images, which a tilt does not change."""
+    """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
     flat = series.images.reshape(series.num_tilts, -1)
     level = np.quantile(flat, 0.95, axis=1) if series.mode == "transmission" else flat.mean(1) - _pedestal(series)
     middle = float(np.median(level))
@@ -167,7 +169,7 @@ def _first_beam(series: TiltSeries) -> Tensor:
 def _negative_log_likelihood(
     residual: NDArray[np.float32], predicted: NDArray[np.float32], good: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Of each tilt under Gaussian noise whose variance depends on the signal as it does in the good tilts, nats per pixel."""
+    """NLL of each tilt, nats per pixel, under Gaussian noise with the signal-dependent variance of the good tilts."""
     edges = np.quantile(predicted[good], np.linspace(0, 1, 9)[1:-1])
     group = np.searchsorted(edges, predicted)
     squares = residual.astype(np.float64) ** 2
@@ -182,7 +184,7 @@ def _negative_log_likelihood(
 def _running_median(
     values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The median of each tilt's neighbours in angle, the bad ones left out."""
+    """The median of each tilt's neighbours in angle, without bad tilts."""
     order = np.argsort(angles, kind="stable")
     good = order[~bad[order]]
     smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")

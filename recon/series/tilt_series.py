@@ -1,4 +1,4 @@
-"""Tilt series and volumes: values checked once, when they are made or read."""
+"""Tilt series, voxel grids and volumes, validated on creation."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ class TiltSeries:
     """Images of one object at several tilts, in raw detector units.
 
     Attributes:
-        images: (tilt, y, u), any real number type, an array or a tensor; the tilt axis runs along y through the middle of u.
+        images: (tilt, y, u), any real type, array or tensor; the tilt axis is along y through the centre of u.
         tilt_angles: (tilt,) degrees.
-        pixel_size: Å, or None where unknown.
+        pixel_size: Å, or None if unknown.
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
-        mask: (tilt, y, u), True for the pixels to use; None for all. Fits leave the others out; the classical methods take
-            them as they stand in `images`, so they should hold something plausible.
-        beam: (tilt,) incident intensity relative to the median tilt's, where the beam drifts; a fit starts from it.
-        tilt_axis: direction of the tilt axis in raw images that their file states, degrees from y towards −x, or None; only an
-            alignment starts from it.
+        mask: (tilt, y, u), True for pixels to use; None for all. Fits exclude the other pixels; classical methods use their
+            values in `images`, which should be plausible.
+        beam: (tilt,) incident intensity relative to the median if the beam drifts; the initial value of a fit.
+        tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
+            only as the initial value of an alignment.
 
     Raises:
-        ValueError: not a stack, angles, mask or beam that do not match it, pixels or angles that are not finite, a flat stack.
+        ValueError: `images` is not a stack or is constant, angles, mask or beam do not match it, or pixels or angles are not
+            finite.
 
     Example:
         >>> import numpy as np, recon
@@ -62,7 +63,7 @@ class TiltSeries:
             raise ValueError(f"a tilt series is a stack (tilt, y, x); this array has shape {self.images.shape}")
         if len(self.images) != len(self.tilt_angles):
             raise ValueError(
-                f"the stack has {len(self.images)} images and there are {len(self.tilt_angles)} tilt angles; "
+                f"the stack has {len(self.images)} images, but there are {len(self.tilt_angles)} tilt angles; "
                 "give the angle file of this stack"
             )
         if len(self.images) < 2:
@@ -88,30 +89,30 @@ class TiltSeries:
 
     @property
     def num_tilts(self) -> int:
-        """How many images."""
+        """Number of tilts."""
         return len(self.images)
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """(tilt, y, u), True for the pixels to use."""
+        """(tilt, y, u), True for pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
     def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
-        """Some rows (y) of all images; they may be flat, where the whole is not."""
+        """Some rows (y) of all images; they may be constant."""
         return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
 
     def with_images(self, images: NDArray[Any], mask: NDArray[np.bool_] | None) -> TiltSeries:
-        """The same series with a part of its images, which were checked, or with copies of them."""
+        """The same series with parts or copies of its images, without new checks."""
         part = copy.copy(self)
         object.__setattr__(part, "images", images)
         object.__setattr__(part, "mask", mask)
         return part
 
     def select(self, tilts: NDArray[Any] | slice) -> TiltSeries:
-        """The series of some of its tilts, by index, boolean mask or slice; these may be flat, where the whole is not.
+        """Some of the tilts, by index, boolean mask or slice; they may be constant.
 
-        Evenly spaced tilts are views of the images, so mapped ones stay on the disk; others go to a temporary file where the
-        images are mapped and large.
+        Evenly spaced tilts are views of the images, so that mapped images stay on the disk. Other selections of large mapped
+        images are copied to a temporary file.
         """
         tilts = evenly(tilts, self.num_tilts)
         images, mask = _sections(self.images, tilts), None if self.mask is None else _sections(self.mask, tilts)
@@ -133,11 +134,11 @@ def _sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]
 @described(depth="voxels", height="voxels", width="voxels", voxel_size="Å")
 @dataclass(frozen=True)
 class VolumeGrid:
-    """The voxel grid to reconstruct on, centred on the tilt axis.
+    """The voxel grid of a reconstruction, centred on the tilt axis.
 
     Attributes:
         depth, height, width: voxels along z (the beam at zero tilt), y (the tilt axis) and x.
-        voxel_size: Å, or None where unknown.
+        voxel_size: Å, or None if unknown.
 
     Example:
         >>> import recon
@@ -161,12 +162,12 @@ class VolumeGrid:
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, thickness: int | None = None) -> VolumeGrid:
-        """One voxel per pixel: as high and wide as the images, `thickness` voxels deep (the width if None)."""
+        """A grid with one voxel per pixel: height and width of the images, depth `thickness` voxels (the width if None)."""
         _, height, width = tilt_series.images.shape
         if thickness is not None and thickness > 2 * max(height, width):
             raise ValueError(
-                f"--thickness {thickness} is more than twice the images' {max(height, width)} pixels; nothing so thick stays in "
-                "view when tilted: give it in voxels, as large as pixels"
+                f"--thickness {thickness} is more than twice the images' {max(height, width)} pixels, too thick to stay in view "
+                "when tilted; give it in voxels, which have the size of pixels"
             )
         return cls(width if thickness is None else thickness, height, width, tilt_series.pixel_size)
 
@@ -176,8 +177,8 @@ class Volume:
     """A reconstruction.
 
     Attributes:
-        attenuation: (z, y, x), per voxel, an array or a tensor.
-        voxel_size: Å, or None where unknown.
+        attenuation: (z, y, x), attenuation per voxel, array or tensor.
+        voxel_size: Å, or None if unknown.
 
     Example:
         >>> import numpy as np, recon
@@ -215,18 +216,18 @@ def read_tilt_series(
     """Read a stack and its tilt angles.
 
     Args:
-        path: the stack, in any format that `noiseflow.io.read` knows.
+        path: the stack, in any format that `noiseflow.io.read` supports.
         angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
-            ``.mdoc`` beside the stack, or else the angles inside the stack's own file.
-        transforms: IMOD's ``.xf`` alignment of this stack, to apply to the images (they become float32).
-        mode: how the images were formed.
-        mask: True for the pixels to use, (tilt, y, u) or (y, u) for all tilts.
-        mask_nan: leave NaN and infinite pixels out instead of refusing them.
-        mapped: leave the images on the disk, see `noiseflow.io.read`; not with a mask, NaNs or transforms.
+            ``.mdoc`` next to the stack, or else the angles in the stack file.
+        transforms: IMOD alignment (``.xf``) to apply to the images, which become float32.
+        mode: image formation.
+        mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
+        mask_nan: mask NaN and infinite pixels instead of raising an error.
+        mapped: memory-map the images, see `noiseflow.io.read`; not with a mask, NaNs or transforms.
 
     Raises:
-        FileNotFoundError: no such file, or no angles beside or inside the stack.
-        ValueError: a file cannot be read, the mask does not match, or `TiltSeries` refuses what the stack holds.
+        FileNotFoundError: the file does not exist, or there are no angles in or next to the stack.
+        ValueError: a file cannot be read, the mask does not match, or the stack is not a valid `TiltSeries`.
 
     Example:
         >>> import noiseflow, pathlib, recon
@@ -237,7 +238,7 @@ def read_tilt_series(
     image_file = io.read(path, mapped=mapped)
     if image_file.data.ndim != 3:
         raise ValueError(
-            f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is needed"
+            f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
         )
     tilt_angles = io.tilt_angles_of(path, image_file) if angles is None else io.read_angles(angles)
     images, mask = _masked(image_file.data, mask, mask_nan, str(path))
@@ -251,7 +252,7 @@ def read_tilt_series(
     empty = ~mask.any((1, 2))
     if empty.any() and len(tilt_angles) == len(images):
         named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
-        warnings.warn(f"{int(empty.sum())} tilts have no usable pixel and are left out: {named}", stacklevel=2)
+        warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
         return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(
             np.flatnonzero(~empty)
         )
@@ -261,7 +262,7 @@ def read_tilt_series(
 def _masked(
     images: NDArray[Any], mask: NDArray[np.bool_] | None, mask_nan: bool, name: str
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-    """Images whose unused pixels hold their nearest used neighbour's reading, and the mask of the used ones."""
+    """Images whose unused pixels are replaced by the nearest used value, and the mask of used pixels."""
     if mask is None and all(np.isfinite(image).all() for image in images):
         return images, None
     if mask is not None and mask.shape not in (images.shape, images.shape[1:]):
@@ -278,19 +279,17 @@ def _masked(
             first = (number, int(row), int(column))
         bad += int(wrong.sum())
     if bad and not mask_nan:
-        raise ValueError(
-            f"{name} has {bad} NaN or infinite pixels, the first at {first}; leave them out with --mask-nan"
-        )
+        raise ValueError(f"{name} has {bad} NaN or infinite pixels, the first at {first}; exclude them with --mask-nan")
     if use.all():
         return images, None
     if not use.any():
-        raise ValueError(f"{name} has no usable pixel: all are masked, NaN or infinite")
+        raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
     whole = (filled(image, part) for image, part in zip(images, use, strict=True))
     return mapped.mapped_copy(whole, images.shape, images.dtype, in_memory=mapped.IN_MEMORY), use
 
 
 def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
-    """A (y, u) image whose unused pixels hold the reading of the nearest used one; zero where there is none."""
+    """A (y, u) image whose unused pixels are replaced by the nearest used value; zero if there is none."""
     from scipy.ndimage import distance_transform_edt
 
     if use.all():
@@ -302,7 +301,7 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of so many pixels, image by image; what is left over is left out at both edges."""
+    """Means of blocks of pixels, image by image; incomplete blocks are dropped, evenly at both edges."""
     height, width = images.shape[1] // down, images.shape[2] // across
     top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
     whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
@@ -310,7 +309,7 @@ def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.floa
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
-    """Write the stack, and its angles to a ``.rawtlt`` file beside it; returns the angle file's path.
+    """Write the stack, and its angles to a ``.rawtlt`` file next to it. Return the path of the angle file.
 
     Example:
         >>> import numpy as np, pathlib, recon, tempfile
@@ -327,14 +326,14 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
 
 
 def write_angles(path: Path, tilt_angles: NDArray[np.floating[Any]]) -> Path:
-    """Write tilt angles, degrees, one a line; returns the path."""
+    """Write tilt angles, degrees, one per line, and return the path."""
     with io.atomic_path(path) as partial:
         partial.write_text("".join(f"{angle:.4f}\n" for angle in tilt_angles), encoding="utf-8")
     return path
 
 
 def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
-    """The same tilts, as a slice where they are evenly spaced and ascending."""
+    """The same tilts as a slice if they are evenly spaced and ascending."""
     if isinstance(tilts, slice):
         return tilts
     numbers = np.arange(count)[tilts]
@@ -348,25 +347,25 @@ def _require_several_views(images: NDArray[Any]) -> None:
     shown = sum(bool(image.min() < image.max()) for image in images)
     if shown < 2 <= len(images):
         raise ValueError(
-            f"{len(images) - shown} of {len(images)} images are flat, every pixel of an image the same; a tilt series needs "
-            "two or more that are not: check that the right file was given"
+            f"{len(images) - shown} of {len(images)} images are constant; a tilt series needs at least two that "
+            "are not: check that the right file was given"
         )
 
 
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
     largest = np.abs(angles).max()
     if largest > io.LARGEST_ANGLE:
-        raise ValueError(f"a tilt angle of {largest:g}° is impossible; angles are degrees within ±{io.LARGEST_ANGLE}")
+        raise ValueError(f"a tilt angle of {largest:g}° is impossible; give degrees within ±{io.LARGEST_ANGLE}")
     values, counts = np.unique(np.round(angles, 6), return_counts=True)
     if len(values) < 2:
         raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
         warnings.warn(
-            f"tilt angles appear more than once ({repeated}); each image is used as its own view", stacklevel=4
+            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=4
         )
     if np.abs(angles).max() < 1.6:
         warnings.warn(
-            f"all tilt angles are within ±{np.abs(angles).max():.2f}: are they in radians? Degrees are expected",
+            f"all tilt angles are within ±{np.abs(angles).max():.2f}, as if in radians; give them in degrees",
             stacklevel=4,
         )

@@ -1,4 +1,4 @@
-"""What must not change a volume: the order of the tilts, full turns of their angles, doubled tilts, a constant added."""
+"""Invariances of a reconstruction: order of the tilts, full turns of angles, duplicate tilts, an added constant."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 
-_TWINS = 0.1  # of the mean step: tilts so near to each other show the same view
+_TWINS = 0.1  # of the mean step: tilts this close show the same view
 _SAMPLE = 100_000
 
 
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
-    """The series by rising angle, in [−180°, 180°] where an angle was outside; tilts of equal angle keep their order."""
+    """The series sorted by angle, mapped to [−180°, 180°] if an angle was outside; the sort is stable."""
     angles = tilt_series.tilt_angles
     if np.abs(angles).max() > 180:
         angles = (angles + 180) % 360 - 180
@@ -25,9 +25,9 @@ def in_order(tilt_series: TiltSeries) -> TiltSeries:
 
 
 def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(tilt,) the number of each tilt's view, from one side of the missing wedge to the other; twins have the same.
+    """(tilt,) index of each tilt's view, from one side of the missing wedge to the other; duplicates have the same index.
 
-    Images half a turn apart are mirror images of each other, and twins too.
+    Images 180° apart are mirror images of each other and count as duplicates.
 
     Args:
         tilt_angles: (tilt,) degrees.
@@ -35,7 +35,7 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     half_turn = np.round(tilt_angles % 180, 6) % 180
     values, back = np.unique(half_turn, return_inverse=True)
     steps = np.diff(np.r_[values, values[0] + 180])
-    centres = np.abs((values + steps / 2) % 180 - 90)  # of equal steps, the one about 90° counts as the wedge
+    centres = np.abs((values + steps / 2) % 180 - 90)  # if steps are equal, the one around 90° is taken as the wedge
     wedge = max(range(len(values)), key=lambda i: (round(steps[i], 4), -round(centres[i], 4)))
     rolled = np.roll(steps, -wedge - 1)[:-1]
     apart = rolled > _TWINS * rolled.sum() / len(tilt_angles)
@@ -44,7 +44,7 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def every_nth_view(tilt_angles: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
-    """(tilt,) True for one view in `count`, spread evenly from the middle view to both sides, each with all its twins.
+    """(tilt,) True for one view in `count`, evenly spaced from the middle view to both sides, each with all its duplicates.
 
     Args:
         tilt_angles: (tilt,) degrees, in any order.
@@ -55,10 +55,10 @@ def every_nth_view(tilt_angles: NDArray[np.float64], count: int) -> NDArray[np.b
 
 
 def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
-    """(tilt,) the number of the first tilt of equal angle, image and mask: copies to the last pixel, which say nothing new.
+    """(tilt,) index of the first tilt with equal angle, image and mask; exact copies contain no new information.
 
     Args:
-        tilt_series: by rising angle.
+        tilt_series: sorted by angle.
     """
     angles, images, used = tilt_series.tilt_angles, tilt_series.images, tilt_series.mask
     numbers = np.arange(len(angles))
@@ -74,16 +74,16 @@ def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
 
 
 def dark_level(tilt_series: TiltSeries) -> float:
-    """The dark level of linear images, that of the darkest hundredth of their pixels; zero for bright field.
+    """The dark level of linear images, the level of the darkest hundredth of their pixels; zero for bright field.
 
-    Noise models that count electrons begin to count near zero without it, and what a fit chooses does not depend on a constant
-    added.
+    After its subtraction, electron-counting noise models start near zero, and the choices of a fit do not depend on an added
+    constant.
     """
     return level_of(tilt_series, quantile=0.01)
 
 
 def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
-    """Images minus a level, subtracted in float64 and kept in float32; the series itself where the level is zero."""
+    """Images minus a level, subtracted in float64 and stored in float32; the series itself if the level is zero."""
     if not level:
         return tilt_series
     images = tilt_series.images
@@ -93,9 +93,9 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
 
 
 def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
-    """Linear images minus their median pixel value, in float32, and that value: a large constant costs no digits so.
+    """Linear images minus their median, in float32, and the median, so that a large constant does not reduce the precision.
 
-    Bright-field images keep their zero, which means something: the level is zero there.
+    For bright-field images, whose zero is meaningful, the level is zero.
     """
     images, level = tilt_series.images, level_of(tilt_series)
     if not level:
@@ -104,7 +104,7 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
 
 def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
-    """The median of the used pixel values of linear images, or that at another quantile; zero for bright field."""
+    """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
     images, mask = tilt_series.images, tilt_series.mask
     if tilt_series.mode != "linear":
         return 0.0

@@ -1,1 +1,1 @@
-"""Volumes of known truth, known noise, and tilt series made of them."""
+"""Simulation: phantoms, known noise, and tilt series of them."""

@@ -1,4 +1,4 @@
-"""Noise that is known exactly: truths to simulate from and to compare a learnt noise model with. Nothing here is learnt."""
+"""Known noise models without trainable parameters, for simulation and as ground truth for learnt noise models."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
 class KnownNoise(ArrayModel, ABC):
-    """A noise model without parameters to learn."""
+    """Base class of noise models without trainable parameters."""
 
     @abstractmethod
     def forward(self, signal: Tensor) -> NoiseDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, detector units."""
+        """The distribution of the observations, given signals of any shape, detector units."""
 
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Nothing to measure: the noise is known."""
+        """Do nothing, because the noise is known."""
 
 
 class SkewedNoise(KnownNoise):
-    """Noise of standard deviation ``floor + slope · signal``, Gaussian or skewed (sinh–arcsinh, doi:10.1093/biomet/asp053).
+    """Noise with standard deviation ``floor + slope · signal``, Gaussian or skewed (sinh–arcsinh, doi:10.1093/biomet/asp053).
 
     Args:
         floor: standard deviation at zero signal, detector units.
-        slope: growth with the signal.
-        skewness: of the sinh–arcsinh family; 0 is Gaussian, 0.5 has a long tail to the right.
+        slope: increase of the standard deviation per unit signal.
+        skewness: skewness parameter of the sinh–arcsinh family; 0 is Gaussian, 0.5 has a long tail to the right.
     """
 
     def __init__(self, floor: float = 0.05, slope: float = 0.2, skewness: float = 0.0) -> None:
@@ -50,7 +50,7 @@ class SkewedNoise(KnownNoise):
 
 
 class SinhArcsinh(LatentDistribution):
-    """signal + scale · (sinh(arcsinh z + ε) − mean) / deviation, of mean `signal` and standard deviation `scale`."""
+    """signal + scale · (sinh(arcsinh z + ε) − mean) / deviation, with mean `signal` and standard deviation `scale`."""
 
     def __init__(self, signal: Tensor, scale: Tensor, skewness: float) -> None:
         super().__init__(signal.shape)
@@ -83,12 +83,12 @@ class SinhArcsinh(LatentDistribution):
 
 
 class OutlierNoise(KnownNoise):
-    """Gaussian noise of which a share of the pixels is much noisier.
+    """Gaussian noise with a share of outliers with larger standard deviation.
 
     Args:
-        floor, slope: standard deviation at zero signal, and its growth with the signal.
-        share: of the outliers.
-        factor: how much noisier they are.
+        floor, slope: standard deviation at zero signal, and its increase per unit signal.
+        share: share of outliers.
+        factor: ratio of the standard deviations.
     """
 
     def __init__(self, floor: float = 0.05, slope: float = 0.1, share: float = 0.05, factor: float = 8.0) -> None:
@@ -108,11 +108,11 @@ class OutlierNoise(KnownNoise):
 
 
 class CountingNoise(KnownNoise):
-    """Poisson counts read out with Gaussian noise, one count per detector unit; for a signal below zero, read noise about it.
+    """Poisson counts plus Gaussian read noise, one count per detector unit; only read noise for signals below zero.
 
     Args:
         read_noise: electrons rms.
-        most: counts beyond which the Poisson sum is cut off.
+        most: count at which the Poisson sum is truncated.
     """
 
     def __init__(self, read_noise: float = 0.5, most: int = 40) -> None:
@@ -122,17 +122,17 @@ class CountingNoise(KnownNoise):
     def forward(self, signal: Tensor) -> GaussianMixture:
         counts = torch.arange(self.most + 1, dtype=signal.dtype, device=signal.device)
         counts = counts.view(-1, *[1] * signal.ndim)
-        rate = signal.clamp_min(1e-4)  # a vanishing signal still gives finite likelihoods
+        rate = signal.clamp_min(1e-4)  # keeps likelihoods finite for a vanishing signal
         log_weights = counts * torch.log(rate) - rate - torch.lgamma(counts + 1)
         centres = counts + (signal - rate)
         return GaussianMixture(signal, log_weights, centres, torch.full_like(log_weights, self.read_noise))
 
 
 class GaussianMixture(NoiseDistribution):
-    """A mixture of normal distributions, components along a new first axis.
+    """A mixture of normal distributions, with components along a new first axis.
 
     Args:
-        mean: the mixture's mean; its shape is the batch shape.
+        mean: mean of the mixture; its shape is the batch shape.
         log_weights, centres, scales: (component, *batch).
     """
 

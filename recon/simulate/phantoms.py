@@ -1,6 +1,6 @@
-"""Volumes whose truth is known. Shapes do not depend on the size, and edges are covered in proportion.
+"""Phantoms. Shapes do not depend on the number of voxels, and edges are antialiased.
 
-Every phantom can be drawn whole or a few y-slices at a time, with the same voxels.
+Every phantom can be drawn as a whole or a few y-slices at a time, with identical voxels.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from recon.simulate.virion import zika_in_box
 
 Array = NDArray[np.float32]
-_VIRION_VOXELS = 32  # across; the atoms' density is known to 15 Å, and a coarser voxel would not show it
+_VIRION_VOXELS = 32  # diameter; coarser voxels would not resolve the density, which is known to 15 Å
 
 
-_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about a voxel of 64 and four: neighbours are distinguished
+_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about one and four voxels of 64, so that neighbours are resolved
 
 
 class Canvas:
@@ -34,7 +34,7 @@ class Canvas:
         self.volume = np.zeros((size, len(self.rows), size), np.float32)
 
     def window(self, centre: NDArray[Any], reach: float) -> tuple[tuple[slice, ...], tuple[NDArray[Any], ...]]:
-        """Where in `volume` lies all within `reach` of a centre, and the coordinates (z, y, x) relative to it there."""
+        """The region of `volume` within `reach` of a centre, and its coordinates (z, y, x) relative to the centre."""
         low = np.maximum(0, ((centre - reach + 1) / 2 * self.size).astype(int))
         high = np.clip(np.ceil((centre + reach + 1) / 2 * self.size).astype(int), low, self.size)
         first, last = (int(np.clip(end, self.rows.start, self.rows.stop)) for end in (low[1], high[1]))
@@ -48,7 +48,7 @@ class Canvas:
         return (z, y, x), (places[0][:, None, None], places[1][:, None], places[2])
 
     def covered(self, places: tuple[NDArray[Any], ...], axes: NDArray[Any], rotation: NDArray[Any]) -> Array:
-        """The share of each voxel that lies in the ellipsoid around the origin of `places`."""
+        """The share of each voxel inside an ellipsoid around the origin of `places`."""
         z, y, x = places
         squared, slope = (np.zeros(np.broadcast_shapes(z.shape, y.shape, x.shape), np.float32) for _ in range(2))
         for column, length in zip((rotation / axes).astype(np.float32).T, axes, strict=True):
@@ -69,7 +69,7 @@ class Canvas:
         *,
         hollow: NDArray[Any] | None = None,
     ) -> None:
-        """Draw an ellipsoid where it is denser than what is there; `hollow` are the half-axes of the space inside it."""
+        """Draw an ellipsoid where it is denser than the existing volume; `hollow` are the semi-axes of the space inside it."""
         box, places = self.window(centre, axes.max() + 2 / self.size)
         shape = self.covered(places, axes, rotation)
         if hollow is not None:
@@ -77,7 +77,7 @@ class Canvas:
         self.volume[box] = np.maximum(self.volume[box], np.float32(density) * shape)
 
     def ball(self, density: float, centre: NDArray[Any], radius: float, *, hollow: float | None = None) -> None:
-        """Draw a ball, or a spherical shell around a hollow of that radius."""
+        """Draw a ball, or a spherical shell with inner radius `hollow`."""
         inside = None if hollow is None else np.full(3, hollow)
         self.put(density, centre, np.full(3, radius), np.eye(3), hollow=inside)
 
@@ -87,8 +87,8 @@ def shells(size: int, *, generator: np.random.Generator, count: int = 22, rows: 
 
     Args:
         size: voxels along each edge.
-        generator: source of places, shapes and densities.
-        count: how many shells.
+        generator: source of positions, shapes and densities.
+        count: number of shells.
         rows: y-slices to draw, all by default.
 
     Returns:
@@ -108,7 +108,7 @@ def _put_shells(canvas: Canvas, generator: np.random.Generator, count: int) -> N
 
 
 def virions(size: int, *, generator: np.random.Generator, count: int = 5, rows: slice | None = None) -> Array:
-    """Zika virions; where a voxel is coarser than 15 Å, spheres of a coat with spikes, a membrane and a core. As `shells`."""
+    """Zika virions; with voxels coarser than 15 Å, spheres with spikes, coat, membrane and core. As `shells`."""
     canvas = Canvas(size, rows)
     for _ in range(count):
         radius = generator.uniform(0.18, 0.27)
@@ -129,7 +129,7 @@ def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: N
 
 
 def cell(size: int, *, generator: np.random.Generator, count: int = 18, rows: slice | None = None) -> Array:
-    """Shells with small virions among them, as the synthetic set of Kniesel et al. (CVPR 2022). As `shells`."""
+    """Shells with small virions among them, as in the synthetic data of Kniesel et al. (CVPR 2022). As `shells`."""
     canvas = Canvas(size, rows)
     _put_shells(canvas, generator, count)
     for _ in range(count // 2):
@@ -180,7 +180,7 @@ def slab(size: int, *, generator: np.random.Generator, count: int = 120, rows: s
 
 
 def atoms(size: int, *, generator: np.random.Generator, count: int = 300, rows: slice | None = None) -> Array:
-    """A particle at atomic resolution: Gaussians at random sites that keep their distance. Arguments and result as `shells`."""
+    """A particle at atomic resolution: Gaussians at random sites with a minimum distance. Arguments and result as `shells`."""
     canvas = Canvas(size, rows)
     sites: list[NDArray[Any]] = []
     for _ in range(20 * count):
@@ -195,7 +195,7 @@ def atoms(size: int, *, generator: np.random.Generator, count: int = 300, rows: 
 
 
 def texture(size: int, *, generator: np.random.Generator, count: int = 40, rows: slice | None = None) -> Array:
-    """One body whose density rises from side to side under a texture of `count` waves, without any edge inside. As `shells`."""
+    """A body with a density gradient and a texture of `count` waves, without internal edges. As `shells`."""
     canvas = Canvas(size, rows)
     box, places = canvas.window(np.zeros(3), 0.9)
     body = canvas.covered(places, np.array([0.55, 0.85, 0.8]), np.eye(3))
@@ -210,7 +210,9 @@ def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows
     box, places = canvas.window(np.zeros(3), 0.9)
     body = canvas.covered(places, np.array([0.7, 0.85, 0.8]), np.eye(3))
     waves = _waves(places, generator, 60, longest=0.8, shortest=0.5)
-    walls = np.clip(0.5 + (0.3 - np.abs(waves)) * 3, 0, 1)  # about the waves' zero: a sponge of one connected wall
+    walls = np.clip(
+        0.5 + (0.3 - np.abs(waves)) * 3, 0, 1
+    )  # around the zeros of the waves: a sponge with one connected wall
     canvas.volume[box] = (0.4 * body * walls).astype(np.float32)
     for _ in range(count):
         radius = generator.uniform(0.03, 0.06)
@@ -221,7 +223,7 @@ def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows
 def _waves(
     places: tuple[NDArray[Any], ...], generator: np.random.Generator, count: int, *, longest: float, shortest: float
 ) -> NDArray[Any]:
-    """Plane waves of random direction and phase, of variance one together; lengths in half-edges of the cube."""
+    """Sum of plane waves with random directions and phases, variance 1; wavelengths in half-edges of the cube."""
     z, y, x = places
     total = np.zeros(np.broadcast_shapes(z.shape, y.shape, x.shape))
     for _ in range(count):
@@ -245,10 +247,10 @@ PHANTOMS: dict[str, Callable[..., Array]] = {
 
 
 def make_phantom(name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None) -> Array:
-    """The phantom of a name, (z, y, x); with `rows`, only these y-slices of it.
+    """Create a phantom by name, (z, y, x); with `rows`, only these y-slices.
 
     Raises:
-        ValueError: unknown name, or a size that is too small to draw anything.
+        ValueError: the name is unknown, or the size is too small.
     """
     if name not in PHANTOMS:
         raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")
@@ -264,7 +266,7 @@ def _direction(generator: np.random.Generator) -> NDArray[Any]:
 
 
 def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:
-    """A centre at which a ball of this radius stays inside the sphere that touches the faces."""
+    """A random centre such that a ball of this radius is inside the sphere that touches the faces."""
     place: NDArray[Any] = _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
     return place
 
@@ -274,7 +276,7 @@ def _rotation(generator: np.random.Generator) -> NDArray[Any]:
 
 
 def _fibonacci_sphere(count: int) -> NDArray[Any]:
-    """(3, count) nearly even directions."""
+    """(3, count) nearly uniformly distributed directions."""
     height = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (1 + 5**0.5) * np.arange(count)
     across = np.sqrt(1 - height**2)

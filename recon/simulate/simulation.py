@@ -1,4 +1,4 @@
-"""Tilt series of known volumes, with known noise."""
+"""Simulation of tilt series from known volumes with known noise."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from recon.simulate.noises import CountingNoise, OutlierNoise, SkewedNoise
 
 @dataclass(frozen=True)
 class Acquisition:
-    """How a simulated series is taken.
+    """Acquisition settings of a simulated series.
 
     Attributes:
-        noise: makes the true noise model, or None for clean images.
-        mode: how the images are formed.
+        noise: function that creates the true noise model, or None for clean images.
+        mode: image formation.
         peak: the largest line integral, which sets the unit of attenuation.
         intensity: incident intensity (transmission) or gain (linear), detector units.
     """
@@ -36,16 +36,16 @@ class Acquisition:
     intensity: float = 1.0
 
     def signal(self, line_integrals: Tensor) -> Tensor:
-        """What the detector reads without noise."""
+        """Noise-free pixel values."""
         return self.intensity * (line_integrals if self.mode == "linear" else torch.exp(-line_integrals))
 
     def unit(self, highest: float) -> float:
-        """From density, of largest line integral `highest`, to attenuation (times the gain, in linear mode): the factor."""
+        """The factor from density with largest line integral `highest` to attenuation (times gain in linear mode)."""
         return self.peak / highest * (self.intensity if self.mode == "linear" else 1.0)
 
     @property
     def brightest(self) -> float:
-        """The largest signal there can be."""
+        """The largest possible signal."""
         return self.intensity * (self.peak if self.mode == "linear" else 1.0)
 
 
@@ -60,7 +60,7 @@ ACQUISITIONS = {
         lambda: Digitised(SkewedNoise(10.0, 0.15, skewness=0.3), step=1.0, low=0.0, high=255.0), intensity=200.0
     ),
 }
-"""Acquisitions by name; ``clipped`` is like the synthetic data of Kniesel et al. (CVPR 2022)."""
+"""Acquisitions by name; ``clipped`` resembles the synthetic data of Kniesel et al. (CVPR 2022)."""
 
 
 def clean_tilt_series(
@@ -73,16 +73,16 @@ def clean_tilt_series(
     """Project a known volume without noise.
 
     Args:
-        volume: (z, y, x) density, any unit, an array or a tensor.
+        volume: (z, y, x) density, any unit, array or tensor.
         tilt_angles: degrees.
-        acquisition: how the images are formed.
+        acquisition: acquisition settings.
         pixel_size: Å.
 
     Returns:
-        The series, and the factor from density to attenuation per voxel (times the gain, in linear mode).
+        The series, and the factor from density to attenuation per voxel (times the gain in linear mode).
 
     Raises:
-        ValueError: an empty volume.
+        ValueError: the volume is empty.
 
     Example:
         >>> import numpy as np, recon
@@ -96,7 +96,7 @@ def clean_tilt_series(
     line_integrals = projector(torch.from_numpy(np.asarray(io.as_array(volume), dtype=np.float32)))
     highest = float(line_integrals.max())
     if not highest > 0:
-        raise ValueError("the volume is empty: there is nothing to project")
+        raise ValueError("the volume is empty; give one with positive density")
     line_integrals = line_integrals * (acquisition.peak / highest)
     signal = acquisition.signal(line_integrals)
     unit = acquisition.unit(highest)
@@ -104,7 +104,7 @@ def clean_tilt_series(
 
 
 def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0) -> TiltSeries:
-    """Draw one noisy pixel value of every pixel of a clean series; whole numbers are stored as integers.
+    """Draw a noisy observation of every pixel of a clean series; rounded values are stored as integers.
 
     Example:
         >>> import noiseflow, numpy as np, recon
@@ -119,7 +119,7 @@ def add_noise(tilt_series: TiltSeries, noise_model: nn.Module, *, seed: int = 0)
 
 
 def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> Iterator[NDArray[Any]]:
-    """One noisy pixel value of each clean image (y, x) after the other."""
+    """Yield a noisy observation of each clean image (y, x)."""
     generator = torch.Generator().manual_seed(seed)
     for image in images:
         with torch.no_grad():
@@ -127,37 +127,37 @@ def draw_noise(images: NDArray[Any], noise_model: nn.Module, *, seed: int) -> It
 
 
 def stored_type(noise_model: nn.Module | None) -> type[np.generic]:
-    """The number type of a detector's pixel values: integers where it rounds to whole numbers."""
+    """The data type of pixel values: integers if the noise model rounds to whole numbers."""
     if not isinstance(noise_model, Digitised) or noise_model.step != 1:
         return np.float32
     return np.uint8 if (noise_model.low, noise_model.high) == (0, 255) else np.int32
 
 
 def tilt_range(text: str) -> NDArray[np.float64]:
-    """Angles of ``START:STOP:STEP`` in degrees, both ends included.
+    """Parse ``START:STOP:STEP`` in degrees, both ends included.
 
     Raises:
-        ValueError: not three numbers, no angle in the range, or angles of more than two full turns.
+        ValueError: the text does not hold three numbers, the range is empty or too fine, or angles exceed two full turns.
     """
     try:
         start, stop, step = (number(part) for part in text.split(":"))
     except ValueError:
         raise ValueError(f"tilts '{text}': give START:STOP:STEP in degrees, such as -60:60:2") from None
     if not (step and np.isfinite([start, stop, step]).all() and (stop - start) / step >= 0):
-        raise ValueError(f"tilts '{text}': the step does not lead from start to stop")
+        raise ValueError(f"tilts '{text}': the step does not lead from START to STOP")
     if (stop - start) / step > 10_000:
         raise ValueError(f"tilts '{text}': more than 10000 tilts; give a larger step")
     if max(abs(start), abs(stop)) > LARGEST_ANGLE:
-        raise ValueError(f"tilts '{text}': angles are degrees within ±{LARGEST_ANGLE}")
+        raise ValueError(f"tilts '{text}': give degrees within ±{LARGEST_ANGLE}")
     return np.round(start + step * np.arange(int((stop - start) / step + 1e-6) + 1), 6)
 
 
 def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share: float) -> NDArray[np.float64]:
-    """Angles spread evenly over a tilt range that are none of its own: `share` of the way from one tilt to the next.
+    """Angles between the tilts of a series, evenly spread over its range: `share` of the way from one tilt to the next.
 
     Args:
         tilt_angles: degrees.
-        count: how many; fewer where there are fewer gaps.
+        count: number of angles; fewer if there are fewer gaps.
         share: between 0 and 1; different shares give different angles.
     """
     ordered = np.unique(tilt_angles)

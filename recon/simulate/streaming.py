@@ -1,4 +1,4 @@
-"""Simulated tilt series of any size, straight to files: blocks of slices and a few tilts at a time are all that memory holds."""
+"""Simulation of tilt series of any size to files, with only blocks of slices and a few tilts in memory."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
 
 @dataclass(frozen=True)
 class Simulation:
-    """What to simulate.
+    """Settings of a simulation.
 
     Attributes:
         phantom: one of `recon.simulate.phantoms.PHANTOMS`.
         size: voxels along each edge.
-        angles: degrees by name of the stack: ``clean`` and, where wanted, ``validation`` and ``test``.
-        acquisition: how images are formed.
-        noise_model: the noise on the ``clean`` stack, or None.
-        seed: of the phantom and of the noise.
-        defocus: blur of the ``clean`` stack by depth, see
-            `recon.projection.defocused_projector.DefocusedProjector`; the others stay sharp.
+        angles: degrees by name of the stack: ``clean`` and optionally ``validation`` and ``test``.
+        acquisition: acquisition settings.
+        noise_model: noise model for the ``clean`` stack, or None.
+        seed: seed of the phantom and of the noise.
+        defocus: depth-dependent blur of the ``clean`` stack, see
+            `recon.projection.defocused_projector.DefocusedProjector`; the other stacks are in focus.
     """
 
     phantom: str
@@ -53,7 +53,7 @@ class Simulation:
 
     @property
     def num_steps(self) -> int:
-        """Steps that `write` reports: blocks drawn, blocks projected and images read out."""
+        """Number of steps that `write` reports: blocks drawn, blocks projected, and images written."""
         blocks = len(list(self._blocks()))
         tilts = sum(len(angles) for angles in self.angles.values())
         return blocks * (1 + sum(-(-len(angles) // self._together) for angles in self.angles.values())) + tilts
@@ -67,15 +67,15 @@ class Simulation:
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
     def write(self, folder: Path, progress: Progress = lambda done, note: None) -> float:
-        """Write ``truth.mrc``, the clean stacks by name and the noisy ``tilts.mrc``, with their angles, into a folder.
+        """Write ``truth.mrc``, the clean stacks by name and the noisy ``tilts.mrc``, with their angles, to a folder.
 
-        The files appear when all are whole; a run that fails leaves none behind.
+        The files appear when all are complete; a failed run leaves none.
 
         Returns:
-            The factor from the phantom's density to the truth's attenuation.
+            The factor from the density of the phantom to the attenuation of the truth.
 
         Raises:
-            ValueError: an unknown phantom, or an empty one.
+            ValueError: the phantom is unknown or empty.
         """
         with (
             output_folder(folder),
@@ -101,7 +101,7 @@ class _Writer:
                 self._step("drawing")
             highest = max(self._project(name, truth.data) for name in plan.angles)
             if not highest > 0:
-                raise ValueError("the volume is empty: there is nothing to project")
+                raise ValueError("the volume is empty; choose another phantom or a larger size")
             unit = plan.acquisition.unit(highest)
             for rows in plan._blocks():
                 truth.data[:, rows] *= np.float32(unit)
@@ -110,7 +110,7 @@ class _Writer:
         return unit
 
     def _project(self, name: str, truth: Array) -> float:
-        """Line integrals of one stack, and the largest of them in focus; only the first stack's sets the unit."""
+        """Write the line integrals of one stack, and return the largest one in focus; that of the first stack sets the unit."""
         plan, angles, highest = self.simulation, self.simulation.angles[name], 0.0
         with self._new(name, (len(angles), plan.size, plan.size), np.float32) as stack:
             for start in range(0, len(angles), plan._together):
@@ -157,7 +157,7 @@ class _Writer:
 
 
 def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:
-    """Images (tilt, y, u) of some slices, into which their neighbours are blurred."""
+    """Images (tilt, y, u) of some slices, including blur from their neighbours."""
     rim = projector.reach
     start, stop = max(0, rows.start - rim), min(volume.shape[1], rows.stop + rim)
     images = projector(torch.from_numpy(np.array(volume[:, start:stop])))

@@ -1,7 +1,7 @@
-"""The protein shell of a Zika virion, as a density built from the atoms of Protein Data Bank entry 5IRE (CC0).
+"""The protein shell of a Zika virion, as a density computed from the atoms of Protein Data Bank entry 5IRE (CC0).
 
-The density that ships is made by ``python -m recon.simulate.virion 5ire.pdb``: atoms of the asymmetric unit, weighted by
-atomic number, laid out by the 60 icosahedral operators (``REMARK 350 BIOMT``), gathered on a grid of 6 Å and blurred.
+The included density was created by ``python -m recon.simulate.virion 5ire.pdb``: atoms of the asymmetric unit, weighted by
+atomic number, are replicated by the 60 icosahedral operators (``REMARK 350 BIOMT``), binned to a grid of 6 Å and blurred.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 VOXEL_SIZE = 6.0
 RADIUS = 250.0
-"""Å; hardly any atom lies further out."""
+"""Å; hardly any atom is further out."""
 _ATOMIC_NUMBER = {"H": 1, "C": 6, "N": 7, "O": 8, "P": 15, "S": 16}
 
 
@@ -31,13 +31,13 @@ def density_of_atoms(
         path: file with ``ATOM`` records and ``REMARK 350 BIOMT`` operators.
         voxel_size: Å.
         radius: Å; half the edge of the cube.
-        blur: standard deviation of a Gaussian, Å.
+        blur: standard deviation of the Gaussian blur, Å.
 
     Returns:
-        (z, y, x) density between 0 and 1, the middle voxel at the centre of the capsid.
+        (z, y, x) density between 0 and 1, with the middle voxel at the centre of the capsid.
 
     Raises:
-        ValueError: no atoms or no operators.
+        ValueError: the file has no atoms or no operators.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -57,7 +57,7 @@ def _read(text: str) -> tuple[Array, Array, Array]:
     rows = [line.split()[4:8] for line in text.splitlines() if line.startswith("REMARK 350   BIOMT")]
     if not atoms or not rows or len(rows) % 3:
         raise ValueError(
-            "a capsid needs ATOM records and REMARK 350 BIOMT operators of three rows each; take the .pdb file"
+            "a capsid needs ATOM records and REMARK 350 BIOMT operators with three rows each; give the .pdb file"
         )
     positions = np.array([[float(line[start : start + 8]) for start in (30, 38, 46)] for line in atoms])
     weights = np.array([_ATOMIC_NUMBER.get(line[76:78].strip() or line[13], 6) for line in atoms], dtype=float)
@@ -65,12 +65,12 @@ def _read(text: str) -> tuple[Array, Array, Array]:
 
 
 def zika_in_box(places: tuple[Array, ...], radius: float, rotation: Array) -> NDArray[np.float32]:
-    """The virion's density at points of a regular grid.
+    """The density of the virion at points of a regular grid.
 
     Args:
-        places: coordinates (z, y, x) relative to its centre, broadcasting against each other; `radius` in their unit.
-        radius: of the virion.
-        rotation: (3, 3) orthogonal; a reflection is turned into a rotation, so that the hand stays right.
+        places: coordinates (z, y, x) relative to its centre, which broadcast with each other, in the unit of `radius`.
+        radius: radius of the virion.
+        rotation: (3, 3) orthogonal; a reflection is converted to a rotation, to preserve the handedness.
 
     Returns:
         Density between 0 and 1, zero outside the virion.
@@ -88,7 +88,7 @@ def zika_in_box(places: tuple[Array, ...], radius: float, rotation: Array) -> ND
 
 @lru_cache(maxsize=8)
 def _shipped(voxels: float) -> NDArray[np.float32]:
-    """The density as it ships, smoothed for sampling at steps of so many of its voxels."""
+    """The included density, smoothed for sampling at steps of `voxels` of its voxels."""
     from scipy.ndimage import gaussian_filter
 
     with (

@@ -1,4 +1,4 @@
-"""How far to trust a volume: error bars, and figures of a volume with their intervals."""
+"""Uncertainty of a volume: error bars, and measurements with intervals."""
 
 import lazy_loader as _lazy
 

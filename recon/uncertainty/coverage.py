@@ -1,4 +1,4 @@
-"""Whether error bars may be believed: the share of a known truth, or of pixels that no fit saw, that their intervals hold."""
+"""Calibration of error bars: coverage of a known truth, or of held-out pixels, by their intervals."""
 
 from __future__ import annotations
 
@@ -23,27 +23,28 @@ from recon.uncertainty.result import Uncertainty
 def voxel_coverage(
     volume: NDArray[Any], uncertainty: Uncertainty, truth: NDArray[Any], *, level: float = 0.9
 ) -> NDArray[np.bool_]:
-    """Where the interval around a voxel holds the truth, (z, y, x).
+    """Whether the interval of each voxel contains the truth, (z, y, x).
 
     Args:
         volume, truth: (z, y, x) attenuation per voxel.
-        uncertainty: of the volume.
-        level: share of the truth that the intervals should hold.
+        uncertainty: error bars of the volume.
+        level: nominal coverage of the intervals.
     """
     found: NDArray[np.bool_] = np.abs(volume - truth) <= uncertainty.half_width(level)
     return found
 
 
 def predictive_ranks(noise_model: nn.Module, signals: Tensor, observation: Tensor, *, seed: int = 0) -> NDArray[Any]:
-    """Rank of each observation in its predictive distribution, 0 to 1: the mean of F(observation | signal) over signals that were
-    sampled. Ranks are uniform where noise model and signals are right (Dawid 1984, doi:10.2307/2981683); jumps of F, where a
-    detector rounds or clips, are filled at random.
+    """Rank of each observation in its predictive distribution, 0 to 1.
+
+    The rank is the mean of F(observation | signal) over sampled signals. Ranks are uniform if noise model and signals are correct
+    (Dawid 1984, doi:10.2307/2981683). They are randomised within jumps of F, where a detector rounds or clips.
 
     Args:
         noise_model: conditional density of the observations.
         signals: (samples, ...) detector units.
         observation: (...) detector units.
-        seed: of what fills the jumps.
+        seed: seed of the randomisation.
     """
     below, at = torch.zeros(observation.shape, dtype=torch.float64), torch.zeros(observation.shape, dtype=torch.float64)
     with torch.no_grad():
@@ -57,31 +58,29 @@ def predictive_ranks(noise_model: nn.Module, signals: Tensor, observation: Tenso
 
 
 def share_within(ranks: NDArray[Any], level: float = 0.9) -> float:
-    """The share of ranks inside the central interval: `level` where they are uniform."""
+    """The share of ranks inside the central interval, which equals `level` if they are uniform."""
     return float((np.abs(ranks - 0.5) <= level / 2).mean())
 
 
 def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int = 16, **settings: Any) -> NDArray[Any]:
-    """Ranks of the pixels of tilts left out in their predictive distributions, see `predictive_ranks`.
+    """Ranks of the pixels of held-out tilts in their predictive distributions, see `predictive_ranks`.
 
-    A volume is fitted to the other tilts, its posterior sampled, and each sample projected and put through the noise model.
-    Samples are moved so that their mean is the volume, for it is the volume that error bars stand around.
+    A volume is fitted to the other tilts and its posterior is sampled. Each sample is projected, and the noise model is applied.
+    Samples are shifted so that their mean is the volume, because error bars are centred on it.
 
     Args:
-        tilt_series: with one detector response for all tilts.
-        every: of so many tilts one is left out, and neither end.
-        num_samples: of the posterior.
-        **settings: of `recon.reconstruct`.
+        tilt_series: a series with one detector response for all tilts.
+        every: one of this many tilts is held out, but neither end.
+        num_samples: number of posterior samples.
+        **settings: settings of `recon.reconstruct`.
 
     Raises:
-        ValueError: too few tilts, a response that differs from tilt to tilt, or a method that fits no volume.
+        ValueError: there are too few tilts, the response differs between tilts, or the method does not fit a volume.
     """
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     left = order[every // 2 : -1 : every]
     if every < 2 or not left.size:
-        raise ValueError(
-            f"{len(order)} tilts: leaving out one of {every} leaves nothing to judge by; give a smaller number"
-        )
+        raise ValueError(f"{len(order)} tilts are too few to hold out one of {every}; give a smaller number")
     kept, judged = tilt_series.select(np.setdiff1d(order, left)), tilt_series.select(left)
     orientation = Orientation.of(kept)  # that of the signal model
     kept, judged = orientation.series(kept), orientation.series(judged)
@@ -94,9 +93,11 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     model, observation = outcome.signal_model, torch.from_numpy(judged.images.astype(np.float32))
     formation = None if model is None else model.image_formation
     if outcome.noise_model is None or not isinstance(formation, Linear | Transmission):
-        raise ValueError(f"method {outcome.method} has no noise model and response of its own; use --method joint")
+        raise ValueError(f"method {outcome.method} does not fit a noise model and a response; use --method joint")
     if any(parameter.numel() > 1 for parameter in formation.parameters()):
-        raise ValueError("the response differs from tilt to tilt: what it is at tilts left out is not known")
+        raise ValueError(
+            "the response differs between tilts and is not known for held-out tilts; use a series with one response"
+        )
     depth, _, width = volumes[0].shape
     moved = torch.from_numpy(outcome.volume.attenuation) - torch.stack(volumes).mean(0).cpu()
     pixels = judged.images.shape[2]

@@ -1,4 +1,4 @@
-"""The posterior of a volume as a fit left it: minus its log-density, as a function of voxels, with its gradient."""
+"""The negative log-posterior of a fitted volume as a function of the voxels, with its gradient."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from noiseflow.fitting.observation_table import ObservationTable
 from recon.joint.signal_model import TomographySignal
 from recon.projection.base import from_columns
 
-_SOFTENED = 10  # times the smoothing: a tenth as stiff, and still a fifth of a unit, below what is to be distinguished
+_SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
 _POWER_STEPS = 8
-_SAFE = 1.2  # a power iteration of few steps comes out low
+_SAFE = 1.2  # a power iteration with few steps underestimates
 
 
 class Energy:
-    """Minus the log-density of a volume, in units of the field's scale: −log p(observation | volume) + weight · regulariser.
+    """Negative log-density of a volume in units of the field's scale: −log p(observation | volume) + weight · regulariser.
 
     Args:
-        model: signal model, as fitted.
-        noise_model: what it was fitted under.
+        model: the fitted signal model.
+        noise_model: the noise model of the fit.
         observation: (tilt, u, y) pixel values.
-        train: of that shape, True at the pixels that were fitted.
+        train: (tilt, u, y) True at the pixels used in the fit.
     """
 
     def __init__(self, model: TomographySignal, noise_model: nn.Module, observation: Tensor, train: Tensor) -> None:
@@ -40,12 +40,12 @@ class Energy:
             pixels = observation[train]
             low = float(torch.minimum(signal.min(), pixels.min()))
             high = float(torch.maximum(signal.max(), pixels.max()))
-            filled = torch.where(train, observation, pixels.mean())  # pixels that are left out may be NaN
+            filled = torch.where(train, observation, pixels.mean())  # excluded pixels may be NaN
             self.table = ObservationTable(noise_model, filled.reshape(-1), low, high)
 
     @property
     def filled(self) -> Tensor | float:
-        """1 where a voxel may hold anything."""
+        """1 at occupied voxels."""
         return 1.0 if self.model.occupancy is None else self.model.tiles.filled
 
     def _rays(self, units: Tensor) -> Tensor:
@@ -55,7 +55,7 @@ class Energy:
         )
 
     def _misfit(self, units: Tensor) -> Tensor:
-        """Its gradient is that of minus the log-likelihood; its value is not, where a table gives the slope alone."""
+        """A function with the gradient of the negative log-likelihood; with a table, its value is not meaningful."""
         signal: Tensor = self.model.image_formation(self._rays(units).view(self.observation.shape))
         if self.table is not None:
             return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train, signal.reshape(-1))
@@ -71,11 +71,11 @@ class Energy:
         return self.weight * cost
 
     def gradient(self, units: Tensor) -> Tensor:
-        """Of the energy, nats per unit."""
+        """Gradient of the energy, nats per unit."""
         return _slope(lambda values: self._misfit(values) + self._cost(values), units)
 
     def stiffness(self) -> float:
-        """The largest curvature at the fit, nats per square unit: likelihood and regulariser apart, by power iteration."""
+        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately."""
         generator = torch.Generator(self.start.device).manual_seed(0)
         rough = torch.randn(self.start.shape, generator=generator, device=self.start.device)
         even = torch.ones_like(self.start)
@@ -87,13 +87,13 @@ class Energy:
             direction = direction * self.filled
             step = (
                 0.01 * direction / direction.abs().max().clamp_min(1e-30)
-            )  # units: within what smoothing makes quadratic
+            )  # units: within the quadratic range of the smoothing
             direction = _slope(part, self.start + step) - start
             found = float(direction.norm() / step.norm().clamp_min(1e-30))
         return found
 
     def volume(self, units: Tensor) -> Tensor:
-        """(z, y, x), attenuation per voxel."""
+        """Attenuation per voxel, (z, y, x)."""
         columns = units if self.model.occupancy is None else self.model.tiles.lattice(units)
         return from_columns(columns * self.scale, self.model.field.depth).contiguous()
 

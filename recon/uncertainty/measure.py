@@ -1,4 +1,4 @@
-"""Figures of a volume, each with the interval that its error bars allow."""
+"""Measurements on a volume, with intervals from its error bars."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Region = tuple[slice, slice, slice]
 
 @dataclass(frozen=True)
 class Measurement:
-    """A figure and its interval.
+    """A measured value with its interval.
 
     Attributes:
-        value: what the volume says.
+        value: the measured value.
         low, high: ends of the interval; None without error bars.
     """
 
@@ -28,16 +28,16 @@ class Measurement:
     high: float | None = None
 
     def in_words(self) -> str:
-        """The figure, with its interval where it has one."""
+        """The value, with its interval if available."""
         text = f"{self.value:.4g}"
         return text if self.low is None else f"{text} ({self.low:.4g} to {self.high:.4g})"
 
 
 def parse_region(text: str, shape: tuple[int, ...]) -> Region:
-    """The slices of ``z0:z1,y0:y1,x0:x1``, voxels; ends may be left out.
+    """Parse ``z0:z1,y0:y1,x0:x1``, voxels; ends may be omitted.
 
     Raises:
-        ValueError: another form, or a region outside the volume.
+        ValueError: the form is wrong, or the region is outside the volume.
     """
     parts = text.split(",")
     try:
@@ -60,14 +60,14 @@ def mean_of_region(
 ) -> Measurement:
     """Mean attenuation of a region.
 
-    How errors of neighbours correlate is not in the error bars. The interval holds for any correlation, and is too wide where
-    they are independent: the standard deviation of a mean is at most the mean of the standard deviations.
+    Error bars do not include correlations between voxels. The interval is valid for any correlation, because the standard
+    deviation of a mean is at most the mean of the standard deviations; it is too wide if errors are independent.
 
     Args:
         volume: (z, y, x) attenuation per voxel.
         region: slices along z, y and x.
-        uncertainty: of the volume.
-        level: of the interval.
+        uncertainty: error bars of the volume.
+        level: probability of the interval.
     """
     value = float(volume[region].mean(dtype=np.float64))
     if uncertainty is None:
@@ -87,14 +87,16 @@ def volume_above(
     *,
     level: float = 0.9,
 ) -> Measurement:
-    """Voxels of a region above a threshold; the interval counts those whose own interval is above it, and reaches above it.
+    """Number of voxels of a region above a threshold.
+
+    The ends of the interval count voxels whose interval is completely above the threshold, and partly above it.
 
     Args:
         volume: (z, y, x) attenuation per voxel.
         threshold: attenuation per voxel.
         region: slices along z, y and x.
-        uncertainty: of the volume.
-        level: of the intervals of voxels.
+        uncertainty: error bars of the volume.
+        level: probability of the intervals of voxels.
     """
     part = volume[region]
     value = float((part > threshold).sum())
@@ -116,15 +118,15 @@ def line_profile(
 
     Args:
         volume: (z, y, x) attenuation per voxel.
-        start, stop: (z, y, x) ends, voxels.
-        uncertainty: of the volume.
-        level: of the interval.
+        start, stop: (z, y, x) end points, voxels.
+        uncertainty: error bars of the volume.
+        level: probability of the interval.
 
     Returns:
         Distance from the start in voxels, attenuation, and half the width of its interval (None without error bars).
 
     Raises:
-        ValueError: an end outside the volume.
+        ValueError: an end point is outside the volume.
     """
     ends = np.array([start, stop], dtype=np.float64)
     if (ends < 0).any() or (ends > np.array(volume.shape) - 1).any():

@@ -1,4 +1,4 @@
-"""Samples of the posterior of a fitted volume by Langevin steps (Roberts & Tweedie 1996, doi:10.2307/3318418)."""
+"""Posterior samples of a fitted volume by Langevin dynamics (Roberts & Tweedie 1996, doi:10.2307/3318418)."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
     from recon.scale.blocks import Block
 
 _STEPS = 30  # between two samples
-_SETTLE = 120  # steps that lead from the most likely volume to a usual one
-_EVERY = 3  # steps between volumes that are averaged: neighbours are nearly alike
-_SHARE = 0.1  # of the pixels, left out as in the fit, so that the posterior knows no more
+_SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
+_EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
+_SHARE = 0.1  # share of the pixels, held out as in the fit, so that the posterior uses the same data
 
 
 class Posterior:
-    """A chain of volumes that are compatible with the images and with the regulariser, as a stage: one step gives one sample.
+    """A Markov chain of posterior volumes as a stage; one step of the stage gives one sample.
 
-    A step goes down the gradient of `Energy` and is disturbed by Gaussian noise; what would be negative is reflected. Noise
-    model, weight and detector response stay as the fit left them.
+    Langevin steps follow the negative gradient of `Energy` with added Gaussian noise; negative values are reflected. Noise model,
+    weight and detector response are fixed.
 
     Args:
         outcome: a fitted reconstruction.
-        tilt_series: what it was made of, tilts in the same order.
-        num_samples: how many.
-        seed: of the fit and of the chain.
-        block: the slices of these images among all of the volume: they say which pixels its fit left out.
+        tilt_series: its data, with tilts in the same order.
+        num_samples: number of samples.
+        seed: seed of the fit and of the chain.
+        block: the slices of these images within the whole volume, which determine the pixels that the fit held out.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
     Raises:
-        ValueError: a reconstruction that no fit made, or fewer than two samples.
+        ValueError: the reconstruction was not fitted, or `num_samples` is less than two.
     """
 
     def __init__(
@@ -58,13 +58,13 @@ class Posterior:
         model, noise_model = outcome.signal_model, outcome.likelihood or outcome.noise_model
         if model is None or noise_model is None:
             raise ValueError(
-                f"method {outcome.method} fits no volume under a noise model; error bars need --method joint"
+                f"method {outcome.method} does not fit a volume with a noise model; for error bars use --method joint"
             )
         if num_samples < 2:
-            raise ValueError(f"--uncertainty {num_samples}: a spread needs at least 2 samples; 16 are usual")
+            raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
-        self.orientation = outcome.orientation  # the fit saw the series so
+        self.orientation = outcome.orientation  # as in the fit
         rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
         tilt_series = self.orientation.series(rising)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
@@ -75,16 +75,18 @@ class Posterior:
         if tilt_series.mask is not None:
             train &= _native(tilt_series.mask).to(device)
         self.energy = Energy(model, noise_model, observation, train)
-        self.step_size = 1 / (self.energy.stiffness() or 1.0)  # a block of vacuum has none, and nothing moves
+        self.step_size = 1 / (
+            self.energy.stiffness() or 1.0
+        )  # the stiffness of a block of vacuum is zero, and nothing changes
         first = 0 if rows is None else rows.start
-        self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # blocks must not share their noise
+        self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
         shares = None if block is None else torch.from_numpy(block.shares())
         self.sums = ShellSums(self.energy.volume(self.units), shares=shares, height=height)
 
     @torch.no_grad()
     def step(self) -> str:
-        """Lead the chain to its next sample."""
+        """Advance the chain to the next sample."""
         if self.done == 0:
             for _ in range(_SETTLE):
                 self._move()
@@ -93,7 +95,7 @@ class Posterior:
             if number % _EVERY == 0:
                 self.moments.add(self.units)
         if not bool(torch.isfinite(self.units).all()):
-            raise ValueError("the error bars diverged: a voxel is no longer finite; check the data's scale")
+            raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
         self.sums.add(self.energy.volume(self.units))
         if self.visit is not None:
@@ -109,19 +111,19 @@ class Posterior:
         return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
-        """The chain where it is, and its moments so far."""
+        """Current state of the chain, and the moments so far."""
         chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
         return chain | {"moments": self.moments.state(), "sums": self.sums.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state."""
         self.done, self.units = state["done"], state["units"].to(self.units).clone()
         self.generator.set_state(state["generator"])
         self.moments.load_state(state["moments"])
         self.sums.load_state(state["sums"])
 
     def result(self) -> Uncertainty:
-        """Standard deviation, bias and expected shell correlation from the samples so far."""
+        """Standard deviation, bias and expected Fourier shell correlation from the samples so far."""
         parts = self.moments.std, self.moments.mean - self.energy.start
         std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
         return Uncertainty(std, bias, self.done, self.sums.powers().band())
@@ -138,20 +140,19 @@ def error_bars(
 ) -> Uncertainty:
     """Standard deviation and bias of every voxel of a fitted volume, from samples of its posterior.
 
-    The posterior is what noise model and weight say: the likelihood of the pixels that were fitted, times
-    exp(−weight · regulariser).
-    Where the missing wedge hides something, only the regulariser speaks. Voxels that count as vacuum have no spread.
+    The posterior is the likelihood of the fitted pixels times exp(−weight · regulariser). In the missing wedge it is determined
+    by the regulariser alone. Voxels treated as vacuum have zero standard deviation.
 
     Args:
-        outcome: of a method that fits a volume under a noise model.
-        tilt_series: what it was made of, tilts in the same order.
-        num_samples: how many; they are thirty steps of the chain apart.
-        seed: of the fit; it leaves the same pixels out.
-        run_stage: carries the stage out; `recon.joint.checkpoint.Journal.run_stage` keeps what it has reached.
-        prefix: of the name under which it does.
+        outcome: result of a method that fits a volume with a noise model.
+        tilt_series: its data, with tilts in the same order.
+        num_samples: number of samples, thirty steps of the chain apart.
+        seed: seed of the fit, so that the same pixels are held out.
+        run_stage: runs the stage; `recon.joint.checkpoint.Journal.run_stage` also saves its state.
+        prefix: prefix of the name of the stage.
 
     Raises:
-        ValueError: a reconstruction that no fit made, or fewer than two samples.
+        ValueError: the reconstruction was not fitted, or `num_samples` is less than two.
     """
     posterior = Posterior(outcome, tilt_series, num_samples, seed=seed)
     run_stage(f"{prefix}error bars", posterior)
@@ -159,5 +160,5 @@ def error_bars(
 
 
 def _native(images: np.ndarray) -> Tensor:
-    """(tilt, y, u) to the projector's order (tilt, u, y)."""
+    """Convert (tilt, y, u) to the projector's order (tilt, u, y)."""
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1)))

@@ -1,8 +1,8 @@
-"""The Fourier shell correlation of a volume with a truth that nobody knows: a band, from samples of the posterior.
+"""Expected Fourier shell correlation of a volume with the unknown truth: a band from posterior samples.
 
-Each sample is a truth that the images and the regulariser allow. Their mean differs from the volume, which is the most likely
-of them, by the bias. The lower edge counts all of it: the correlation of the volume with the samples, which 95 % of them
-exceed. The upper edge counts none: that with samples moved so that their mean is the volume.
+Each posterior sample is a possible truth. The mean of the samples differs from the volume, the posterior mode, by the bias. The
+lower edge of the band includes the bias: it is the correlation of the volume with samples that 95 % of them exceed. The upper
+edge excludes the bias: the samples are shifted so that their mean is the volume.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from noiseflow.io.ownership import signature
 from recon.metrics.metrics import resolution, shells_of
 
 Array = NDArray[np.float64]
-_LEVEL = 0.9  # as the intervals of voxels: a twentieth of the samples correlate less
+_LEVEL = 0.9  # as for the intervals of voxels: 5 % of the samples have a lower correlation
 _COLUMNS = "frequency (cycles per voxel),low,high"
 _FEWEST = 4  # voxels along an axis: two shells, of which the first is the mean
 
@@ -30,7 +30,7 @@ _FEWEST = 4  # voxels along an axis: two shells, of which the first is the mean
 @described(frequency="cycles per voxel")
 @dataclass(frozen=True)
 class ShellBand:
-    """Between which values the Fourier shell correlation of a volume with the truth is expected.
+    """The band in which the Fourier shell correlation of a volume with the truth is expected.
 
     Attributes:
         frequency: (N,) cycles per voxel.
@@ -42,12 +42,12 @@ class ShellBand:
     high: Array
 
     def resolution(self, threshold: float = 0.5) -> tuple[float, float]:
-        """Where the lower and the upper edge fall below a threshold, cycles per voxel; see `recon.metrics.metrics.resolution`."""
+        """Frequencies at which lower and upper edge fall below a threshold, see `recon.metrics.metrics.resolution`."""
         low, high = (resolution(self.frequency, edge, threshold) for edge in (self.low, self.high))
         return low, high
 
     def in_words(self, voxel_size: float | None, threshold: float = 0.5) -> str:
-        """The range of the resolution, and as a length where the voxels (Å) are known."""
+        """The range of the resolution, also as a length if the voxel size (Å) is known."""
         ends = self.resolution(threshold)
         words = f"{ends[0]:.3f} to {ends[1]:.3f} cycles per voxel"
         if not voxel_size or not ends[0]:
@@ -57,7 +57,7 @@ class ShellBand:
         return f"{words} ({coarse / size:.3g} to {fine / size:.3g} {unit})"
 
     def write(self, path: str | Path) -> None:
-        """Write a table of comma-separated values, one line per shell."""
+        """Write a CSV table with one line per shell."""
         with atomic_path(path) as partial:
             table = np.stack([self.frequency, self.low, self.high], axis=1)
             title = f"# {signature()}: Fourier shell correlation with the truth, 90 % band\n{_COLUMNS}"
@@ -65,10 +65,10 @@ class ShellBand:
 
     @classmethod
     def read(cls, path: str | Path) -> ShellBand:
-        """What `write` wrote.
+        """Read a table that `write` wrote.
 
         Raises:
-            ValueError: another table.
+            ValueError: it is a different table.
         """
         try:
             _, columns, *lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -76,19 +76,17 @@ class ShellBand:
                 raise ValueError(columns)
             return cls(*np.array([[float(value) for value in line.split(",")] for line in lines]).T)
         except (ValueError, TypeError) as error:
-            raise ValueError(
-                f"{path} is not the table of correlations that noiseflow writes beside a volume; remove it"
-            ) from error
+            raise ValueError(f"{path} is not a table of correlations written by noiseflow; remove it") from error
 
 
 @dataclass(frozen=True)
 class ShellPowers:
-    """Sums over the frequencies of each shell, of a volume and of samples; those of parts of a volume add up.
+    """Shell sums of the spectra of a volume and of samples; sums of the parts of a volume can be added.
 
     Attributes:
-        cross: (sample, shell) of the products of sample and volume.
-        power: (sample, shell) of the power of each sample.
-        own, common: (shell,) of the power of the volume and of the samples' mean.
+        cross: (sample, shell) sum of the products of sample and volume.
+        power: (sample, shell) power of each sample.
+        own, common: (shell,) power of the volume and of the mean of the samples.
     """
 
     cross: Array
@@ -97,17 +95,17 @@ class ShellPowers:
     common: Array
 
     def table(self) -> Array:
-        """All in one array, which `of` takes; tables of parts add up."""
+        """All sums in one array for `of`; tables of parts can be added."""
         return np.concatenate([self.cross, self.power, self.own[None], self.common[None]])
 
     @classmethod
     def of(cls, table: Array) -> ShellPowers:
-        """What `table` gave."""
+        """Create the sums from the result of `table`."""
         count = len(table) // 2 - 1
         return cls(table[:count], table[count:-2], table[-2], table[-1])
 
     def band(self) -> ShellBand | None:
-        """The band; None of a volume that is fewer than four voxels thick, or without samples."""
+        """The band; None without samples or if an axis has fewer than four voxels."""
         count, shells = len(self.power), len(self.own) - 1
         if 2 * shells < _FEWEST or not count:
             return None
@@ -121,15 +119,15 @@ class ShellPowers:
 
 
 class ShellSums:
-    """Sums by shell of the spectra of a volume and of samples seen one by one.
+    """Running shell sums of the spectra of a volume and of samples.
 
-    A part of a volume shows the powers of the whole, as in P. D. Welch's estimate of power spectra (1967,
-    doi:10.1109/TAU.1967.1161901), if each of its slices counts by a share and the squares of all parts' shares add up to one.
+    The powers of a whole volume can be estimated from its parts by Welch's method (1967, doi:10.1109/TAU.1967.1161901), if slices
+    have weights whose squares sum to 1 over all parts.
 
     Args:
         volume: (z, y, x).
-        shares: (y,) of the slices of a part; None counts all of them in full.
-        height: slices of the whole volume, where this is a part of it.
+        shares: (y,) weights of the slices of a part; None for 1.
+        height: number of slices of the whole volume, if this is a part of it.
     """
 
     def __init__(self, volume: Tensor, *, shares: Tensor | None = None, height: int | None = None) -> None:
@@ -137,7 +135,7 @@ class ShellSums:
         self.shells = min(shape[0], height or shape[1], shape[2]) // 2
         self.shares = None if shares is None else shares.to(volume)[:, None]
         index, times = shells_of(tuple(shape), self.shells)
-        inside = np.minimum(index, self.shells + 1)  # one more for the corners, which nobody looks at
+        inside = np.minimum(index, self.shells + 1)  # one more shell for the corners, which are not used
         self.index = torch.from_numpy(inside.ravel().astype(np.int32)).to(volume.device)
         self.times = torch.from_numpy(times.astype(np.float32)).to(volume.device)
         self.spectrum = self._spectrum(volume)
@@ -146,7 +144,7 @@ class ShellSums:
         self.total = torch.zeros_like(self.spectrum)
 
     def add(self, sample: Tensor) -> None:
-        """Take a sample in, (z, y, x)."""
+        """Add a sample, (z, y, x)."""
         spectrum = self._spectrum(sample)
         self.cross.append(self._by_shell((spectrum * self.spectrum.conj()).real))
         self.power.append(self._power(spectrum))
@@ -162,11 +160,11 @@ class ShellSums:
         )
 
     def state(self) -> dict[str, Any]:
-        """What `load_state` takes."""
+        """The state for `load_state`."""
         return {"cross": self.cross[:], "power": self.power[:], "total": self.total.clone()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state."""
         self.cross, self.power, self.total = state["cross"][:], state["power"][:], state["total"].clone()
 
     def _spectrum(self, volume: Tensor) -> Tensor:

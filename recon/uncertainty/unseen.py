@@ -1,4 +1,4 @@
-"""The directions that no tilt saw: the missing wedge, the widest gap between projections, which repeat after half a turn."""
+"""The missing wedge: the largest gap between tilt angles modulo 180°."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ Array = NDArray[np.float64]
 
 
 def unseen_range(tilt_angles: Array) -> tuple[float, float]:
-    """First and last angle of the widest gap between tilts, degrees; the last may exceed 90.
+    """First and last angle of the largest gap between tilts, degrees; the last may exceed 90.
 
-    A projection at θ holds the frequencies along x·cos θ + z·sin θ, so those at the angles of the gap, from x towards z, are
-    known to the regulariser alone.
+    A projection at θ contains the frequencies along x·cos θ + z·sin θ. Frequencies at the angles of the gap, from x towards z,
+    are therefore determined by the regulariser alone.
 
     Args:
         tilt_angles: (tilt,) degrees.
@@ -25,14 +25,14 @@ def unseen_range(tilt_angles: Array) -> tuple[float, float]:
 
 
 def unseen_share(volume: NDArray[np.floating], tilt_angles: Array) -> float:
-    """Share of a volume's sum of squares at frequencies that no tilt saw.
+    """Share of a volume's sum of squares at frequencies in the missing wedge.
 
     Args:
-        volume: (z, y, x), such as an error.
+        volume: (z, y, x), for example an error.
         tilt_angles: (tilt,) degrees.
     """
     first, last = unseen_range(tilt_angles)
-    power = (np.abs(np.fft.fftn(volume)) ** 2).sum(1)  # y, the tilt axis, is seen at every tilt
+    power = (np.abs(np.fft.fftn(volume)) ** 2).sum(1)  # every tilt contains all frequencies along y, the tilt axis
     z, x = (np.fft.fftfreq(size) for size in power.shape)
     angle = np.mod(np.degrees(np.arctan2(z[:, None], x)) - first, 180)
     inside = (angle > 0) & (angle < last - first) & (np.hypot(z[:, None], x) > 0)
@@ -40,10 +40,10 @@ def unseen_share(volume: NDArray[np.floating], tilt_angles: Array) -> float:
 
 
 def in_words(tilt_angles: Array) -> str:
-    """A sentence for readers of error bars."""
+    """A sentence about the missing wedge for readers of error bars."""
     first, last = unseen_range(tilt_angles)
     return (
-        f"No tilt between {first:.4g}° and {last:.4g}° was recorded ({100 * (last - first) / 180:.0f} % of half a turn): detail "
-        "along these directions, counted from x towards z, comes from the regulariser alone, and error bars only say how firmly "
-        "it holds that."
+        f"No tilt between {first:.4g}° and {last:.4g}° was recorded ({100 * (last - first) / 180:.0f} % of 180°): detail "
+        "along these directions, measured from x towards z, is determined by the regulariser alone, and the error bars reflect "
+        "only its assumptions there."
     )

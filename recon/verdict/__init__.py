@@ -1,1 +1,1 @@
-"""How far to trust a reconstruction: evidence from the images, and a grade with its reasons."""
+"""Automatic assessment of a reconstruction: evidence from the images, and a grade with reasons."""

@@ -1,4 +1,4 @@
-"""A tilt series averaged over squares of pixels, as line integrals: small enough for every test of consistency."""
+"""Binned tilt series as line integrals, for fast consistency tests."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means
 
 Array = NDArray[Any]
-WIDTH = 32  # of the coarse images: each further test then takes milliseconds
-_MOST_TILTS = 90  # of more, every second, third … is taken: neighbours add nothing at this width
-_LEAST_SHARE = 0.02  # of the incident intensity: what is darker counts as that dark
+WIDTH = 32  # width of the coarse images; each test then takes milliseconds
+_MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
+_LEAST_SHARE = 0.02  # of the incident intensity: darker values are clipped to it
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Coarse:
     Attributes:
         images: (tilt, y, u) line integrals, in coarse voxels.
         tilt_angles: (tilt,) degrees.
-        tilts: (tilt,) where these tilts stand in the whole series.
-        binning: pixels along each side of a coarse one.
+        tilts: (tilt,) indices of these tilts in the whole series.
+        binning: binning factor.
         depth, width: coarse voxels.
-        detector_offset: coarse pixels, of what does not fill a square at the far edge.
+        detector_offset: offset due to incomplete bins at the far edge, coarse pixels.
     """
 
     images: Array
@@ -42,7 +42,7 @@ class Coarse:
 
     @property
     def order(self) -> Array:
-        """Tilts by angle."""
+        """Indices of tilts sorted by angle."""
         return np.argsort(self.tilt_angles, kind="stable")
 
 
@@ -66,13 +66,13 @@ def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, *, width: int = WID
 
 
 def line_integrals(tilt_series: TiltSeries, images: Array, binning: int) -> Array:
-    """Images of the kind of a series, (tilt, y, u), binned and inverted by the response that the series shows."""
+    """Images (tilt, y, u), binned and converted to line integrals with the estimated response of the series."""
     response = estimate_response(replace(tilt_series, mask=None))
     return inverted(response, block_means(images, binning, binning))
 
 
 def inverted(response: Transmission | Linear, images: Array) -> Array:
-    """Line integrals of coarse images; dark ones are bounded, for noise must not become infinite."""
+    """Line integrals of coarse images; dark values are clipped, so that noise does not become infinite."""
     given = torch.from_numpy(np.asarray(images, dtype=np.float32))
     with torch.no_grad():
         if isinstance(response, Transmission):

@@ -1,4 +1,4 @@
-"""Whether each image continues those beside it: single tilts that do not, and places where the series breaks in two."""
+"""Continuity of the images: single inconsistent tilts, and breaks of the series."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_LONE, _LONE_SHARE, _BESIDE = 6.0, 0.3, 11  # usual deviations, good 4.1; of the structure; tilts beside it
+_LONE, _LONE_SHARE, _BESIDE = (
+    6.0,
+    0.3,
+    11,
+)  # typical deviations, good series up to 4.1; share of the structure; number of neighbouring tilts
 _BREAK, _BREAK_SCORE, _AROUND = (
     0.5,
     4.0,
     9,
 )  # of what neighbours share elsewhere, good series 0.58; standard errors; pairs
-_WIDE = 1.5  # median steps: images so far apart need not be alike
+_WIDE = 1.5  # median steps: images further apart need not be similar
 
 
 def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
-    """Single tilts that their neighbours predict far worse than the tilts beside them; those at the ends have few neighbours."""
+    """Single tilts that are predicted far worse than neighbouring tilts; tilts at the ends have few neighbours."""
     images, left = coarse.images[coarse.order], errors[coarse.order]
     if images.shape[1] < 2 or len(images) < 2 * _BESIDE:
         return {}, []
@@ -37,13 +41,13 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
     if not far.any():
         return evidence, []
     named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[coarse.order][far][:5])
-    words = f"the image at {named} does not fit between its neighbours: it belongs to another tilt or another object"
+    words = f"the image at {named} is inconsistent with its neighbours: it belongs to another tilt or another object"
     strength = float(min(2.9, (beyond / max(usual, 1e-30))[far].max() / _LONE))
-    return evidence, [Finding("tilts", strength, words, "check its angle, or leave it out")]
+    return evidence, [Finding("tilts", strength, words, "check its angle, or exclude it")]
 
 
 def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
-    """One place where neighbouring images, whose noise is independent, share far less than all other neighbours do."""
+    """A single break: neighbouring images with much less common structure than all other neighbours."""
     images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
     steps = np.diff(angles)
     if len(images) < 2 * _AROUND:
@@ -55,7 +59,7 @@ def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     usual = ndimage.median_filter(shared, _AROUND, mode="nearest")
     apart = (shared < _BREAK * usual) & (usual - shared > _BREAK_SCORE * chance) & (steps < _WIDE * np.median(steps))
     evidence = {"breaks": int(apart.sum())}
-    if apart.sum() != 1:  # more are wrong angles, which other evidence names
+    if apart.sum() != 1:  # several breaks mean wrong angles, which other evidence detects
         return evidence, []
     where = int(np.argmax(apart))
     between = f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on"

@@ -1,4 +1,4 @@
-"""How each image differs from the volume's projection: moved, turned, magnified, brighter or at another angle."""
+"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, angle."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
 NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "brightness", "background")
-_TWIN, _FEWEST = 0.02, 3  # degrees within which tilts are one angle; tilts that a spread can be taken of
-_DEGREE = 5  # of the curves over the tilts: drifts and wrong angles are smooth, noise is not
+_TWIN, _FEWEST = 0.02, 3  # degrees within which angles are equal; smallest number of tilts for a standard deviation
+_DEGREE = 5  # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """One kind of difference over all tilts.
+    """One type of distortion over all tilts.
 
     Attributes:
-        size: rms over the tilts within the range, beyond chance and beyond the mean; pixels at the image's edge, or a share of
+        size: rms over the inner tilts, without the mean and the expected random part; pixels at the image edge, or a share of
             the contrast.
-        smooth: rms of its smooth part over the tilts, alike.
-        rough: spread about its smooth part beyond chance, alike; a few tilts far out do not count.
-        mean: over all tilts, alike.
-        scatter: rms of the deviations from the mean in standard errors, 1 by chance.
-        trend: rms of the coefficients of the smooth part in standard errors, 1 by chance.
+        smooth: rms of its smooth part over the tilts, same unit.
+        rough: standard deviation around its smooth part without the expected random part, same unit; robust to outliers.
+        mean: mean over all tilts, same unit.
+        scatter: rms of the deviations from the mean in standard errors; 1 for random errors.
+        trend: rms of the coefficients of the smooth part in standard errors; 1 for random errors.
         offset: the mean in standard errors.
-        values: (tilt,) as measured.
+        values: (tilt,) measured values.
     """
 
     size: float
@@ -45,11 +45,11 @@ class Distortion:
 
 
 def distortions(residuals: Residuals) -> dict[str, Distortion]:
-    """Regress each residual on what small changes of its image would do to it, with errors that hold under any noise.
+    """Regress each residual on the effects of small distortions of its image, with robust standard errors.
 
-    The errors are White's (doi:10.2307/1912934): noise need be neither Gaussian nor of one width. Fitted volumes take part of a
-    distortion into themselves, so what is found is a lower bound. The tilts at both ends of the range are measured and not
-    counted: there a regularised volume follows neighbours of one side alone, and its projection lags behind the image.
+    The standard errors are White's (doi:10.2307/1912934), which do not require Gaussian or homoscedastic noise. Fitted volumes
+    absorb a part of each distortion, so the result is a lower bound. Tilts at the ends of the range are measured but not
+    included, because there a regularised volume has neighbours on one side only, and its projection lags behind the image.
     """
     found = [_of_tilt(*pair) for pair in _fields(residuals)]
     estimates, errors = zip(*found, strict=True)
@@ -61,16 +61,18 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
 
 
 def _units(residuals: Residuals) -> tuple[float, ...]:
-    """From coefficients to pixels at the edge, and to shares of the contrast."""
+    """Factors from coefficients to pixels at the image edge, or to shares of the contrast."""
     edge = residuals.images.shape[2] / 2
     return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30)
 
 
 def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
-    """For each tilt in turn, the columns of the regression and what they shall explain."""
+    """Yield the columns and the target of the regression for each tilt."""
     width = residuals.images.shape[2]
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
-    along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # about the middle of these slices
+    along = (residuals.height - residuals.height.mean())[:, None].astype(
+        np.float64
+    )  # relative to the middle of these slices
     by_angle = _slope_over_tilts(residuals)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
@@ -82,7 +84,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
 
 
 def _slope_over_tilts(residuals: Residuals) -> Array:
-    """Change of the projections with the tilt angle, per radian; twins share one angle."""
+    """Derivative of the projections with respect to the tilt angle, per radian; duplicates count as one angle."""
     angles, first, back = np.unique(np.round(residuals.tilt_angles, 3), return_index=True, return_inverse=True)
     if len(angles) < 2:
         return np.zeros_like(residuals.projections)
@@ -90,7 +92,7 @@ def _slope_over_tilts(residuals: Residuals) -> Array:
 
 
 def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
-    """Coefficients and their standard errors; nothing is claimed of what an image does not show."""
+    """Coefficients and their standard errors; undetermined coefficients have infinite errors."""
     scale = np.sqrt((columns**2).sum(0)) + 1e-30
     scaled = columns / scale
     inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))

@@ -1,4 +1,4 @@
-"""The images that a volume and its noise model lead one to expect: a detector that clips moves the mean."""
+"""Expected images of a volume under its noise model, whose mean is shifted by clipping."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from noiseflow import Digitised
 from recon.verdict.verdict import Result
 
-_LEVELS = 256  # signals at which the mean is computed; between them it is interpolated
+_LEVELS = 256  # number of signals at which the mean is computed; interpolated in between
 
 
 def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.float32]:
-    """Means of the noise model at the projections (tilt, y, u) of some rows, detector units; else the projections."""
+    """Means of the noise model at the projections (tilt, y, u) of some rows; the projections if there is no noise model."""
     model: nn.Module | None = getattr(result, "noise_model", None)
     projections = np.asarray(result.projections, dtype=np.float32)[:, rows]
     if model is None:
@@ -35,7 +35,7 @@ def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.flo
 
 
 def _unrounded(model: nn.Module, levels: Tensor) -> nn.Module:
-    """The model without a rounding too fine to move its mean: its levels, which are added up, may be countless."""
+    """The model without rounding that is too fine to affect the mean, because summing over many levels is slow."""
     if not isinstance(model, Digitised):
         return model
     fine = model.step < float(levels[1] - levels[0]) or model.step**2 < float(model.model(levels).variance.median())

@@ -1,4 +1,4 @@
-"""Whether the fit arrived, and whether the alignment is determined by the images."""
+"""Checks of convergence, regulariser weight, and determination of the tilt axis."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from recon.series.alignment import Alignment
 from recon.verdict.verdict import Finding
 
-_MARGIN = 2.0  # standard errors: a lead that chance gives once in forty
-_JUMP = 0.1  # nats per pixel that a fit ends above its best: later steps change the likelihood by some thousandths
+_MARGIN = 2.0  # standard errors: a lead with a probability of 1 in 40 by chance
+_JUMP = 0.1  # nats per pixel above the best evaluation; final steps normally change the likelihood by some thousandths
 
 
 def fit_findings(result: Any, alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
@@ -42,14 +42,14 @@ def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _weight(tried: dict[float, float]) -> list[Finding]:
-    """Weights, with their held-out negative log-likelihoods: where the best lies at an end, a better one lies beyond."""
+    """Check whether the best of the tried weights is at an end of the range, so that a better one may be outside."""
     if len(tried) < 2:
         return []
     best = min(tried, key=lambda weight: tried[weight])
-    if best == min(tried):  # the fit follows something that is no noise
+    if best == min(tried):  # the fit follows structure that is not noise
         words = f"held-out pixels prefer a weight of the regulariser below the lowest one tried, {best:.2g}"
         return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
-    if best == max(tried):  # nothing but the regulariser helps: what is left is misfit, and the volume turns blocky
+    if best == max(tried):  # the residuals are misfit that only the regulariser reduces, and the volume becomes blocky
         words = f"held-out pixels prefer a weight of the regulariser above the highest one tried, {best:.2g}"
         return [
             Finding(

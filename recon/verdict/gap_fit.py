@@ -1,4 +1,4 @@
-"""Tilts left out in contiguous gaps and predicted from the others: exactly, for all gaps at once, by one linear fit."""
+"""Prediction of contiguous held-out gaps of tilts from the others, exactly for all gaps by one linear fit."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from scipy import linalg, sparse
 from recon.projection.projector import _joseph
 
 Array = NDArray[Any]
-GAP = 12.0  # degrees: neighbours give each other away, tilts so far apart do not
-_RIDGE = 0.02  # of the smoothness: keeps voxels that no ray meets determined
+GAP = 12.0  # degrees: closer tilts predict each other
+_RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses
 _FEWEST_GAPS = 4
 
 
 class GapFit:
-    """Least squares with a smooth prior for one geometry, and what it predicts for every gap from outside of it.
+    """Least squares with a smoothness prior for one geometry, and its leave-out prediction of every gap.
 
-    For a linear fit y → H y, the tilts of a gap G are predicted by a fit without them with the error
-    (I − H_GG)⁻¹ (y − H y)_G (the block form of Allen's PRESS, doi:10.1080/00401706.1974.10489157), so no fit is repeated. A
-    constant that all pixels share is fitted too: it stands for the offset or the logarithm of the incident intensity.
+    For a linear fit y → H y, a fit without the tilts of a gap G predicts them with the error (I − H_GG)⁻¹ (y − H y)_G (the block
+    form of Allen's PRESS, doi:10.1080/00401706.1974.10489157), so that no fit is repeated. A constant common to all pixels is
+    also fitted: it represents the offset or the logarithm of the incident intensity.
 
     Args:
         tilt_angles: (tilt,) degrees.
@@ -54,7 +54,7 @@ class GapFit:
         prior = _roughness(depth, width)
         scale = smoothness * float(np.trace(normal[:-1, :-1])) / float(prior.data[prior.row == prior.col].sum())
         normal[prior.row, prior.col] += np.float32(scale) * prior.data
-        # symmetric: the transpose is in the order of LAPACK, which then copies nothing
+        # symmetric: the transpose has the memory order of LAPACK, which avoids a copy
         factor = linalg.cholesky(normal.T, lower=True, overwrite_a=True, check_finite=False)
         self.half = linalg.solve_triangular(factor, matrix.T, lower=True, overwrite_b=True, check_finite=False)
         self.inverse = [self._inverse(tilts) for tilts in self.gaps]
@@ -67,12 +67,12 @@ class GapFit:
         return np.asarray(linalg.inv(np.eye(part.shape[1], dtype=np.float32) - part.T @ part, check_finite=False))
 
     def fitted(self, images: Array) -> Array:
-        """What the volume of all tilts predicts, (tilt, y, u)."""
+        """Prediction by the volume of all tilts, (tilt, y, u)."""
         rays = _to_rays(images)
         return _to_images(self.half.T @ (self.half @ rays), images.shape)
 
     def errors(self, images: Array) -> Array:
-        """Images less what a volume predicts of them that has not seen their gap, (tilt, y, u)."""
+        """Images minus their prediction by a volume without their gap, (tilt, y, u)."""
         rays = _to_rays(images)
         left = rays - self.half.T @ (self.half @ rays)
         result = np.empty_like(left)
@@ -83,7 +83,7 @@ class GapFit:
 
 
 def contiguous_gaps(angles: Array, degrees: float) -> list[Array]:
-    """Tilts grouped by angle into runs of so many degrees, at least four runs; twins stay together."""
+    """Tilts grouped into contiguous ranges of `degrees`, at least four; duplicates stay together."""
     values, back = np.unique(np.round(angles, 3), return_inverse=True)
     span = float(values[-1] - values[0])
     count = int(max(_FEWEST_GAPS, round(span / degrees)))
@@ -92,25 +92,25 @@ def contiguous_gaps(angles: Array, degrees: float) -> list[Array]:
 
 
 def shared(images: Array) -> float:
-    """Mean product of each pixel with its neighbour along y: the power of what neighbouring rows share, free of white noise.
+    """Mean product of each pixel with its neighbour along y: the power common to neighbouring rows, without white noise.
 
-    Rows are fitted apart from each other, so noise that differs from row to row adds nothing to it on average.
+    Rows are fitted independently, so noise that is independent between rows does not contribute on average.
     """
     return float(np.mean(images[:, 1:] * images[:, :-1])) if images.shape[1] > 1 else float(np.mean(images**2))
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Share of what neighbouring rows share that is not predicted, and its standard error."""
+    """Unpredicted share of the structure common to neighbouring rows, and its standard error."""
 
     share: float
     error: float
 
 
 def unexplained(images: Array, errors: Array) -> Unexplained:
-    """Of the structure of images (tilt, y, u), the share that is left in the errors of their prediction.
+    """The share of the structure of images (tilt, y, u) that remains in the errors of their prediction.
 
-    Where noise alone is shared, the share is of no meaning and its error far above one.
+    If there is only noise, the share is meaningless and its error is far above one.
     """
     flat = images - images.mean()
     chance = float(np.mean(flat**2)) / np.sqrt(flat.size)
@@ -119,7 +119,7 @@ def unexplained(images: Array, errors: Array) -> Unexplained:
 
 
 def _roughness(depth: int, width: int) -> sparse.coo_array:
-    """Squared gradient of a (depth, width) slice as a sparse matrix of distinct entries, and a little of its square."""
+    """Squared gradient of a (depth, width) slice as a sparse matrix, plus a small ridge."""
 
     def line(size: int) -> Array:
         steps = np.diff(np.eye(size), axis=0)

@@ -1,4 +1,4 @@
-"""Whether another geometry explains the images better: another tilt axis, other angles, a thicker volume, two objects."""
+"""Tests of alternative geometries: another tilt axis, other angles, a thicker volume, two objects."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from recon.verdict.gap_fit import GAP, GapFit
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
-_SINGLE = 0.3  # smoothness where one tilt is left out: less of it lets noise hide what does not belong
-_TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # to both sides
-_SMALL = 20.0  # degrees: turns up to here are compared with their mirror image, for both interpolate alike
-_LIKE_A_TURN = 0.211  # of a pixel: a shift by so much leaves as much noise as a turn: f² + (1 − f)² = 2/3
+_SINGLE = 0.3  # smoothness for single held-out tilts; with less, noise would hide inconsistent tilts
+_TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
+_SMALL = (
+    20.0  # degrees: smaller rotations are compared with their opposite, because both have the same interpolation error
+)
+_LIKE_A_TURN = 0.211  # pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What another geometry explains of left-out tilts beyond the one as given.
+    """Improvement of the prediction of held-out tilts by another geometry.
 
     Attributes:
-        share: of the error of the one as given.
-        score: in standard errors over the gaps.
-        what: the geometry, in words.
+        share: improvement relative to the error of the given geometry.
+        score: improvement in standard errors over the gaps.
+        what: description of the geometry.
     """
 
     share: float
@@ -37,12 +39,12 @@ class Gain:
 
 
 class Geometry:
-    """Left-out gaps of a coarse series, under the geometry as given and others.
+    """Prediction of held-out gaps of a coarse series by the given geometry and by others.
 
     Attributes:
         coarse: the series.
-        fit: the geometry as given, at the smoothness that predicts gaps best.
-        errors: (tilt, y, u) what it leaves of the gaps.
+        fit: fit with the given geometry, at the smoothness that predicts gaps best.
+        errors: (tilt, y, u) prediction errors of that fit.
     """
 
     def __init__(self, coarse: Coarse) -> None:
@@ -52,7 +54,7 @@ class Geometry:
         self.errors = self.fit.errors(coarse.images)
 
     def single_errors(self) -> Array:
-        """(tilt, y, u) what the smoothest fit leaves of each angle when that angle alone is left out: neighbours predict it."""
+        """(tilt, y, u) errors of the smoothest fit when single angles are held out and predicted by their neighbours."""
         angles = self.coarse.tilt_angles
         each = float(np.ptp(angles)) / len(np.unique(np.round(angles, 3)))
         return self._fit(_SINGLE, gap=each).errors(self.coarse.images)
@@ -95,11 +97,11 @@ class Geometry:
         )
 
     def thicker(self) -> Gain:
-        """A volume as deep as wide, where it is thinner."""
+        """A volume with a depth equal to the width, if it is thinner."""
         return self._with("as deep as wide", depth=max(self.coarse.depth, self.coarse.width))
 
     def two_objects(self) -> Gain:
-        """Every part of the series explained by itself: by halves, and by every other tilt."""
+        """Separate volumes for parts of the series: halves, and every other tilt."""
         order = self.coarse.order
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
@@ -117,7 +119,7 @@ class Geometry:
         return self._gain(self._fit(self.smoothness, **changes).errors(self.coarse.images), self.errors, what)
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Gain:
-        """By how much errors are smaller than those as given; its error is that of the mean over the gaps."""
+        """Reduction of the errors relative to the given geometry; its standard error is that of the mean over the gaps."""
         per_tilt = (as_given**2 - errors**2).mean((1, 2))
         per_gap = np.array([per_tilt[tilts].mean() for tilts in self.fit.gaps])
         whole = max(float(np.mean(self.errors**2)), 1e-30)

@@ -1,4 +1,4 @@
-"""What left-out gaps say about axis, angles, thickness and specimen."""
+"""Findings about axis, angles, thickness and specimen from held-out gaps."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from recon.verdict.geometry import Gain, Geometry
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
-_AXIS, _AXIS_SCORE = 0.02, 1.8  # of the error of left-out tilts; standard scenes gain 0.006 at most
-_ANGLES, _ANGLES_SCORE = 0.055, 3.0  # smaller angles make any object smoother: standard scenes gain up to 0.04
-_OBJECTS, _OBJECTS_SCORE = 0.06, 1.0  # halves know less and lose 0.07 to 0.13 where they show one object
+_AXIS, _AXIS_SCORE = 0.02, 1.8  # of the error of held-out tilts; standard scenes gain at most 0.006
+_ANGLES, _ANGLES_SCORE = 0.055, 3.0  # smaller angles make any object smoother; standard scenes gain up to 0.04
+_OBJECTS, _OBJECTS_SCORE = 0.06, 1.0  # halves have less data; for one object they lose 0.07 to 0.13
 _THICKER, _THICKER_SCORE = 0.05, 2.0
-_SLACK, _TIMES = 0.06, 3.0  # share of structure; times what the volume's own projections leave
-_EDGE = 0.4  # line integral at the sides over the mean: beyond, the object goes on there
-_STRUCTURE = 8.0  # standard errors of what neighbouring rows share
-_BLUNT = 0.1  # share of structure that noise can feign: beyond, no test below sees a spoilt series
+_SLACK, _TIMES = 0.06, 3.0  # share of the structure; factor relative to the volume's own projections
+_EDGE = 0.4  # line integral at the sides relative to the mean: above it, the object extends beyond the sides
+_STRUCTURE = 8.0  # standard errors of the structure common to neighbouring rows
+_BLUNT = 0.1  # uncertainty of the share of the structure: above it, the following tests cannot detect defects
 
 
 def geometry_findings(
@@ -51,16 +51,14 @@ def geometry_findings(
         )
     if beyond >= 1:
         words = (
-            f"{gap.share:.0%} of the structure of tilts left out in gaps is not explained by the others, where a correct volume "
+            f"{gap.share:.0%} of the structure of held-out gaps of tilts is not explained by the others; a correct volume "
             f"would leave {expected.share:.0%} unexplained"
         )
         findings.append(
             Finding("consistency", min(beyond, 3.5), words, "check axis, shifts and angles of the series", "general")
         )
     if gap.error > _BLUNT:
-        words = (
-            f"noise hides how much of the left-out tilts is explained: the error is ±{gap.error:.0%} of their structure"
-        )
+        words = f"noise limits the test: the explained share of held-out tilts has an error of ±{gap.error:.0%}"
         findings.append(
             Finding("noise", min(2.9, gap.error / _BLUNT), words, "average exposures, or bin the images", "general")
         )
@@ -70,14 +68,14 @@ def geometry_findings(
 def _axis(gain: Gain) -> list[Finding]:
     if gain.share < _AXIS or gain.score < _AXIS_SCORE:
         return []
-    words = f"images {gain.what} explain each other better: left-out tilts lose {gain.share:.0%} of their error"
+    words = f"images {gain.what} explain each other better: the error of held-out tilts decreases by {gain.share:.0%}"
     return [Finding("axis", min(6.0, 1 + gain.share / _AXIS), words, "give --tilt-axis, or use --refine-alignment")]
 
 
 def _angles(gain: Gain) -> list[Finding]:
     if gain.share < _ANGLES or gain.score < _ANGLES_SCORE:
         return []
-    words = f"tilt angles {gain.what} explain left-out tilts better by {gain.share:.0%} of their error"
+    words = f"tilt angles {gain.what} explain held-out tilts better: their error decreases by {gain.share:.0%}"
     return [Finding("angles", min(6.0, 1 + gain.share / _ANGLES), words, "check the list of tilt angles")]
 
 
@@ -98,21 +96,21 @@ def _objects(gain: Gain) -> list[Finding]:
 def _thicker(gain: Gain) -> list[Finding]:
     if gain.share < _THICKER or gain.score < _THICKER_SCORE:
         return []
-    words = f"the volume is too thin: one {gain.what} explains left-out tilts better by {gain.share:.0%}"
+    words = f"the volume is too thin: one {gain.what} explains held-out tilts better by {gain.share:.0%}"
     return [
-        Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "leave out --thickness, or give a larger one")
+        Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "remove --thickness, or give a larger value")
     ]
 
 
 def _edge(geometry: Geometry) -> float:
-    """Line integral of the outer columns over the mean of all, averaged over tilts and rows, above the emptiest column."""
+    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
     profile = geometry.coarse.images.mean((0, 1))
     raised = profile - profile.min()
     return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
 
 def _structure(geometry: Geometry) -> float:
-    """What neighbouring pixels share, in standard errors of chance: along y or u, whichever is more."""
+    """Structure common to neighbouring pixels, in standard errors: the larger value of y and u."""
     images = geometry.coarse.images
     flat = images - images.mean((1, 2), keepdims=True)
     chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)

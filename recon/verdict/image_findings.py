@@ -1,4 +1,4 @@
-"""What the residuals of the volume say about shifts, angles, beam and fit."""
+"""Findings about shifts, angles, beam and fit from the residuals."""
 
 from __future__ import annotations
 
@@ -11,22 +11,27 @@ from recon.verdict.distortions import Distortion
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
-_SCATTER, _TREND, _OFFSET = 1.4, 2.1, 2.8  # standard errors: by chance 1 ± 0.1, 1 ± 0.3 and 0 ± 1 for some forty tilts
-_PIXELS, _SMOOTH_PIXELS = 0.25, 0.13  # rms; a volume takes part of every shift into itself, so more was there
-_MAGNIFIED = 0.15  # pixels at the image's edge; standard scenes, too noisy for a trend, reach 0.11 where there is one
-_AT_ANGLES = (
-    0.9  # pixels at the image's edge from tilt to tilt; a prior that smooths the volume leaves a smooth trend alone
-)
+_SCATTER, _TREND, _OFFSET = (
+    1.4,
+    2.1,
+    2.8,
+)  # standard errors: for about forty tilts, random values are 1 ± 0.1, 1 ± 0.3 and 0 ± 1
+_PIXELS, _SMOOTH_PIXELS = 0.25, 0.13  # rms; a volume absorbs a part of every shift, so the true shifts are larger
+_MAGNIFIED = 0.15  # pixels at the image edge; standard scenes that are too noisy for a significant trend reach 0.11
+_AT_ANGLES = 0.9  # pixels at the image edge from tilt to tilt; a smoothness prior leaves only a smooth trend
 _GONIOMETER = (
-    0.0175  # radians, one degree: beyond the repeatability of a stage; of wide images a pixel is less than that
+    0.0175  # radians, one degree: more than the repeatability of a stage; for wide images a pixel corresponds to less
 )
-_TURN = 0.06  # pixels at the edge, of all images alike; standard scenes reach 0.049
-_TURN_OFFSET = 2.3  # standard errors of the same: chance gives so many once in fifty; standard scenes reach 1.03
-_OFF_MIDDLE = 0.12  # pixels, of all images alike, that the volume did not follow; standard scenes reach 0.06
-_USUAL_EDGE, _BLURRED = 24.0, 0.5  # pixels from middle to edge that these hold for; what blurs images of any size
-_BRIGHT = 0.18  # share of the contrast; total variation takes up to 0.14 from weak contrast at some tilts
-_BLOCK, _SMOOTH = 8, 0.65  # pixels; a moved or turned object leaves 0.6 at most, for residuals then lie at its edges
-_RESIDUAL = 0.06  # share of the structure that the volume leaves, beyond the contrast that its regulariser takes
+_TURN = 0.06  # pixels at the edge, common to all images; standard scenes reach 0.049
+_TURN_OFFSET = 2.3  # standard errors of the same: probability of 1 in 50 by chance; standard scenes reach 1.03
+_OFF_MIDDLE = 0.12  # pixels, common to all images, not absorbed by the volume; standard scenes reach 0.06
+_USUAL_EDGE, _BLURRED = 24.0, 0.5  # pixels from centre to edge for these limits; limit that blurs images of any size
+_BRIGHT = 0.18  # share of the contrast; total variation reduces weak contrast by up to 0.14 at some tilts
+_BLOCK, _SMOOTH = (
+    8,
+    0.65,
+)  # pixels; smooth share: shifted or rotated objects reach at most 0.6, because their residuals are at edges
+_RESIDUAL = 0.06  # unexplained share of the structure, beyond the contrast lost by regularisation
 
 
 def image_findings(residuals: Residuals, found: dict[str, Distortion]) -> tuple[dict[str, Any], list[Finding]]:
@@ -61,17 +66,17 @@ def image_findings(residuals: Residuals, found: dict[str, Distortion]) -> tuple[
 
 
 def _taken(residuals: Residuals, found: dict[str, Distortion]) -> float:
-    """Share of the structure left because the volume shows all contrast too weak: the regulariser's work, no fault of the series.
+    """Share of residual structure due to reduced contrast, caused by the regulariser and not by a defect of the series.
 
-    Only noise stronger than the contrast excuses it.
+    It is accepted only if the noise is stronger than the contrast.
     """
     missing = max(0.0, found["brightness"].mean) if residuals.noise > residuals.contrast else 0.0
     return (missing / (1 + missing)) ** 2
 
 
 def _smooth_part(residuals: Residuals) -> float:
-    """Of what neighbouring residuals share, the part that neighbouring blocks of pixels share too, and the next tilt does not: a
-    method that stops early leaves much that is smooth, at all tilts alike."""
+    """Share of correlated residuals that is smooth (common to neighbouring blocks) and differs between tilts. Early stopping also
+    leaves smooth residuals, but equal ones at all tilts."""
     height, width = residuals.residual.shape[1:]
     if min(height, width) < 2 * _BLOCK:
         return 0.0
@@ -85,7 +90,7 @@ def _smooth_part(residuals: Residuals) -> float:
 
 
 def _strength(one: Distortion, least: float, smooth: float) -> float:
-    """How far a distortion is beyond chance and beyond what matters."""
+    """Strength of a distortion, relative to limits of significance and of relevance."""
     whole = one.size / least if one.scatter > _SCATTER else 0.0
     curve = one.smooth / smooth if one.trend > _TREND else 0.0
     return max(whole, curve)
@@ -105,15 +110,15 @@ def _shifts(found: dict[str, Distortion], edge: float) -> list[Finding]:
         return []
     if off > strengths[where]:
         where, size = "across the axis", float(np.hypot(size, across.mean))
-    words = f"the images are shifted {where} against the volume, by at least {size:.2f} pixels rms"
+    words = f"the images are shifted {where} relative to the volume, by at least {size:.2f} pixels rms"
     return [
         Finding("alignment", max(strengths[where], off), words, "align the series first, or use --refine-alignment")
     ]
 
 
 def _at_edge(pixels: float, edge: float) -> float:
-    """A limit on turns, magnifications and smooth shifts, pixels: the same share of a wider image, whose tilts sample its edge
-    more coarsely alike, up to what blurs it visibly."""
+    """A limit for rotations, magnifications and smooth shifts, pixels. It is proportional to the width of the image, because
+    tilts sample its edge more coarsely, up to the limit of visible blur."""
     return max(pixels, min(_BLURRED, pixels * edge / _USUAL_EDGE))
 
 
@@ -129,7 +134,7 @@ def _geometry(found: dict[str, Distortion], edge: float) -> list[Finding]:
     if strengths[what] < 1:
         return []
     words = (
-        f"along the series the images {what} against the volume: tilt angles are wrong, the tilt axis is rotated, or the "
+        f"along the series the images {what} relative to the volume: tilt angles are wrong, the tilt axis is rotated, or the "
         "specimen or its magnification changes"
     )
     return [
@@ -146,7 +151,7 @@ def _turned(found: dict[str, Distortion], edge: float) -> list[Finding]:
     if strength < 1:
         return []
     size = max(abs(turn.mean), turn.smooth)
-    words = f"the images are rotated against the volume, by at least {size:.2f} pixels at their edge: the tilt axis is wrong"
+    words = f"the images are rotated relative to the volume, by at least {size:.2f} pixels at their edge: the tilt axis is wrong"
     return [Finding("axis", strength, words, "give --tilt-axis, or use --refine-alignment")]
 
 
@@ -156,7 +161,7 @@ def _beam(found: dict[str, Distortion]) -> list[Finding]:
     if strengths[name] < 1:
         return []
     size = max(found[name].size, found[name].smooth)
-    words = f"the {name} changes from tilt to tilt by {size:.0%} of the contrast against the volume"
+    words = f"the {name} changes from tilt to tilt by {size:.0%} of the contrast relative to the volume"
     return [Finding("beam", strengths[name], words, "normalise the images by their incident beam, or check the mode")]
 
 

@@ -1,4 +1,4 @@
-"""The verdict on a reconstruction, from its tilt series, its volume and what the volume predicts."""
+"""The verdict on a reconstruction, from its tilt series, its volume and the predicted images."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from recon.verdict.tilts import tilt_findings
 from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
-_TALL = 4  # widths: of a taller series so many slices are judged, because the rest may not fit into memory
-_FULL = 1.3  # times the mean: sections that fill their volume reach 0.85, objects cut off 1.66 and more
-_CONTRAST = 0.05  # right and inverted phantoms differ by 0.12 or more
+_TALL = 4  # widths: only this number of slices of a taller series is used, because all may not fit into memory
+_FULL = 1.3  # times the mean: sections that fill their volume reach 0.85, truncated objects 1.66 and more
+_CONTRAST = 0.05  # correct and inverted phantoms differ by at least 0.12
 
 
 def judge(
@@ -40,21 +40,21 @@ def judge(
     screening: Screening | None = None,
     alignment: Alignment | None = None,
 ) -> Verdict:
-    """Judge a volume by what its projections leave of the images, and by tilts left out in contiguous gaps.
+    """Assess a volume by the residuals of its projections, and by held-out contiguous gaps of tilts.
 
     Args:
-        tilt_series: what was reconstructed: aligned, and without the tilts that were thrown out.
-        result: volume, projections (tilt, y, u) in detector units, and noise model and history of the fit where there are any.
-        screening: of the tilts before some were thrown out.
-        alignment: of the raw images, where they were aligned.
+        tilt_series: the reconstructed series, aligned and without rejected tilts.
+        result: volume, projections (tilt, y, u) in detector units, and noise model and fit history if available.
+        screening: screening of all tilts.
+        alignment: alignment of the raw images, if they were aligned.
 
     Raises:
-        ValueError: projections of another shape than the images.
+        ValueError: projections and images differ in shape.
     """
     if result.projections.shape != tilt_series.images.shape:
         raise ValueError(
-            f"projections {result.projections.shape} do not belong to images {tilt_series.images.shape}; judge a volume "
-            "with the tilt series that it was made from"
+            f"projections {result.projections.shape} do not match images {tilt_series.images.shape}; give the tilt series "
+            "that the volume was made from"
         )
     shape = np.shape(result.volume.attenuation)
     rows = contrast_slab(tilt_series, _TALL * tilt_series.images.shape[2])
@@ -86,14 +86,14 @@ def judge(
 def _gaps(
     tilt_series: TiltSeries, expected: Array, coarse: Coarse, geometry: Geometry
 ) -> tuple[Unexplained, Unexplained]:
-    """What left-out gaps leave of the images, and what they leave of the volume's own projections, which are consistent."""
+    """Unexplained structure of held-out gaps, for the images and for the projections of the volume, which are consistent."""
     some = tilt_series.select(coarse.tilts)
     own = line_integrals(some, expected[evenly(coarse.tilts, len(expected))], coarse.binning)
     return unexplained(coarse.images, geometry.errors), unexplained(own, geometry.fit.errors(own))
 
 
 def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
-    """Whether a coarse non-negative volume explains the images better with bright and dark swapped."""
+    """Whether a coarse non-negative volume explains the images better with inverted contrast."""
     height, width = tilt_series.images.shape[1:]
     small = replace(tilt_series, images=block_means(tilt_series.images, -(-height // 16), -(-width // 32)), mask=None)
     as_given, swapped = explained(small), explained(invert_contrast(small))
@@ -102,8 +102,8 @@ def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
         return evidence, []
     other = "--mode transmission" if tilt_series.mode == "linear" else "--mode linear"
     words = (
-        f"the contrast looks inverted: a volume explains {max(as_given, 0):.0%} of the images, and {swapped:.0%} with bright and "
-        "dark swapped"
+        f"the contrast looks inverted: a volume explains {max(as_given, 0):.0%} of the images, and {swapped:.0%} with inverted "
+        "contrast"
     )
     return evidence, [
         Finding("mode", 3.0 + (swapped - as_given) / _CONTRAST, words, f"give {other}, or --invert-contrast")
@@ -111,7 +111,7 @@ def _contrast(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
-    """Whether what lies beyond the top or bottom of a thin volume was pushed into its outer layers."""
+    """Whether material beyond the top or bottom of a thin volume was projected into its outer layers."""
     depth, height, width = volume.shape
     if depth >= width:
         return {}, []
@@ -122,13 +122,13 @@ def _faces(volume: Array) -> tuple[dict[str, Any], list[Finding]]:
     words = (
         f"the volume is {densest:.1f} times as dense at its top or bottom as on average: the object extends beyond it"
     )
-    advice = "leave out --thickness, or give a larger one"
+    advice = "remove --thickness, or give a larger value"
     return {"densest face": densest}, [Finding("thickness", min(2.9, densest / _FULL), words, advice, "seen")]
 
 
 def _good(gap: Unexplained, residuals: Residuals) -> str:
     white = max(abs(value) for value in residuals.whiteness().values())
     return (
-        f"the volume explains {min(1.0, 1 - gap.share):.1%} of the structure of tilts left out in gaps, and neighbouring "
+        f"the volume explains {min(1.0, 1 - gap.share):.1%} of the structure of held-out gaps of tilts, and neighbouring "
         f"residuals correlate by at most {white:.2f}; images do not determine the sign and the zero of the tilt angles"
     )

@@ -1,4 +1,4 @@
-"""Where pixel values end: limits of the detector or of the number type that cut off what lies beyond."""
+"""Saturation and wrap-around: limits of the pixel values from the detector or the data type."""
 
 from __future__ import annotations
 
@@ -13,20 +13,24 @@ from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SATURATED = (
-    0.005  # share of pixels amid a full neighbourhood at a limit; noise about a limit fills nine with chance 2⁻⁹
-)
-_BLANK = 0.3  # the same at the end of vacuum, where a full neighbourhood loses nothing but weak contrast
-_PILE, _NEAR = 0.004, 0.05  # share of pixels at the limit of strong contrast, standard scenes 0.0003; ranges beside it
-_OF_NEAR = 0.6  # of those beside it too: noise about a limit leaves at least half of them inside
-_CLIFF, _BIN = 12.0, 0.25  # times fewer pixels above than below, standard scenes 3.2; bin in deviations of the noise
-_FEWEST, _PILED = 60, 0.5  # pixels below a cliff, so that chance makes none; share of them at one value: clipping
-_ABOVE = 0.1  # of the pixels may lie above it: steps in the middle are those of the object
+_SATURATED = 0.005  # share of pixels whose complete neighbourhood is at a limit; noise around a limit gives 2⁻⁹
+_BLANK = 0.3  # the same at the vacuum end, where a saturated neighbourhood loses only weak contrast
+_PILE, _NEAR = (
+    0.004,
+    0.05,
+)  # share of pixels at the limit of strong contrast, 0.0003 in standard scenes; neighbourhood, in ranges
+_OF_NEAR = 0.6  # share of pixels near the limit: with noise around a limit, at least half of them are inside
+_CLIFF, _BIN = (
+    12.0,
+    0.25,
+)  # ratio of pixels below to above, 3.2 in standard scenes; bin width in standard deviations of the noise
+_FEWEST, _PILED = 60, 0.5  # smallest number of pixels below a cliff; share of them at one value that means clipping
+_ABOVE = 0.1  # largest share of pixels above it: steps in the middle belong to the object
 _ADVICE = "use a series that is not saturated, or mask these parts"
 
 
 def saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Pixels at the lowest or highest value: amid others at it anywhere, or too many of them at the end of strong contrast."""
+    """Saturated pixels: complete neighbourhoods at the lowest or highest value, or too many pixels at the strong-contrast end."""
     ends = {"low": float(images.min()), "high": float(images.max())}
     empty = "low" if tilt_series.mode == "linear" else "high"
     shares = {name: float(np.mean(ndimage.minimum_filter(images == end, (1, 3, 3)))) for name, end in ends.items()}
@@ -47,7 +51,7 @@ def saturation(tilt_series: TiltSeries, images: Array, residuals: Residuals) -> 
 
 
 def _pile(images: Array, end: float) -> tuple[float, float]:
-    """Share of the pixels at an end, and their share of all that lie near it: as far as the next value at least."""
+    """Share of pixels at an end, and their share of all pixels near it (at least to the next value)."""
     away = np.abs(images - np.float32(end))
     low, high = np.quantile(images, (0.01, 0.99))
     at, next_value = away == 0, float(away[away > 0].min(initial=np.inf))
@@ -56,15 +60,15 @@ def _pile(images: Array, end: float) -> tuple[float, float]:
 
 
 def cliff(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """A value at which the brightest pixels end abruptly, without a pile: those beyond it wrapped around, or were taken out.
+    """An abrupt end of the brightest values without accumulation: brighter values wrapped around or were removed.
 
-    Noise of a width of four bins smears every edge of the object's histogram over more than one of them.
+    The noise is four bins wide and smears every edge in the histogram of the object over more than one bin.
     """
     residual = residuals.residual
     width = _BIN * 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     values, counts = np.unique(images, return_counts=True)
     if not np.median(np.diff(values[-_FEWEST:])) < width / 2:
-        return {"cliff": 0.0}, []  # a histogram of so few values has steps of its own
+        return {"cliff": 0.0}, []  # a histogram with so few values has steps of its own
     total = np.append(0, np.cumsum(counts))
     first = min(int(np.searchsorted(total, (1 - _ABOVE) * images.size)), len(values) - 1)
     tops, here = values[first:], total[first + 1 :]
@@ -77,5 +81,5 @@ def cliff(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str,
     if ratio < _CLIFF:
         return {"cliff": ratio}, []
     sentence = f"the pixel values end abruptly at {top:.4g}, as if brighter ones had wrapped around or been removed"
-    advice = "check the number type in which the images were saved"
+    advice = "check the data type in which the images were saved"
     return {"cliff": ratio}, [Finding("saturation", 2.0, sentence, advice, "seen")]

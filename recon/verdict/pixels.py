@@ -1,4 +1,4 @@
-"""What the pixels say by themselves: limits reached, dead lines, spikes, and a pattern that stays with the detector."""
+"""Findings about pixel values: saturation, dead lines, spikes, and fixed detector patterns."""
 
 from __future__ import annotations
 
@@ -14,29 +14,37 @@ from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SPIKE = 5.0  # ranges from the 0.5 to the 99.5 % quantile: noise with long tails reaches two
+_SPIKE = 5.0  # in ranges between the 0.5 and 99.5 % quantiles; noise with long tails reaches two
 _PATTERN, _PATTERN_CONTRAST = (
     1.6,
     0.02,
-)  # variance over that by chance; share of the contrast that it must reach to matter
-_ALIKE = 0.2  # of the fine pattern's variance: gains of single pixels share −0.1 or less, misfit at edges 0.4 and more
-_STEADY = 0.03  # share of the structure that all tilts' residuals hold alike; standard scenes leave up to 0.019
+)  # variance relative to that expected by chance; smallest relevant share of the contrast
+_ALIKE = 0.2  # correlation of the fine pattern: single-pixel gains have −0.1 or less, misfit at edges 0.4 and more
+_STEADY = 0.03  # share of the structure common to the residuals of all tilts; standard scenes reach 0.019
 _STEADY_CHANCE, _STEADY_PART = (
     15.0,
     0.3,
-)  # standard errors; part of the residuals' structure, 0.2 or less where tilts are moved
-_SIGNALS = 16  # bins of equal counts: finer than any smooth misfit
-_STREAK = 8.0  # usual deviations of a line's mean residual from those beside it: chance gives four among thousands
-_STREAKS = 0.002  # of all lines: one in five hundred spoils nothing
-_REGION = 0.002  # of the pixels: one in five hundred spoils nothing, and no pixel is constant by chance
-_BORDERS = 0.1  # of the images: fewer are single faults, which the screening throws out
-_SEAM, _SEAM_STEP = 12.0, 0.25  # usual steps from column to column; spreads of all pixels, 0.13 at most in good series
-_BLOCK, _BLOCKS = 8, 1.6  # pixels along a block; steps at their borders over those inside, 1.15 in good series
-_DEAD, _STEP = 0.1, 0.1  # spread of a dead line over that of others; its step to its neighbours over the range
+)  # standard errors; share of the residual structure, at most 0.2 if tilts are shifted
+_SIGNALS = 16  # number of equally populated bins: finer than smooth misfit
+_STREAK = (
+    8.0  # typical deviations of the mean residual of a line from its neighbours; by chance, four in thousands of lines
+)
+_STREAKS = 0.002  # of all lines: one in five hundred is harmless
+_REGION = 0.002  # of the pixels: one in five hundred is harmless, and no pixel is constant by chance
+_BORDERS = 0.1  # of the images: fewer are single defects, which screening removes
+_SEAM, _SEAM_STEP = (
+    12.0,
+    0.25,
+)  # typical steps between columns; in standard deviations of all pixels, at most 0.13 in good series
+_BLOCK, _BLOCKS = 8, 1.6  # block size, pixels; ratio of steps at borders to those inside, 1.15 in good series
+_DEAD, _STEP = (
+    0.1,
+    0.1,
+)  # standard deviation of a dead line relative to others; its step to its neighbours relative to the range
 
 
 def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about pixel values, on the slices of most contrast."""
+    """Evidence and findings about pixel values, from the slices with the highest contrast."""
     images = residuals.images
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
@@ -52,7 +60,7 @@ def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[
     far = float(np.mean(np.abs(images - (low + high) / 2) > _SPIKE * max(high - low, 1e-30)))
     if far == 0 or high <= low:
         return {"spikes": far}, []
-    sentence = f"{far:.2%} of the pixels lie more than {_SPIKE:g} ranges away from the others"
+    sentence = f"{far:.2%} of the pixels deviate from the others by more than {_SPIKE:g} times their range"
     strength = 1.5 + min(1.4, 500 * far)
     return {"spikes": far}, [
         Finding("outliers", strength, sentence, "mask the spikes with --mask FILE, or replace them", "seen")
@@ -67,14 +75,14 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
         if count:
             size = images.shape[1 if name == "rows" else 2]
             strength = 1.5 + min(2.0, 20 * count / size)
-            sentence = f"{count} of {size} {name} have one value in all tilts, unlike their neighbours"
+            sentence = f"{count} of {size} {name} have a constant value in all tilts, unlike their neighbours"
             findings.append(Finding("lines", strength, sentence, "mask them with --mask FILE", "seen"))
     return {"dead lines": dead}, findings
 
 
 def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Pixels that hold one value in all tilts while others change: at a limit of the values, where vacuum or saturation may hold
-    them, only those that differ from the pixels around."""
+    """Pixels with a constant value in all tilts. At a limit of the values, where vacuum or saturation may be the cause, only
+    pixels that differ from their surroundings count."""
     ends = float(images.min()), float(images.max())
     constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(
         0
@@ -90,13 +98,13 @@ def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
     share = float(dead.mean())
     if constant.all() or share < _REGION:
         return {"dead pixels": share}, []
-    sentence = f"{share:.1%} of the pixels have one value in all tilts, unlike those around them"
+    sentence = f"{share:.1%} of the pixels have a constant value in all tilts, unlike those around them"
     strength = 1.5 + min(1.4, 10 * share)
     return {"dead pixels": share}, [Finding("lines", strength, sentence, "mask them with --mask FILE", "seen")]
 
 
 def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Rows or columns of single images whose mean residual is off from those beside it by as much as the projections vary."""
+    """Rows or columns of single images whose mean residual differs from their neighbours by as much as the projections vary."""
     counts = {}
     for name, axis in (("rows", 2), ("columns", 1)):
         means = residuals.residual.mean(axis)
@@ -107,14 +115,14 @@ def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     share = counts[name] / residuals.residual[..., 0].size
     if share < _STREAKS:
         return {"streaks": counts}, []
-    sentence = f"{counts[name]} {name} of single images differ from those beside them"
-    advice = "mask them with --mask FILE, or leave these images out"
+    sentence = f"{counts[name]} {name} of single images differ from their neighbours"
+    advice = "mask them with --mask FILE, or exclude these images"
     return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
 
 def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Sides of single images that hold one value, unlike the pixels beside them: what an alignment moved in from outside."""
-    if tilt_series.mask is not None:  # what was moved in is known
+    """Borders of single images with a constant value, unlike the adjacent pixels, as left by an alignment."""
+    if tilt_series.mask is not None:  # borders are masked
         return {}, []
     span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
     sides = [
@@ -126,12 +134,14 @@ def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dic
     evidence = {"filled borders": share}
     if share < _BORDERS:
         return evidence, []
-    sentence = f"{share:.0%} of the images have borders of one value, up to {filled.max():.0f} pixels wide on average"
+    sentence = (
+        f"{share:.0%} of the images have borders with a constant value, up to {filled.max():.0f} pixels wide on average"
+    )
     return evidence, [Finding("lines", 2.0, sentence, "mask these borders with --mask FILE", "seen")]
 
 
 def _filled(lines: Array, span: float) -> Array:
-    """(tilt,) how many of the first lines hold one value that the line after them does not come near."""
+    """(tilt,) number of leading lines with a constant value that differs clearly from the next line."""
     flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
     count = np.argmin(flat, axis=1)
     after = lines[np.arange(len(lines)), count].mean(1)
@@ -139,14 +149,14 @@ def _filled(lines: Array, span: float) -> Array:
 
 
 def _dead(lines: Array, span: float) -> int:
-    """Lines that hardly vary and stand apart from their neighbours."""
+    """Number of lines that hardly vary and differ from their neighbours."""
     spread, mean = lines.std((1, 2)), lines.mean((1, 2))
     apart = np.abs(mean - ndimage.median_filter(mean, 5, mode="nearest")) > _STEP * span
     return int((apart & (spread < _DEAD * np.median(spread))).sum())
 
 
 def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """A step between two columns that stays where it is in the mean of all tilts, which smear every edge of an object."""
+    """A step between two columns in the mean of all tilts, in which edges of the object are smeared out."""
     steps = np.diff(images.mean((0, 1), dtype=np.float64))
     apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
     usual, where = 1.4826 * float(np.median(apart)), int(np.argmax(apart))
@@ -161,7 +171,7 @@ def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], 
 
 
 def _blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Steps at the borders of blocks of pixels, along y and u: what lossy compression of photographs leaves."""
+    """Steps at the borders of pixel blocks, along y and u, from lossy compression such as JPEG."""
     ratios = []
     for axis in (1, 2):
         steps = np.abs(np.diff(images, axis=axis)).mean((0, 3 - axis), dtype=np.float64)
@@ -177,7 +187,7 @@ def _blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any]
 
 
 def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Fine structure of the residuals' mean over the tilts, against what independent tilts would leave."""
+    """Fine structure of the mean residual over the tilts, compared with that expected for independent tilts."""
     fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
     mean = fine.mean(0, keepdims=True)
     steady = float(np.var(mean))
@@ -194,7 +204,7 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     if ratio < _PATTERN or size < _PATTERN_CONTRAST or alike > _ALIKE:
         return evidence, []
     sentence = (
-        f"the residuals contain a pattern of the detector: {size:.1%} of the contrast, {ratio:.1f} times that of chance"
+        f"the residuals contain a fixed detector pattern: {size:.1%} of the contrast, {ratio:.1f} times that of chance"
     )
     return evidence, [
         Finding("pattern", min(2.9, ratio / _PATTERN), sentence, "correct the images with flats and darks first")
@@ -202,7 +212,7 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
 
 
 def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Smooth structure that stays where it is in all residuals: illumination or a detector that is not flat."""
+    """Smooth structure common to all residuals: uneven illumination or detector response."""
     residual = residuals.residual - _by_signal(images - residuals.residual, residuals.residual)
     mean = residual.mean(0, keepdims=True)
     steady, power = neighbours(mean, 1), float(np.mean(residual**2))
@@ -218,7 +228,7 @@ def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
 
 
 def _by_signal(signal: Array, residual: Array) -> Array:
-    """The mean residual at each pixel's signal: clipping that a method does not know leaves one, wherever the pixel lies."""
+    """The mean residual at each pixel's signal, as caused by clipping that a method does not model."""
     edges = np.quantile(signal, np.linspace(0, 1, _SIGNALS + 1)[1:-1])
     bins = np.searchsorted(edges, signal)
     counts = np.bincount(bins.ravel(), minlength=_SIGNALS)

@@ -1,4 +1,4 @@
-"""What the images still share with each other after the volume's projections are taken away."""
+"""Residuals of the projections of a volume, and their correlations."""
 
 from __future__ import annotations
 
@@ -13,19 +13,17 @@ from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[Any]
-_MOST_PIXELS = (
-    4_000_000  # of a large series, the slices of most contrast: more pixels only sharpen what is sharp already
-)
+_MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Images and projections of the slices of most contrast, in order of the tilt angle.
+    """Images and projections of the slices with the highest contrast, sorted by tilt angle.
 
     Attributes:
-        images, projections: (tilt, y, u) detector units, and their difference `residual`, zero where masked.
+        images, projections: (tilt, y, u) detector units; their difference is `residual`, zero where masked.
         tilt_angles: (tilt,) degrees, ascending.
-        height: (y,) pixels from the middle of the whole images.
+        height: (y,) pixels from the centre of the whole images.
     """
 
     images: Array
@@ -36,7 +34,7 @@ class Residuals:
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, projections: Array | Callable[[slice], Array]) -> Residuals:
-        """The residuals of a series under the projections of its volume, (tilt, y, u), or what gives those of some rows."""
+        """The residuals of a series, from projections (tilt, y, u) of its volume, or a function that returns some rows."""
         count, height, width = tilt_series.images.shape
         rows = contrast_slab(tilt_series, max(8, _MOST_PIXELS // (count * width)))
         order = np.argsort(tilt_series.tilt_angles, kind="stable")
@@ -60,9 +58,10 @@ class Residuals:
         return float(self.residual.std())
 
     def unexplained(self) -> tuple[float, float]:
-        """Power that residuals share with their neighbours, over that of the images, and its standard error by chance.
+        """Power common to neighbouring residuals, relative to that of the images, and its standard error for white noise.
 
-        White noise shares none. The larger of both directions counts: what is broken from row to row shows along u alone.
+        White noise does not contribute. The larger value of both directions is returned, because structure that changes from
+        row to row is correlated only along u.
         """
         flat = self.images - self.images.mean()
         power, chance = float(np.mean(self.residual**2)), np.sqrt(self.residual.size)
@@ -81,6 +80,6 @@ class Residuals:
 
 
 def neighbours(images: Array, axis: int) -> float:
-    """Mean product of neighbouring pixels of (tilt, y, u) images along an axis; zero where there is one pixel alone."""
+    """Mean product of neighbouring pixels of (tilt, y, u) images along an axis; zero if the axis has one pixel."""
     along = np.moveaxis(images, axis, 0)
     return float(np.mean(along[1:] * along[:-1])) if len(along) > 1 else 0.0

@@ -1,4 +1,4 @@
-"""Whether some tilts are blurred against others: by the masses of the rows, which no tilt changes, and by steps in sharpness."""
+"""Detection of blur that differs between tilts, from the row sums, which tilting preserves, and from steps in sharpness."""
 
 from __future__ import annotations
 
@@ -14,23 +14,30 @@ from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SMALLEST = 40  # pixels along y: of 512 good series the only ones that seemed blurred by chance had 24 or 32
+_SMALLEST = 40  # pixels along y: among 512 good series, the only false positives had 24 or 32
 _GROWTH, _GROWTH_SCORE = (
     2.5,
     2.8,
-)  # pixels² of variance from 0° to 90°; standard errors: chance gives one in four hundred
-_SCALES, _ALIKE, _BETTER = (0.5, 0.7, 1.4, 2.0), 0.9, 0.1  # correlation of rows; beyond that at one magnification
-_RUN, _SPAN = 8, 30.0  # tilts before and after a step, and degrees at most: over more, good slabs change by 0.77
-_STEP, _STEP_SCORE = 0.75, 4.0  # share of the fine structure that is lost, good series 0.68; standard errors
-_LAGS = (1, 4)  # pixels: what is shared so far is free of white noise, and what is lost in between is fine structure
-_ADVICE = "leave out the blurred tilts, or blur all tilts equally"
+)  # pixels² of variance from 0° to 90°; standard errors, with a probability of 1 in 400 by chance
+_SCALES, _ALIKE, _BETTER = (
+    (0.5, 0.7, 1.4, 2.0),
+    0.9,
+    0.1,
+)  # magnifications; correlation of rows; improvement over equal magnification
+_RUN, _SPAN = (
+    8,
+    30.0,
+)  # tilts before and after a step, within this range in degrees; over larger ranges, good slabs change by 0.77
+_STEP, _STEP_SCORE = 0.75, 4.0  # lost share of the fine structure, up to 0.68 in good series; standard errors
+_LAGS = (1, 4)  # pixels: correlations at these lags exclude white noise, and their difference is fine structure
+_ADVICE = "exclude the blurred tilts, or blur all tilts equally"
 
 
 def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings about blur that differs from tilt to tilt.
 
-    A volume follows most of such a blur: each tilt alone says how sharp it is in its own direction. Only the sum of each row of
-    line integrals is common to all tilts, and neighbouring tilts, which show nearly the same.
+    A volume absorbs most of such a blur, because each tilt determines the sharpness in its own direction. The test therefore uses
+    the sums of rows of line integrals, which are common to all tilts, and neighbouring tilts, which are nearly equal.
     """
     if residuals.images.shape[1] < _SMALLEST:
         return {}, []
@@ -44,7 +51,7 @@ def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[d
         findings.append(Finding("resolution", min(2.9, growth / _GROWTH), words, _ADVICE))
     if step > _STEP:
         words = (
-            f"between {angles[where - 1]:g}° and {angles[where]:g}° the fine structure changes by {min(step, 1):.0%}: tilts to "
+            f"between {angles[where - 1]:g}° and {angles[where]:g}° the fine structure changes by {min(step, 1):.0%}: tilts on "
             "one side are out of focus"
         )
         findings.append(Finding("resolution", min(2.9, 1 + (step - _STEP) / (1 - _STEP)), words, _ADVICE))
@@ -52,7 +59,7 @@ def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[d
 
 
 def _magnified(masses: Array) -> list[Finding]:
-    """Whether the rows of both halves of the series agree at another magnification alone, by their sums (tilt, y)."""
+    """Whether the row sums (tilt, y) of both halves of the series agree only at different magnifications."""
     half = len(masses) // 2
     first, second = masses[:half].mean(0), masses[half:].mean(0)
     y = np.arange(len(first)) - (len(first) - 1) / 2
@@ -65,11 +72,11 @@ def _magnified(masses: Array) -> list[Finding]:
     if alike(best) < max(_ALIKE, alike(1.0) + _BETTER):
         return []
     words = f"the second half of the tilts shows the specimen {best:g} times as large as the first"
-    return [Finding("magnification", 6.0, words, "bring all images to one pixel size", "seen")]
+    return [Finding("magnification", 6.0, words, "rescale all images to one pixel size", "seen")]
 
 
 def _integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
-    """(tilt, y, u) line integrals in order of the angle, with what is masked as the volume predicts it."""
+    """(tilt, y, u) line integrals sorted by angle; masked pixels are replaced by the prediction of the volume."""
     images = residuals.projections + residuals.residual
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     beam = None if tilt_series.beam is None else tilt_series.beam[order]
@@ -78,9 +85,9 @@ def _integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
 
 
 def blurs(images: Array) -> tuple[Array, Array]:
-    """(tilt,) half the variance of a blur along y, pixels², against the mean of all tilts, and its standard errors.
+    """(tilt,) half the variance of a blur along y, pixels², relative to the mean of all tilts, and its standard errors.
 
-    The sums of rows are regressed on the mean of all tilts, its slope and its curvature, with White's errors.
+    Row sums are regressed on the mean of all tilts, its slope and its curvature, with White's standard errors.
     """
     masses = images.sum(2)
     mean = masses.mean(0)
@@ -99,7 +106,7 @@ def blurs(images: Array) -> tuple[Array, Array]:
 
 
 def _growth(values: Array, errors: Array, angles: Array) -> tuple[float, float]:
-    """Variance of the blur that grows with sin² of the tilt, pixels², and the same in standard errors."""
+    """Variance of a blur proportional to sin² of the tilt, pixels², and the same in standard errors."""
     place, weights = np.sin(np.deg2rad(angles)) ** 2, 1 / errors**2
     place = place - (weights * place).sum() / weights.sum()
     known = float((weights * place**2).sum())
@@ -108,7 +115,7 @@ def _growth(values: Array, errors: Array, angles: Array) -> tuple[float, float]:
 
 
 def _step(images: Array, angles: Array) -> tuple[float, int]:
-    """The largest share of fine structure that is lost from one run of tilts to the next, where it is beyond chance."""
+    """The largest significant loss of fine structure from one range of tilts to the next, as a share, and its position."""
     flat = images - images.mean((1, 2), keepdims=True)
     near, far = (_shared(flat, lag) for lag in _LAGS)
     fine = near - far
@@ -125,7 +132,7 @@ def _step(images: Array, angles: Array) -> tuple[float, int]:
 
 
 def _shared(images: Array, lag: int) -> Array:
-    """(tilt,) mean product of pixels so far apart, along y and along u."""
+    """(tilt,) mean product of pixels at a distance of `lag`, along y and along u."""
     along_y = (images[:, lag:] * images[:, :-lag]).mean((1, 2))
     along_u = (images[:, :, lag:] * images[:, :, :-lag]).mean((1, 2))
     return np.asarray((along_y + along_u) / 2)

@@ -1,4 +1,4 @@
-"""What the list of tilts says: range, gaps, steps, images given twice, images that do not belong to their angle."""
+"""Findings about the tilts: range, gaps, steps, duplicate images, images that do not match their angle."""
 
 from __future__ import annotations
 
@@ -17,21 +17,25 @@ from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_WEDGE, _GAP, _FEWEST = 90.0, 15.0, 20  # degrees without data: with more, most directions are guessed; tilts
-_LEFT_OUT = 0.1  # of the tilts: so many are no exceptions
-_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # of a tilt's own structure that the others predict; of the tilts
-_BLANK = 0.3  # of the structure of the tilts beside it: less is none, and nothing can be predicted
-_TWINS = 0.2  # of the structure: twins show the same object but for noise
-_JUMP, _AROUND = 3.0, 9  # times the change between the tilts around, and of how many; good series reach 0.9
-_JUMP_SHARE = 0.1  # of the images' structure; what an alignment leaves in a quiet needle is 0.001
+_WEDGE, _GAP, _FEWEST = (
+    90.0,
+    15.0,
+    20,
+)  # degrees without data, above which most directions are not measured; gap, degrees; smallest number of tilts
+_LEFT_OUT = 0.1  # of the tilts: too many for exceptions
+_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # share of a tilt's structure that the others predict; share of the tilts
+_BLANK = 0.3  # of the structure of neighbouring tilts: an image with less is blank and cannot be predicted
+_TWINS = 0.2  # of the structure: duplicates differ only by noise
+_JUMP, _AROUND = 3.0, 9  # relative to the change between surrounding tilts, and their number; good series reach 0.9
+_JUMP_SHARE = 0.1  # of the structure of the images; remaining misalignment of a low-noise needle gives 0.001
 _RADIANS = 1.6
-_DRIFT = 0.2  # of the beam: the fit follows a drift, but not exactly
+_DRIFT = 0.2  # relative beam drift: the fit follows it, but not exactly
 
 
 def tilt_findings(
     tilt_series: TiltSeries, coarse: Coarse, geometry: Geometry, screening: Screening | None
 ) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about the tilts; `geometry` holds what others predict of them."""
+    """Evidence and findings about the tilts; `geometry` provides their prediction from the others."""
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
     for found, finding in (
@@ -66,7 +70,7 @@ def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
         words = f"all tilt angles lie within ±{np.abs(angles).max():.2f}°, as if they were radians"
         findings.append(Finding("angles", 10.0, words, "give the tilt angles in degrees", "seen"))
     if wedge > _WEDGE:
-        words = f"{wedge:.0f}° of 180° have no tilt, so most directions of the volume are not measured"
+        words = f"{wedge:.0f}° of 180° have no tilts, so most directions of the volume are not measured"
         findings.append(
             Finding("range", wedge / _WEDGE, words, "add tilts, or trust only structures that face the beam", "seen")
         )
@@ -84,7 +88,7 @@ def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
-    """Images that are equal to the last pixel: no two exposures are, if there is any noise."""
+    """Exactly equal images, which noise excludes for separate exposures."""
     groups: dict[bytes, int] = {}
     for image in tilt_series.images:
         key = np.ascontiguousarray(image).tobytes()
@@ -94,12 +98,12 @@ def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
         return {"repeated images": 0}, []
     share = repeated / tilt_series.num_tilts
     words = f"{repeated} of {tilt_series.num_tilts} images are exact copies of another image"
-    finding = Finding("repeats", min(2.9, 1 + 3 * share), words, "leave the copies out", "seen")
+    finding = Finding("repeats", min(2.9, 1 + 3 * share), words, "remove the copies", "seen")
     return {"repeated images": repeated}, [finding]
 
 
 def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
-    """Images at one angle must differ by noise alone, which neighbouring rows do not share."""
+    """Images at the same angle must differ only by noise, which is independent between neighbouring rows."""
     order = coarse.order
     close = np.diff(coarse.tilt_angles[order]) < 0.02
     if not close.any() or coarse.images.shape[1] < 2:
@@ -119,9 +123,9 @@ def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
-    """Neighbouring tilts that differ far more than those around them: one object turns smoothly.
+    """Neighbouring tilts that differ much more than those around them, although a rotating object changes smoothly.
 
-    What neighbouring rows of the difference share is free of noise; it grows with the square of the step.
+    The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
     images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
     apart = np.diff(angles) > 0.02
@@ -133,7 +137,7 @@ def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
     whole = max(neighbours(images - images.mean(), 1), 1e-30)
     large = shared * steps**2 > _JUMP_SHARE * whole
-    ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # copies leave usual at zero
+    ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # exact copies give usual = 0
     largest = int(np.argmax(ratios))
     evidence = {"largest jump": float(ratios[largest])}
     if ratios[largest] < _JUMP:
@@ -148,7 +152,7 @@ def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
 
 
 def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
-    """Tilts of which the others predict far less than of the rest, by what predicted and measured rows share."""
+    """Tilts that the others predict much worse than the rest, by the structure common to predicted and measured rows."""
     if coarse.images.shape[1] < 2:
         return {}, []
     measured, predicted = (each - each.mean((1, 2), keepdims=True) for each in (coarse.images, coarse.images - errors))
@@ -166,7 +170,7 @@ def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Findin
         return evidence, []
     named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[foreign][:5])
     words = f"{int(foreign.sum())} of {len(foreign)} tilts hardly resemble the prediction from the others ({named} …)"
-    advice = "look at these images and their angles, or leave them out"
+    advice = "check these images and their angles, or exclude them"
     return evidence, [Finding("tilts", min(4.0, 1 + share / _LEFT_OUT), words, advice)]
 
 
@@ -178,7 +182,7 @@ def _screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding
     findings = []
     if share > _LEFT_OUT:
         words = (
-            f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were left out because they do not fit the others"
+            f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were excluded because they do not fit the others"
         )
         findings.append(
             Finding(

@@ -1,4 +1,4 @@
-"""The verdict on a reconstruction: a grade, its reasons in sentences, and the evidence in numbers."""
+"""The verdict on a reconstruction: a grade, its reasons, and the numerical evidence."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from recon.series.tilt_series import Volume
 Grade = Literal["good", "doubtful", "bad"]
 Kind = Literal["seen", "inferred", "general"]
 _KINDS = ("seen", "inferred", "general")
-BAD = 3.0  # a finding this many times beyond what is tolerable: no part of the volume is safe from it
-_TOLD = 4  # reasons: whoever mends the first ones judges again
+BAD = 3.0  # strength of a finding that may affect every part of the volume
+_TOLD = 4  # largest number of reasons; after fixing the first ones, the volume is assessed again
 
 
 class Result(Protocol):
-    """What of a reconstruction is judged: every method's result has it."""
+    """The parts of a reconstruction that are assessed; every method provides them."""
 
     @property
     def volume(self) -> Volume: ...
@@ -34,14 +34,14 @@ class Result(Protocol):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong.
+    """One problem of a reconstruction.
 
     Attributes:
         subject: one word for programs, such as ``axis`` or ``alignment``.
-        strength: how far beyond what is tolerable, 1 where it begins; findings of `BAD` and more are bad.
-        sentence: what was found, with its numbers.
+        strength: size relative to the tolerable limit (1 at the limit); findings of at least `BAD` are bad.
+        sentence: description with numbers.
         advice: what to try.
-        kind: ``seen`` in the files themselves, ``inferred`` from contradictions, or ``general``, which names no cause.
+        kind: ``seen`` in the files, ``inferred`` from inconsistencies, or ``general`` without a specific cause.
     """
 
     subject: str
@@ -52,19 +52,19 @@ class Finding:
 
     @property
     def bad(self) -> bool:
-        """Whether it spoils the whole volume."""
+        """Whether it affects the whole volume."""
         return self.strength >= BAD
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far to trust a volume.
+    """The assessment of a volume.
 
     Attributes:
         grade: ``good``, ``doubtful`` or ``bad``.
-        reasons: sentences, what is seen first, then what is inferred, the strongest first; of a good volume, what was checked.
-        evidence: the numbers, by name.
-        findings: what the reasons stand for.
+        reasons: sentences, seen findings first, then inferred ones, strongest first; for a good volume, the checks.
+        evidence: numbers by name.
+        findings: the findings behind the reasons.
     """
 
     grade: Grade
@@ -74,20 +74,20 @@ class Verdict:
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """Subjects of the findings, the strongest first."""
+        """Subjects of the findings, strongest first."""
         return tuple(finding.subject for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """For programs: grade, reasons and evidence."""
+        """Grade, reasons and evidence, JSON-serialisable."""
         return {"grade": self.grade, "reasons": list(self.reasons), "evidence": self.evidence}
 
     def lines(self) -> list[str]:
-        """For a terminal."""
+        """Lines of text for a terminal."""
         return [f"verdict: {self.grade}", *(f"  - {reason}" for reason in self.reasons)]
 
 
 def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str) -> Verdict:
-    """The verdict that findings add up to; `good` is the sentence where there are none."""
+    """The verdict from findings; `good` is the sentence if there are none."""
     real = (each for each in findings if each.strength >= 1)
     found = sorted(real, key=lambda each: (_KINDS.index(each.kind), -each.strength))
     if not found:
@@ -95,7 +95,7 @@ def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: s
     first = _unrepeated(found)[:_TOLD]
     reasons = [f"{each.sentence}; {each.advice}" for each in first]
     worst = next((each for each in first if each.bad), None)
-    if worst is not None:  # what to try stands before everything else
+    if worst is not None:  # the advice comes first
         number = first.index(worst)
         reasons[number] = worst.sentence
         reasons[0] = f"{_capital(worst.advice)}: {_small(reasons[0])}"
@@ -103,7 +103,7 @@ def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: s
 
 
 def _unrepeated(findings: list[Finding]) -> list[Finding]:
-    """The strongest of each subject."""
+    """The strongest finding of each subject."""
     first: dict[str, Finding] = {}
     for finding in findings:
         first.setdefault(finding.subject, finding)

@@ -153,11 +153,16 @@ def _real_jpeg(quality: int) -> Callable[[np.random.Generator, sim.Image], tuple
 
 
 def _burst(
-    seed: int, number: int, frame: Callable[[np.random.Generator, sim.Image], sim.Image], **case: object
+    seed: int,
+    number: int,
+    frame: Callable[[np.random.Generator, sim.Image], sim.Image],
+    *,
+    size: int = 128,
+    **case: object,
 ) -> Case:
-    """A burst of `number` equal exposures of 128² pixels."""
+    """A burst of `number` equal exposures."""
     generator = np.random.default_rng(seed)
-    scene = sim.random_scene(generator, 128)
+    scene = sim.random_scene(generator, size)
     return replace(Case(np.stack([frame(generator, scene) for _ in range(number)])), **case)  # type: ignore[arg-type]
 
 
@@ -291,7 +296,7 @@ CASES: dict[str, Maker] = {
     ),
     "burst of 8, image lag of 5 %": _lagging,
     "burst of 8, filtered by 0.3 pixels": lambda s: _burst(
-        s, 8, lambda g, x: np.round(_blur(0.3)(exposed(g, x, rounded=False)))
+        s, 8, lambda g, x: np.round(_blur(0.3)(exposed(g, x, rounded=False))), size=256
     ),
     "two converters joined at 800 counts": lambda s: pair(
         s, lambda g, x: (joined(800.0)(g, x), joined(800.0)(g, RATIO * x))

@@ -219,7 +219,7 @@ def test_interrupt_leaves_no_file_and_says_so(folder, capsys, monkeypatch, part)
     monkeypatch.setattr(f"calibration.pipeline.{part}", interrupted)
     files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/out/m.safetensors")
     assert run(*files, "--report", f"{folder}/out/report") == 130
-    assert "the same command starts again" in capsys.readouterr().err
+    assert "run the same command to start again" in capsys.readouterr().err
     assert list((folder / "out").iterdir()) == []
 
 

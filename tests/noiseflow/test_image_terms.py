@@ -135,11 +135,11 @@ def test_map_of_variance_needs_a_model_with_read_noise() -> None:
     ("arguments", "message"),
     [
         ({}, "give a gain or an offset map"),
-        ({"gain": torch.ones(3, 4), "offset": torch.zeros(4, 3)}, "of one size"),
+        ({"gain": torch.ones(3, 4), "offset": torch.zeros(4, 3)}, "of equal size"),
         ({"gain": torch.zeros(3, 4)}, "not positive"),
         ({"offset": torch.full((3, 4), math.nan)}, "NaN"),
         ({"gain": torch.ones(3, 4), "variance": torch.zeros(3, 4)}, "not positive"),
-        ({"gain": torch.ones(3, 4), "variance": torch.ones(4, 3)}, "of one size"),
+        ({"gain": torch.ones(3, 4), "variance": torch.ones(4, 3)}, "of equal size"),
     ],
 )
 def test_impossible_maps_are_refused(arguments: dict[str, torch.Tensor], message: str) -> None:
@@ -150,9 +150,9 @@ def test_impossible_maps_are_refused(arguments: dict[str, torch.Tensor], message
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (WithMaps(Gaussian(), torch.ones(3, 4)), "a gain and an offset of its own"),
+        (WithMaps(Gaussian(), torch.ones(3, 4)), "its own gain and offset"),
         (ScanNoise(Gaussian()), "every row of the image has an offset"),
-        (SplineFlow(neighbourhood=3), "looks at 3 x 3 pixels"),
+        (SplineFlow(neighbourhood=3), "uses 3 x 3 pixels"),
     ],
 )
 def test_flat_signals_are_refused(model: torch.nn.Module, message: str) -> None:

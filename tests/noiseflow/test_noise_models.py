@@ -128,7 +128,7 @@ def test_digitised_masses_sum_to_one() -> None:
 
 @pytest.mark.parametrize(("step", "low", "high"), [(-1.0, 0.0, 1.0), (1.0, 2.0, 1.0)])
 def test_digitised_refuses_impossible_settings(step: float, low: float, high: float) -> None:
-    with pytest.raises(ValueError, match=r"step is|low clipping limit must lie below"):
+    with pytest.raises(ValueError, match=r"step is|low clipping limit must be below"):
         noiseflow.Digitised(noiseflow.Gaussian(), step=step, low=low, high=high)
 
 

@@ -31,8 +31,8 @@ def at(images, value, count=7):
 @pytest.mark.parametrize(
     ("damage", "options", "words"),
     [
-        (lambda i, a: (i, a[:-1]), [], "13 images and there are 12"),
-        (lambda i, a: (i, np.append(a, 70)), [], "13 images and there are 14"),
+        (lambda i, a: (i, a[:-1]), [], "13 images, but there are 12"),
+        (lambda i, a: (i, np.append(a, 70)), [], "13 images, but there are 14"),
         (lambda i, a: (i, np.zeros_like(a)), [], "different angles"),
         (lambda i, a: (i[:1], a[:1]), [], "at least two tilts"),
         (lambda i, a: (i[0], a), [], "one image"),
@@ -58,14 +58,14 @@ def test_impossible_series_gives_one_line_and_no_volume(images, tmp_path, refuse
     [
         (lambda i, a: (i, np.deg2rad(a)), [], "radians"),
         (lambda i, a: (np.concatenate([i, i[:1]]), np.append(a, a[0])), [], "more than once"),
-        (lambda i, a: (i[::-1][[3, 1, 2, 0, *range(4, 13)]], a[::-1][[3, 1, 2, 0, *range(4, 13)]]), [], "not in order"),
+        (lambda i, a: (i[::-1][[3, 1, 2, 0, *range(4, 13)]], a[::-1][[3, 1, 2, 0, *range(4, 13)]]), [], "not sorted"),
         (lambda i, a: (1 - i, a), [], "--invert-contrast"),
-        (lambda i, a: (at(i, 1e5, 1), a), [], "farther out"),
+        (lambda i, a: (at(i, 1e5, 1), a), [], "deviate a hundred times"),
         (lambda i, a: (i, a), ["--mode", "linear"], "--mode transmission"),
         (
             lambda i, a: (np.concatenate([i, np.full_like(i[:1], np.nan)]), np.append(a, 70)),
             ["--mask-nan"],
-            "left out: 70",
+            "excluded: 70",
         ),
     ],
 )

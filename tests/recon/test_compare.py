@@ -92,7 +92,7 @@ def test_what_cannot_be_compared_gets_one_clear_line(volumes, tmp_path):
         run_command("compare", a, write(tmp_path / "small.mrc", truth[..., :20]))
     with pytest.raises(ValueError, match="10 Å in the volume and 12 Å"):
         run_command("compare", a, write(tmp_path / "coarse.mrc", noisy, voxel_size=12.0))
-    with pytest.raises(ValueError, match="volume \\(z, y, x\\) is needed"):
+    with pytest.raises(ValueError, match="give a volume \\(z, y, x\\)"):
         run_command("compare", a, write(tmp_path / "image.mrc", truth[0]))
     with pytest.raises(ValueError, match="flat"):
         run_command("compare", a, write(tmp_path / "flat.mrc", np.ones_like(truth)))

@@ -1,4 +1,4 @@
-"""What a volume is expected to look like before any data is seen, one file each."""
+"""Regularisers of volumes, one file each."""
 
 import lazy_loader as _lazy
 

@@ -1,4 +1,4 @@
-"""The names of all regularisers, without importing any: modules of this folder without an underscore, but the contract."""
+"""Names of all regularisers, without importing them: modules of this folder without underscore, except the base class."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from noiseflow.plugins import plugins
 
 GROUP = "noiseflow.regularisers"
 DEFAULT = "directional"
-"""In 25 scenes of 96³ it gains over total variation in every one (`docs/benchmarks/priors.md`)."""
+"""The default; better than total variation in all of 25 scenes of 96³ (`docs/benchmarks/priors.md`)."""
 
 
 def regulariser_names() -> list[str]:
-    """All regularisers: those of this package, then those of others (entry points ``noiseflow.regularisers``)."""
+    """All regularisers of this package, then those of other packages (entry points ``noiseflow.regularisers``)."""
     own = [module.name for module in iter_modules([str(Path(__file__).parent)])]
     names = sorted(name.replace("_", "-") for name in own if not name.startswith("_") and name != "base")
     return [DEFAULT, *(name for name in names if name != DEFAULT), *sorted(plugins(GROUP))]

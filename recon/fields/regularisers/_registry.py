@@ -1,4 +1,4 @@
-"""How a regulariser is found by its name."""
+"""Look-up of regularisers by name."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from recon.fields.regularisers.base import Regulariser
 
 
 def find_regulariser(name: str) -> Regulariser:
-    """The regulariser of a name, with its own settings.
+    """Create the regulariser with a given name, with its default settings.
 
     Raises:
-        ValueError: there is none.
-        TypeError: an entry point of that name makes something else.
+        ValueError: the name is unknown.
+        TypeError: the entry point with that name does not create a regulariser.
     """
     if name not in regulariser_names():
         raise ValueError(f"--regulariser {name}: choose one of {', '.join(regulariser_names())}")
@@ -23,7 +23,6 @@ def find_regulariser(name: str) -> Regulariser:
     made = import_module(own).REGULARISER() if other is None else load_plugin(other)()
     if not isinstance(made, Regulariser):
         raise TypeError(
-            f"regulariser {name} is a {type(made).__name__}; a regulariser derives from "
-            "recon.fields.regularisers.Regulariser"
+            f"regulariser {name} is a {type(made).__name__}; derive it from recon.fields.regularisers.Regulariser"
         )
     return made

@@ -1,4 +1,4 @@
-"""Variation of first and second order: volumes of few faces, which may be curved and shaded."""
+"""First- and second-order variation, for volumes with few faces, which may be curved or have gradients."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from recon.projection.saved_gradient import SavedGradient
 
 
 class SecondOrderVariation(Regulariser):
-    """Gradient and Hessian under one norm: Σ √(‖∇v‖² + c‖∇²v‖² + ε²) − ε, over √(1 + c) + √c.
+    """Joint norm of gradient and Hessian: Σ √(‖∇v‖² + c‖∇²v‖² + ε²) − ε, divided by √(1 + c) + √c.
 
-    Total variation takes a curved or shaded surface for a staircase; the Hessian (Frobenius norm, doi:10.1109/TIP.2011.2168232)
-    costs a slope nothing but its ends. Together they keep edges and leave slopes (doi:10.1007/s10851-013-0445-4). Divided so, a
-    step across a flat face costs its jump, as in total variation, and weights compare.
+    Total variation turns slopes into staircases. The Hessian (Frobenius norm, doi:10.1109/TIP.2011.2168232) penalises a slope
+    only at its ends. Together they preserve edges and slopes (doi:10.1007/s10851-013-0445-4). With this normalisation, a step
+    across a flat face costs its jump, as for total variation, so that weights are comparable.
 
     Args:
-        curvature: c, how much the Hessian counts beside the gradient.
-        smoothing: ε, changes below this, in units of the scale, count quadratically.
+        curvature: c, weight of the Hessian relative to the gradient.
+        smoothing: ε, changes below this value, in units of the scale, have quadratic cost.
 
     Raises:
-        ValueError: a smoothing that is not positive, or a negative curvature.
+        ValueError: `smoothing` is not positive, or `curvature` is negative.
     """
 
     def __init__(self, curvature: float = 1.0, smoothing: float = 0.02) -> None:
@@ -44,13 +44,13 @@ class SecondOrderVariation(Regulariser):
 
 
 class _Variation(SavedGradient):
-    """The gradient comes in the same pass, a few layers at a time; layers of vacuum cost nothing."""
+    """Computes cost and gradient in one pass, a few layers at a time; layers of vacuum are skipped."""
 
     @staticmethod
     def forward(ctx: Any, volume: Tensor, curvature: float, smoothing: float) -> Tensor:
         gradient, total, count = torch.zeros_like(volume), volume.new_zeros(()), layers(volume)
         for start in range(0, len(volume), count):
-            first, last = max(0, start - 1), start + count + 1  # a term sees one layer on either side
+            first, last = max(0, start - 1), start + count + 1  # a term depends on one layer on each side
             part = volume[first:last]
             if bool(part.any()):
                 own = slice(start - first, start - first + count)
@@ -67,7 +67,7 @@ def _add(part: Tensor, own: slice, gradient: Tensor, *, curvature: float, smooth
     squared = torch.full_like(part, smoothing**2)
     for slope in slopes:
         squared.addcmul_(slope, slope)
-    shares = [curvature * (1 if first == second else 2) for first, second in pairs]  # off the diagonal twice
+    shares = [curvature * (1 if first == second else 2) for first, second in pairs]  # off-diagonal terms count twice
     for bend, share in zip(bends, shares, strict=True):
         squared.addcmul_(bend, bend, value=share)
     magnitude = squared[own].sqrt_()
@@ -81,13 +81,13 @@ def _add(part: Tensor, own: slice, gradient: Tensor, *, curvature: float, smooth
         else:
             add_adjoint(flows[first], bend, second)
     for axis, flow in enumerate(flows):
-        inner(flow, axis, last=True).zero_()  # no difference leads beyond the edge
+        inner(flow, axis, last=True).zero_()  # there is no difference across the edge
         add_adjoint(gradient, flow, axis)
     return (magnitude - smoothing).sum()
 
 
 def _bend(slope: Tensor, first: int, second: int) -> Tensor:
-    """The second difference: along one axis, centred; along two, that of the slope along the first."""
+    """Second difference: centred along one axis; for two axes, the difference of the slope along the first."""
     if first != second:
         return difference(slope, second)
     found = slope.clone()

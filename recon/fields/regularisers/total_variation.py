@@ -1,4 +1,4 @@
-"""Total variation: volumes of few faces."""
+"""Total variation, for volumes with few faces."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class TotalVariation(Regulariser):
     """Isotropic total variation.
 
     Args:
-        smoothing: jumps below this, in units of the scale, count quadratically.
+        smoothing: jumps below this value, in units of the scale, have quadratic cost.
 
     Raises:
-        ValueError: a smoothing that is not positive.
+        ValueError: `smoothing` is not positive.
     """
 
     def __init__(self, smoothing: float = 0.02) -> None:
@@ -42,11 +42,11 @@ class TotalVariation(Regulariser):
 def total_variation(volume: Given, *, smoothing: float) -> Given:
     """Isotropic total variation of a 3D array, summed: Σ √(‖∇v‖² + ε²) − ε (doi:10.1016/0167-2789(92)90242-F).
 
-    Forward differences; the gradient is defined everywhere and comes in the same pass. A flat volume has none of either.
+    Uses forward differences. The gradient is defined everywhere and computed in the same pass. A constant volume has zero cost.
 
     Args:
         volume: (a, b, c), any axis order, a tensor or an array.
-        smoothing: ε, in the units of `volume`: jumps well below it are treated as noise to be smoothed quadratically.
+        smoothing: ε, in the units of `volume`: jumps well below it have quadratic cost.
 
     Raises:
         ValueError: `smoothing` is not positive.

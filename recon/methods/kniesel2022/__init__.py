@@ -1,4 +1,4 @@
-"""The published method of Kniesel et al. (CVPR 2022), with its own settings. It takes days where others take seconds."""
+"""The published method of Kniesel et al. (CVPR 2022), with its own settings. It takes days; other methods take seconds."""
 
 import lazy_loader as _lazy
 

@@ -14,7 +14,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
 def preset_method(name: str, description: str) -> Method:
-    """A preset of `PRESETS` as a method."""
+    """Wrap a preset of `PRESETS` as a method."""
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
         preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)

@@ -1,4 +1,4 @@
-"""The parts of Kniesel et al. (CVPR 2022): its coordinate networks, its noise model, and its sampling of rays."""
+"""Components of Kniesel et al. (CVPR 2022): coordinate networks, noise model, and ray sampling."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _PARAMETER_RANGE = 10.0
 
 
 class CoordinateDensity(nn.Module):
-    """Density in (0, 1) at points of the cube [-1, 1]³: fully connected layers on a positional encoding, sigmoid at the end.
+    """Density in (0, 1) at points of the cube [-1, 1]³: fully connected layers on a positional encoding, with a final sigmoid.
 
     Args:
-        frequencies: octaves of the encoding, sine and cosine each.
-        layers: hidden layers, ReLU between them.
-        width: of the hidden layers.
-        skip: hidden layers after which the encoding is handed in again; 0 for none.
+        frequencies: number of octaves of the encoding, with sine and cosine each.
+        layers: number of hidden layers, with ReLU activations.
+        width: width of the hidden layers.
+        skip: number of hidden layers after which the encoding is concatenated again; 0 for none.
     """
 
     def __init__(self, frequencies: int = 10, layers: int = 9, width: int = 256, skip: int = 5) -> None:
@@ -36,7 +36,7 @@ class CoordinateDensity(nn.Module):
         self.last = nn.Linear(width, 1)
 
     def forward(self, points: Tensor) -> Tensor:
-        """(..., 3) to (...)."""
+        """Density (...) at points (..., 3)."""
         encoded = self.encode(points)
         values = encoded
         for index, layer in enumerate(self.hidden):
@@ -53,12 +53,12 @@ class CoordinateDensity(nn.Module):
 
 
 class PaperFlow(ArrayModel):
-    """Radial layers on the residual, of which the later ones take their parameters from the signal by a small network.
+    """Radial layers on the residual; small networks compute the parameters of the later ones from the signal.
 
     Args:
-        layers: not conditioned, and as many conditioned ones.
+        layers: number of unconditional layers, followed by the same number of conditional layers.
         width: hidden units of each conditioning network.
-        normalised: True evaluates each layer's log-derivative at its input, so that the density integrates to one; False
+        normalised: True evaluates the log-derivative of each layer at its input, so that the density integrates to one; False
             evaluates it at its output, as the released code does.
     """
 
@@ -71,18 +71,18 @@ class PaperFlow(ArrayModel):
         )
 
     def forward(self, signal: Tensor) -> PaperFlowDistribution:
-        """The distribution of observations of pixels with the given signals, any shape, incident intensities."""
+        """The distribution of the observations, given signals of any shape, in units of the incident intensity."""
         rows = [*self.free, *(_PARAMETER_RANGE * network(signal[..., None]) for network in self.networks)]
         return PaperFlowDistribution(signal, [_radial(row) for row in rows], self.normalised)
 
 
 def _radial(raw: Tensor) -> Radial:
-    """Centre, log α and softplus⁻¹(α + β) to a radial map."""
+    """Radial map from centre, log α and softplus⁻¹(α + β)."""
     return Radial(raw[..., 0], raw[..., 1], torch.log(functional.softplus(raw[..., 2]).clamp_min(1e-30)) - raw[..., 1])
 
 
 class PaperFlowDistribution(LatentDistribution):
-    """The flow's distribution; where it is not normalised, `log_prob` is what is published and no density."""
+    """The distribution of the flow; if it is not normalised, `log_prob` is the published formula and not a density."""
 
     def __init__(self, signal: Tensor, maps: list[Radial], normalised: bool) -> None:
         super().__init__(signal.shape)
@@ -107,7 +107,7 @@ class PaperFlowDistribution(LatentDistribution):
 
 
 def stratified(edges: Tensor, generator: torch.Generator) -> Tensor:
-    """One uniform sample in each of the intervals that begin at `edges`, (rays, samples), equally wide, sorted.
+    """One uniform sample in each of the equally wide intervals that start at `edges`, (rays, samples), sorted.
 
     Args:
         edges: (rays, samples), multiples of one width.
@@ -119,12 +119,12 @@ def stratified(edges: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def by_density(edges: Tensor, density: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Intervals drawn in proportion to the density found in them, beside one of each: (rays, count + samples).
+    """Intervals drawn in proportion to their density, in addition to one of each, (rays, count + samples).
 
     Args:
-        edges: (rays, samples) where the intervals begin.
-        density: (rays, samples); rays without any get uniform draws.
-        count: draws for each ray.
+        edges: (rays, samples) starts of the intervals.
+        density: (rays, samples); rays with zero density get uniform draws.
+        count: number of draws per ray.
         generator: source of the draws.
     """
     weights = torch.where(density.sum(-1, keepdim=True) > 0, density, torch.ones_like(density)).cpu()

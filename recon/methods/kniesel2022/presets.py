@@ -1,4 +1,4 @@
-"""Published reconstructions with their own settings, to compare with. They take days where others take seconds."""
+"""Published methods with their own settings, for comparison. They take days; other methods take seconds."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _POINTS_TOGETHER = 2**16
 class Kniesel2022:
     """Kniesel et al., *Clean Implicit 3D Structure from Noisy 2D STEM Images*, CVPR 2022 (doi:10.1109/CVPR52688.2022.02018).
 
-    Two coordinate networks are trained ray by ray with Adam, the second on samples placed by the first, and the noise model with
-    them by stochastic gradient descent. Three things are not as in the released code: the noise model's gradients are cleared at
-    every step, images are divided by the incident intensity instead of being rescaled min–max, and the last state counts, for the
-    best one on clean validation images needs images that nobody has.
+    Two coordinate networks are trained ray by ray with Adam, the second on samples placed by the first. The noise model is
+    trained with them by stochastic gradient descent. There are three differences from the released code: gradients of the noise
+    model are cleared at every step, images are divided by the incident intensity instead of min–max scaled, and the final state
+    is used, because selecting the best one requires clean validation images, which are not available in practice.
 
     Attributes:
-        width: of the hidden layers (the paper's real data: 512).
-        num_steps: iterations.
+        width: width of the hidden layers (512 for the paper's real data).
+        num_steps: number of iterations.
         normalised: False reproduces the published log-density, which does not integrate to one.
-        rays, accumulate: rays of a batch, and batches whose gradients make one step.
-        coarse_samples, fine_samples: along a ray, uniform and drawn by density.
-        field_rate, noise_rate: learning rates; constant up to `decay_start`, then falling in a line to a hundredth.
-        l2_steps: first steps, of the field alone by least squares.
-        density_scale: attenuation per unit length (half the image's width) of a density of one.
-        seed: of every random choice.
-        device: where to compute.
+        rays, accumulate: rays per batch, and batches per optimiser step.
+        coarse_samples, fine_samples: samples along a ray, uniform and drawn by density.
+        field_rate, noise_rate: learning rates; constant up to `decay_start`, then decreasing linearly to a hundredth.
+        l2_steps: number of initial steps that train only the field, by least squares.
+        density_scale: attenuation per unit length (half the image width) at a density of one.
+        seed: seed of all random choices.
+        device: torch device.
     """
 
     width: int = 256
@@ -58,28 +58,28 @@ class Kniesel2022:
     device: torch.device | str = "cpu"
 
     def start(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> PresetState:
-        """Networks as they are before the first step.
+        """The initial state, before the first step.
 
         Args:
             tilt_series: the data.
-            max_steps: stop there; the learning rates go by `num_steps` all the same.
+            max_steps: stop after this number of steps; learning rates still depend on `num_steps`.
 
         Raises:
-            ValueError: a series that is not bright field.
+            ValueError: the series is not bright field.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             return PresetState(self, tilt_series, min(self.num_steps, max_steps or self.num_steps))
 
     def train(self, tilt_series: TiltSeries, *, max_steps: int | None = None) -> Iterator[PresetState]:
-        """Train step by step, as `start` says; each step yields the state as it is."""
+        """Train step by step and yield the state after each; arguments and errors as for `start`."""
         state = self.start(tilt_series, max_steps=max_steps)
         while state.done < state.num_steps:
             state.step()
             yield state
 
     def __call__(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Volume:
-        """Train to the end and evaluate the field on the grid."""
+        """Train completely and evaluate the field on the grid."""
         *_, state = self.train(tilt_series)
         return state.volume(grid)
 
@@ -102,7 +102,7 @@ class PresetState:
         response = estimate_response(tilt_series)
         if not isinstance(response, Transmission):
             raise ValueError(
-                "the preset kniesel2022 knows bright-field images only; a linear series needs another method"
+                "the preset kniesel2022 supports only bright-field images; use another method for a linear series"
             )
         images = np.asarray(tilt_series.images, dtype=np.float32) / response.intensity.numpy()[:, None, None]
         self.images = torch.from_numpy(images).to(preset.device)
@@ -119,12 +119,12 @@ class PresetState:
         }
 
     def state(self) -> dict[str, Any]:
-        """All that the steps to come depend on."""
+        """Everything that further steps depend on."""
         kept = {name: part.state_dict() for name, part in self._parts.items()}
         return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` returned."""
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.generator.set_state(state["generator"])
@@ -169,7 +169,7 @@ class PresetState:
         return nll if likelihood else ((predicted - observed) ** 2).mean()
 
     def _rays(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Origins and directions (x, y, z) and pixel values of randomly drawn rays; the cube is as wide as the image."""
+        """Origins and directions (x, y, z) and pixel values of random rays; the cube is as wide as the image."""
         tilts, height, width = self.images.shape
         tilt, row, column = (
             torch.randint(size, (self.preset.rays,), generator=self.generator).to(self.images.device)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import noiseflow
-from calibration.camera import calibrate_camera, write_maps
+from calibration.camera import calibrate_camera, judge_camera, write_maps
 from calibration.detector.emva import measure_camera
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Burst, read_levels
@@ -241,7 +241,8 @@ def test_image_lag_shows_in_flats_of_three_frames():
     flats, darks, _, _ = camera(8, number=3)
     assert judge_camera(measure_camera(flats, darks)).grade == "good"
     lagging = [
-        Burst(np.round(flat.frames - 0.06 * (flat.frames - np.roll(flat.frames, 1, axis=0))), calibration=True) for flat in flats
+        Burst(np.round(flat.frames - 0.06 * (flat.frames - np.roll(flat.frames, 1, axis=0))), calibration=True)
+        for flat in flats
     ]
     reasons = [one.name for one in judge_camera(measure_camera(lagging, darks)).reasons]
     assert "frames correlated" in reasons

@@ -85,7 +85,7 @@ def test_masked_pixels_may_hold_anything() -> None:
     [
         (torch.zeros(4, 4), torch.zeros(4, 5), "they must be equal"),
         (torch.zeros(0), torch.zeros(0), "too few"),
-        (torch.zeros(100), torch.zeros(100), "no noise to learn"),
+        (torch.zeros(100), torch.zeros(100), "no noise to fit"),
     ],
 )
 def test_unusable_data_is_refused(signal: torch.Tensor, observation: torch.Tensor, message: str) -> None:

@@ -56,8 +56,8 @@ def test_xf_files_are_read_and_wrong_ones_named(tmp_path: Path) -> None:
     for text, message in (
         ("1 0 0 1 0\n", "line 1: six numbers"),
         ("1 0 0 1 0 x\n", "line 1: six numbers"),
-        ("1 1 1 1 0 0\n", "cannot be inverted"),
-        ("nan 0 0 1 0 0\n", "cannot be inverted"),
+        ("1 1 1 1 0 0\n", "is not invertible"),
+        ("nan 0 0 1 0 0\n", "is not invertible"),
         ("\n", "no transforms"),
     ):
         path.write_text(text)
@@ -140,7 +140,7 @@ def test_angles_of_two_full_turns_are_the_largest(tmp_path: Path, text: str) -> 
     assert io.read_angles(tmp_path / "a.tlt").tolist() == [float(text)]
     for beyond in ("721", "-720.5", "1e30"):
         (tmp_path / "a.tlt").write_text(f"\n0\n{beyond}\n")
-        with pytest.raises(ValueError, match=f"line 3: {beyond} is no tilt angle"):
+        with pytest.raises(ValueError, match=f"line 3: {beyond} is not a tilt angle"):
             io.read_angles(tmp_path / "a.tlt")
 
 

@@ -63,7 +63,7 @@ def rewrite(path: Path, **changes: str | None) -> Path:
     [
         ({"format": "something else"}, "not a noiseflow noise model"),
         ({"format_version": "99"}, "update noiseflow"),
-        ({"model": json.dumps({"kind": "os.system", "arguments": {}})}, "unknown kind"),
+        ({"model": json.dumps({"kind": "os.system", "arguments": {}})}, "unknown noise-model class"),
         ({"model": json.dumps({"kind": "Gaussian", "arguments": {"scale": "x"}})}, "damaged"),
         ({"model": json.dumps({"kind": "RadialFlow", "arguments": {}})}, "do not fit a RadialFlow"),
         ({"model": "{"}, "damaged"),
@@ -94,7 +94,7 @@ def test_truncated_and_missing_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_unknown_models_cannot_be_saved(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not a known kind"):
+    with pytest.raises(ValueError, match="not a known noise-model class"):
         noiseflow.save(torch.nn.Linear(1, 1), tmp_path / "model.safetensors")
     assert not list(tmp_path.iterdir())
 

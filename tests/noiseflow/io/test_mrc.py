@@ -79,12 +79,12 @@ def test_complex_colour_and_packed_pixels_are_refused_by_name(tmp_path: Path, mo
         io.read(path)
     assert "damaged" not in str(caught.value)
     absurd = write(tmp_path / "b.mrc", np.zeros((1, 4, 40), "f4"), mode, nx=40_000)
-    with pytest.raises(ValueError, match=f"no MRC file: its header says mode {mode}"):
+    with pytest.raises(ValueError, match=f"not an MRC file: its header says mode {mode}"):
         io.read(absurd)
 
 
 def test_a_mode_that_nobody_knows_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no MRC file: its header says mode 99"):
+    with pytest.raises(ValueError, match="not an MRC file: its header says mode 99"):
         io.read(write(tmp_path / "a.mrc", np.zeros((1, 4, 40), "f4"), 99))
 
 

@@ -30,5 +30,5 @@ def test_a_level_is_kept_in_the_file(tmp_path) -> None:
 
 
 def test_rounding_and_images_stay_outside() -> None:
-    with pytest.raises(ValueError, match="belongs inside"):
+    with pytest.raises(ValueError, match="innermost model"):
         noiseflow.AtLevel(noiseflow.Digitised(noiseflow.Gaussian(), 1.0), LEVEL)

@@ -156,8 +156,8 @@ def test_command_refuses_what_it_does_not_know(tmp_path):
         (["magic"], "choose from rivals"),
         (["--repeats", "0"], "at least 1"),
         (["sabotage", "--method", "magic"], "choose from auto"),
-        (["needle", "--method", "l2"], "belongs to the benchmark sabotage"),
-        (["needle", "--in-turn"], "belongs to the benchmark sabotage"),
+        (["needle", "--method", "l2"], "only for the benchmark sabotage"),
+        (["needle", "--in-turn"], "only for the benchmark sabotage"),
     ):
         result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
         assert isinstance(result.exception, ValueError)
@@ -222,7 +222,7 @@ def test_the_best_candidate_is_found_and_says_where_it_lies():
     found = best(((str(value), np.full(3, value)) for value in (1, 3, 2)), lambda volume: float(volume.sum()))
     assert (found.setting, found.volume[0], found.at_an_end) == ("3", 3, False)
     assert found.tried == {"1": 3.0, "3": 9.0, "2": 6.0}
-    with pytest.raises(ValueError, match="nothing to choose"):
+    with pytest.raises(ValueError, match="no candidates"):
         best([], np.sum)
 
 

@@ -121,7 +121,7 @@ def test_methods_model_it_or_refuse_and_say_what_they_did(tmp_path):
     outcome = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.3, **options)
     assert outcome.choices["defocus"].startswith("0.3, blurs up to 2.")
     left_out = methods.reconstruct(defocused.noisy, grid, method="l2", defocus=0.001, **options)
-    assert "left out" in left_out.choices["defocus"]
+    assert "ignored" in left_out.choices["defocus"]
     blocks = methods.reconstruct(
         defocused.noisy, grid, scratch=tmp_path / "v.npy", method="l2", slices_at_once=8, defocus=0.3, **options
     )

@@ -181,7 +181,7 @@ def test_native_layout_is_the_same_operator():
         ({"tilt_angles": [0.0], "depth": 0}, "at least one"),
         ({"tilt_angles": [0.0], "width": 0, "detector_width": 3}, "at least one"),
         ({"tilt_angles": [0.0], "detector_width": 0}, "at least one"),
-        ({"tilt_angles": [[0.0, 1.0], [2.0, 3.0]]}, "one for each tilt"),
+        ({"tilt_angles": [[0.0, 1.0], [2.0, 3.0]]}, "one per tilt"),
         ({"tilt_angles": [0.0, 1.0], "detector_offset": [1.0, 2.0, 3.0]}, "one per tilt"),
     ],
 )

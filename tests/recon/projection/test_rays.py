@@ -81,7 +81,7 @@ def test_empty_and_missing_rays():
     volume = torch.ones(3, 4, 5)
     origins = torch.tensor([[0.0, 50.0, 0.0]])
     assert float(march(volume, origins, torch.tensor([[1.0, 0.0, 0.0]]))) == 0
-    with pytest.raises(ValueError, match="no length"):
+    with pytest.raises(ValueError, match="zero length"):
         march(volume, origins, torch.zeros(1, 3))
     with pytest.raises(ValueError, match="volume"):
         march(volume[0], origins, origins)

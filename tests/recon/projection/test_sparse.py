@@ -38,7 +38,7 @@ def test_entries_and_rows_are_those_of_the_whole() -> None:
 
 
 def test_a_factor_of_another_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="49 rows do not match the matrix's 50 columns"):
+    with pytest.raises(ValueError, match="49 rows do not match the 50 columns of the matrix"):
         example(7)[0] @ torch.zeros(49, 2, dtype=torch.float64)
 
 

@@ -51,7 +51,7 @@ def test_a_dry_run_names_blocks_memory_disk_and_time(tilts, tmp_path, run):
     assert whole["slices_at_once"] is None
     assert whole["disk"].startswith("blocks: none; disk: about")
     assert parts["slices_at_once"] == 20
-    assert parts["disk"].startswith("blocks: 4 of 20 slices at most; disk: about")
+    assert parts["disk"].startswith("blocks: 4 of at most 20 slices; disk: about")
     assert parts["memory"].startswith("memory: about")
     assert parts["expected_seconds"] > 0
     assert not (tmp_path / "v.mrc").exists()
@@ -97,7 +97,7 @@ def test_workers_cannot_join_a_volume_that_was_begun_in_one_piece(series, tmp_pa
     assert chosen_slices(kept, series, grid, "l2", "cpu", None) is None
     kept.keep()  # writes
     again = Journal(tmp_path / "kept", {}, resume=True)
-    with pytest.raises(ValueError, match=r"in one piece.*leave out --workers"):
+    with pytest.raises(ValueError, match=r"in one piece.*remove --workers"):
         chosen_slices(again, series, grid, "l2", "cpu", 2)
     assert chosen_slices(Journal(tmp_path / "kept", {}), series, grid, "l2", "cpu", 2) == 40
     assert chosen_slices(Journal(tmp_path / "new", {}), series, grid, "l2", "cpu", 1) is None
@@ -107,4 +107,4 @@ def test_workers_cannot_join_a_volume_that_was_begun_in_one_piece(series, tmp_pa
 def test_workers_of_a_method_without_blocks_are_refused(tilts, tmp_path, refused, option):
     said = refused("reconstruct", tilts, "-o", tmp_path / "v.mrc", "--method", "wbp-denoised", *option)
     assert f"{option[0]}: method wbp-denoised" in said
-    assert "wbp, or leave out" in said
+    assert "wbp, or remove" in said

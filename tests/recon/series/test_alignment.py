@@ -134,7 +134,7 @@ def test_few_tilts_and_images_moved_out_of_view_are_refused():
         find_alignment(series)
     with pytest.raises(ValueError, match="out of view"):
         Alignment(0.0, np.full((4, 2), 9.0), series.tilt_angles).apply(series)
-    with pytest.raises(ValueError, match="do not belong"):
+    with pytest.raises(ValueError, match="shifts do not match"):
         Alignment(0.0, np.zeros((3, 2)), series.tilt_angles).apply(series)
 
 
@@ -216,11 +216,11 @@ def test_a_stated_axis_decides_where_the_images_do_not():
 def test_a_wrong_axis_is_contradicted_by_the_images():
     shifts = random_shifts(2.0)
     raw = blobs(10.0, shifts, shape=(28, 28))
-    with pytest.warns(UserWarning, match="the given direction is kept"):
+    with pytest.warns(UserWarning, match="the given direction is used"):
         kept = find_alignment(raw, tilt_axis=100.0)
     assert kept.tilt_axis == pytest.approx(100, abs=20)
     assert kept.margin < 0
-    with pytest.warns(UserWarning, match="the images are believed"):
+    with pytest.warns(UserWarning, match="the direction from the images is used"):
         found = find_alignment(replace(raw, tilt_axis=100.0))
     assert (found.tilt_axis - 10 + 90) % 180 - 90 == pytest.approx(0, abs=2.5)
     assert found.margin > 4
@@ -250,7 +250,7 @@ def test_raw_needle_is_aligned_or_its_axis_asked_for(hint):
 
 def test_a_raw_series_whose_file_states_another_axis_is_asked_to_be_aligned():
     raw = replace(blobs(90.0, random_shifts(6.0), shape=(28, 28)), tilt_axis=90.0)
-    with pytest.raises(ValueError, match=r"axis at 90°.*do not fit.*--refine-alignment.*--tilt-axis 0"):
+    with pytest.raises(ValueError, match=r"axis of 90°.*do not fit.*--refine-alignment.*--tilt-axis 0"):
         prepare(raw)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -259,5 +259,5 @@ def test_a_raw_series_whose_file_states_another_axis_is_asked_to_be_aligned():
     aligned = replace(
         blobs(0.0, np.zeros((len(ANGLES), 2)), shape=(28, 28)), tilt_axis=90.0
     )  # the title is of the raw one
-    with pytest.warns(UserWarning, match=r"taken as aligned.*--refine-alignment"):
+    with pytest.warns(UserWarning, match=r"assumed to be aligned.*--refine-alignment"):
         assert prepare(aligned).alignment is None

@@ -40,7 +40,7 @@ def test_grid_of_a_series():
 @pytest.mark.parametrize(
     ("stack", "angles", "words"),
     [
-        (images(), ANGLES[:2], "3 images and there are 2"),
+        (images(), ANGLES[:2], "3 images, but there are 2"),
         (images()[0], ANGLES[:1], "stack"),
         (images()[:1], ANGLES[:1], "at least two"),
         (np.where(np.arange(8) == 3, np.nan, images()), ANGLES, "NaN"),

@@ -86,8 +86,8 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path):
     [
         (["--phantom", "cube"], "choose one of"),
         (["--noise", "magic"], "noise-model file"),
-        (["--noise", "none", "--clip"], "choose a --noise"),
-        (["--noise", "8-bit", "--clip"], "clipping limits of its own"),
+        (["--noise", "none", "--clip"], "choose noise with --noise"),
+        (["--noise", "8-bit", "--clip"], "already has clipping limits"),
         (["--tilts=0:0:1"], "two tilts"),
         (["--defocus", -0.1], "0 to 1"),
         (["--defocus", "nan"], "0 to 1"),

@@ -107,7 +107,7 @@ def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> 
     made = scene(phantom, noise)
     series = spoilt(phantom, noise, "one region black in all images")
     found = pixel_findings(series, residuals(series, made.clean.images))[1]
-    assert any("have one value in all tilts" in each.sentence for each in found)
+    assert any("have a constant value in all tilts" in each.sentence for each in found)
     masked = replace(series, mask=made.noisy.images == series.images)
     assert pixel_findings(masked, residuals(masked, made.clean.images))[0]["dead pixels"] == 0
 

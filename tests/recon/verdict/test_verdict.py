@@ -296,7 +296,7 @@ def test_order_of_the_tilts_changes_nothing() -> None:
 
 def test_foreign_projections_are_refused() -> None:
     series, told = oracle()
-    with pytest.raises(ValueError, match="do not belong"):
+    with pytest.raises(ValueError, match="do not match images"):
         judge(series, replace(told, projections=told.projections[1:]))
 
 
