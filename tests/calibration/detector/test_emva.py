@@ -240,9 +240,8 @@ def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
 def test_image_lag_shows_in_flats_of_three_frames():
     flats, darks, _, _ = camera(8, number=3)
     assert judge_camera(measure_camera(flats, darks)).grade == "good"
-    lagging = [
-        Burst(np.round(flat.frames - 0.06 * (flat.frames - np.roll(flat.frames, 1, axis=0))), calibration=True)
-        for flat in flats
-    ]
-    reasons = [one.name for one in judge_camera(measure_camera(lagging, darks)).reasons]
-    assert "frames correlated" in reasons
+    lagging = []
+    for flat in flats:
+        kept = np.concatenate([flat.frames[:1], flat.frames[:-1]])
+        lagging.append(Burst(np.round(0.94 * flat.frames + 0.06 * kept), calibration=True))
+    assert "frames correlated" in [one.name for one in judge_camera(measure_camera(lagging, darks)).reasons]
