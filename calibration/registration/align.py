@@ -42,7 +42,7 @@ CLEAR_PEAK = 8.0
 reach 5.5 once the search over shifts, rotations and motions has picked their best."""
 
 SAME_SCENE = 0.9
-"""Correlation from which on small frames and lattices, which have too few independent details for `CLEAR_PEAK`, show one
+"""Correlation from which on small frames and crystal lattices, which have too few independent details for `CLEAR_PEAK`, show one
 scene: unrelated frames that overlap by half, neither turned nor magnified, reach 0.75."""
 
 LATTICE = 0.7
@@ -50,8 +50,8 @@ LATTICE = 0.7
 integer shift next to the top of a period of 5 pixels has 0.8."""
 
 LARGEST_TURN = 0.05
-"""Turn or magnification (3° or 5 %) by which a lattice may fit another, and by which the refinement of a guess, which moves
-pixels near its edge by a few at most, may change it."""
+"""Turn or magnification (3° or 5 %) by which a crystal lattice may fit another, and by which its refinement may
+change a guess, whose pixels near the edge are a few off at most."""
 
 CONCLUSIVE_INLIERS = 30
 """Matches that agree with the refined transform, and outnumber the others, from which on they prove it alone: a false match
@@ -147,10 +147,10 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
     sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
     prefers. A guess counts only if the registered frames then correlate more clearly than unrelated ones could
-    (`CLEAR_PEAK`), or almost fully and with hardly a turn (`SAME_SCENE`: small frames, lattices), or if
+    (`CLEAR_PEAK`), or almost fully and with hardly a turn (`SAME_SCENE`: small frames, crystal lattices), or if
     `CONCLUSIVE_INLIERS` matches and most of all agree with it. Unless matches prove it, the correlation's guess is
-    asked too, and the likelier of the two counts. A lattice fits itself at many shifts: the likeliest counts, which is
-    the smallest one where the lattice is perfect; the residuals are then the same at all of them.
+    asked too, and the likelier of the two counts. A crystal lattice fits itself at many shifts: the likeliest counts, which is
+    the smallest one where the crystal lattice is perfect; the residuals are then the same at all of them.
 
     Args:
         short: (y, x) detector units.
@@ -213,12 +213,13 @@ def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried
 
 
 def _beyond_doubt(found: Registration) -> bool:
-    """Proven by its matches, and without the turn or inversion by which a lattice fits itself."""
+    """Proven by its matches, and without the turn or inversion by which a crystal lattice fits itself."""
     return _conclusive(found.inliers, found.matches) and not found.inverted and _turn(found.matrix) <= LARGEST_TURN
 
 
 def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
-    """The transform moved by each of the eight smallest shifts at which a lattice fits about as well; none in other scenes."""
+    """The transform moved by each of the eight smallest shifts at which a crystal lattice fits about as well;
+    none in other scenes."""
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
@@ -233,8 +234,8 @@ def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
 
 
 def _better(short: Image, long: Image, first: Registration, second: Registration) -> Registration:
-    """The one that keeps the contrast, since a lattice moved by half a period may be its own negative; else the likelier one
-    where both cover the short frame; else, within the likelihood's scatter, the one that covers more."""
+    """The one that keeps the contrast, since a crystal lattice moved by half a period may be its own negative; else the
+    likelier one where both cover the short frame; else, within the likelihood's scatter, the one that covers more."""
     if first.inverted != second.inverted:
         return second if first.inverted else first
     masks = [covered(one.matrix, short.shape) for one in (first, second)]
@@ -305,7 +306,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not proven or error > LARGEST_ERROR or _turn(matrix, guess.matrix) > LARGEST_TURN:
         return None
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
-        return None  # turned or magnified, any lattice fits another
+        return None  # turned or magnified, any crystal lattice fits another
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
     return Registration(
         matrix,
@@ -347,7 +348,7 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
             moved = np.full_like(matrix, np.inf)
         if np.linalg.norm((moved - start) @ centre) <= reach:
             matrix = np.asarray(moved, float)
-        elif blur == 5:  # the coarse step may miss, as it cannot see a fine lattice; this one may not
+        elif blur == 5:  # the coarse step may miss, as it cannot see a fine crystal lattice; this one may not
             return None
     return matrix
 

@@ -21,7 +21,7 @@ INLIER_DISTANCE = 2.0
 """Pixels within which a match agrees with a transform."""
 
 INVERTED = 0.8
-"""Weight of negative correlation: a lattice moved by half a period resembles its negative, which is rarer than a move."""
+"""Weight of negative correlation: a crystal lattice moved by half a period resembles its negative, which is rarer than a move."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def band_pass(image: Image, blur: float) -> Image:
 def correlation_surface(first: Image, second: Image) -> Image:
     """Correlation of two frames at every shift, times the root of their overlap.
 
-    The root makes unrelated frames scatter alike at all shifts, and of the equal peaks of a lattice it favours the
+    The root makes unrelated frames scatter alike at all shifts, and of the equal peaks of a crystal lattice it favours the
     smallest shift. Shifts that leave less than a quarter of the frame are set to 0.
 
     Args:
