@@ -5,7 +5,9 @@ Only the long exposure is ever interpolated: that of the short one would correla
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +23,7 @@ from calibration.registration.matching import (
     band_pass,
     correlation_guesses,
     correlation_surface,
+    cross_correlation,
     feature_guesses,
 )
 from noiseflow.described import described
@@ -35,11 +38,20 @@ MINIMUM_OVERLAP = 0.25
 """Fraction of the short frame that the long one must cover."""
 
 CLEAR_PEAK = 8.0
-"""Standard deviations by which the correlation of registered frames must stand out at zero shift. Unrelated frames
+"""Standard deviations by which the correlation of registered frames must stand out from that of unrelated ones, which
 reach 5.5 once the search over shifts, rotations and motions has picked their best."""
 
-TRUSTED_INLIERS = 10
-"""Matches that agree, from which on the correlation need not be asked."""
+SAME_SCENE = 0.9
+"""Correlation from which on small frames and crystal lattices, which have too few independent details for `CLEAR_PEAK`, show one
+scene: unrelated frames that overlap by half, neither turned nor magnified, reach 0.75."""
+
+LATTICE = 0.7
+"""Height of another peak of the correlation, over the one at the registered place, from which on a scene repeats itself; the
+integer shift next to the top of a period of 5 pixels has 0.8."""
+
+LARGEST_TURN = 0.05
+"""Turn or magnification (3° or 5 %) by which a crystal lattice may fit another, and by which its refinement may
+change a guess, whose pixels near the edge are a few off at most."""
 
 CONCLUSIVE_INLIERS = 30
 """Matches that agree with the refined transform, and outnumber the others, from which on they prove it alone: a false match
@@ -47,9 +59,6 @@ agrees within `INLIER_DISTANCE` about once in 5000, while the correlation fades 
 
 LARGEST_ERROR = 0.5
 """Standard error, in pixels, above which a transform is too uncertain to use."""
-
-SEARCH_MARGIN = 1.5
-"""Pixels from zero shift within which that peak must lie."""
 
 
 @described(rms_px="px", error_px="px")
@@ -65,7 +74,7 @@ class Registration:
         matches: matches before the consensus.
         rms_px: root mean square distance of the inlier matches from the transform; for phase correlation `error_px`.
         error_px: standard error of the transform, rms over the frame, from the noise of the short exposure.
-        peak: height of the correlation at zero shift over its scatter at others.
+        peak: correlation over its standard deviation between unrelated frames of the same spectra.
         inverted: the two frames have opposite contrast.
 
     Example:
@@ -137,10 +146,11 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
     has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
     sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
-    prefers. A guess counts only if the registered frames then correlate clearly, and best at zero shift, or if
-    `CONCLUSIVE_INLIERS` matches and most of all agree with it. Few matches may
-    all be wrong, as where a handful of round particles looks like another: the correlation's guess is then asked too, and
-    the clearer of the two counts.
+    prefers. A guess counts only if the registered frames then correlate more clearly than unrelated ones could
+    (`CLEAR_PEAK`), or almost fully and with hardly a turn (`SAME_SCENE`: small frames, crystal lattices), or if
+    `CONCLUSIVE_INLIERS` matches and most of all agree with it. Unless matches prove it, the correlation's guess is
+    asked too, and the likelier of the two counts. A crystal lattice fits itself at many shifts: the likeliest counts, which is
+    the smallest one where the crystal lattice is perfect; the residuals are then the same at all of them.
 
     Args:
         short: (y, x) detector units.
@@ -160,14 +170,14 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
     tried = _Tried()
-    found: list[Registration] = []
-    for guesses in (feature_guesses(short, long), correlation_guesses(short, long)):
-        one = _first_refined(short, long, guesses, tried)
-        found += [] if one is None else [one]
-        if one is not None and one.inliers >= TRUSTED_INLIERS:
-            break
+    found = list(itertools.islice(_standing(short, long, feature_guesses(short, long), tried), 1))
+    if any(_beyond_doubt(one) for one in found):
+        return found[0]
+    found += _standing(short, long, correlation_guesses(short, long), tried)
     if found:
-        return max(found, key=lambda one: one.peak)
+        best = functools.reduce(lambda *two: _better(short, long, *two), found)
+        others = _standing(short, long, _equal_peaks(short, long, best.matrix), tried)
+        return functools.reduce(lambda *two: _better(short, long, *two), others, best)
     overlap, most_matches = tried.overlap, tried.most_matches
     reason = (
         f"they overlap by {overlap:.0%} only"
@@ -188,8 +198,8 @@ class _Tried:
     most_matches: int = 0
 
 
-def _first_refined(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Registration | None:
-    """The first of the guesses that stands, if any does."""
+def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Iterator[Registration]:
+    """The guesses that stand, refined."""
     for guess in guesses:
         tried.most_matches = max(tried.most_matches, len(guess.points))
         if not _plausible(guess.matrix):
@@ -199,8 +209,44 @@ def _first_refined(short: Image, long: Image, guesses: Iterable[Guess], tried: _
             continue
         found = _refined(short, long, guess)
         if found is not None:
-            return found
-    return None
+            yield found
+
+
+def _beyond_doubt(found: Registration) -> bool:
+    """Proven by its matches, and without the turn or inversion by which a crystal lattice fits itself."""
+    return _conclusive(found.inliers, found.matches) and not found.inverted and _turn(found.matrix) <= LARGEST_TURN
+
+
+def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
+    """The transform moved by each of the eight smallest shifts at which a crystal lattice fits about as well;
+    none in other scenes."""
+    correlation, _ = correlation_at(short, long, matrix, blur=1.5)
+    if abs(correlation) < SAME_SCENE:
+        return []
+    first, second = (band_pass(image, 1.5) for image in (short, _interpolated(long, matrix)))
+    surface = correlation_surface(first, np.sign(correlation) * second)
+    tops = surface == ndimage.maximum_filter(surface, 3, mode="wrap")
+    peaks = np.argwhere(tops & (surface > LATTICE * surface[0, 0]))
+    shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
+    nearest = sorted(shifts[np.abs(shifts).max(axis=1) > 1], key=np.linalg.norm)[:8]
+    moved = (np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ shift]) for shift in nearest)
+    return [Guess(one, "phase correlation", np.empty((0, 2, 2)), 0) for one in moved]
+
+
+def _better(short: Image, long: Image, first: Registration, second: Registration) -> Registration:
+    """The one that keeps the contrast, since a crystal lattice moved by half a period may be its own negative; else the
+    likelier one where both cover the short frame; else, within the likelihood's scatter, the one that covers more."""
+    if first.inverted != second.inverted:
+        return second if first.inverted else first
+    masks = [covered(one.matrix, short.shape) for one in (first, second)]
+    both = masks[0] & masks[1]
+    if not both.any():
+        return max(first, second, key=lambda one: one.peak)
+    smooth = ndimage.gaussian_filter(long, 1.0)
+    gain = _information(short, smooth, second.matrix, both) - _information(short, smooth, first.matrix, both)
+    if abs(gain) < np.sqrt(both.sum()):
+        gain = float(masks[1].sum()) - float(masks[0].sum())
+    return second if gain > 0 else first
 
 
 def _plausible(matrix: Image) -> bool:
@@ -209,20 +255,29 @@ def _plausible(matrix: Image) -> bool:
     return bool(np.linalg.det(matrix[:, :2]) > 0 and singular[0] < 1.3 and singular[1] > 0.75)
 
 
-def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
-    """How clearly two frames correlate under a transform, band-passed at `blur` pixels.
+def _turn(matrix: Image, reference: Image | None = None) -> float:
+    """Largest relative displacement between two transforms, other than a shift; the reference is no transform by default."""
+    reference = np.eye(2, 3) if reference is None else reference
+    return float(np.linalg.norm(matrix[:, :2] - reference[:, :2], 2))
 
-    Returns:
-        The correlation's extreme within `SEARCH_MARGIN` pixels of zero shift over its standard deviation at all shifts,
-        with its sign; and the distance, in pixels, of the highest peak of all from zero shift.
+
+def _conclusive(inliers: int, matches: int) -> bool:
+    return inliers >= max(CONCLUSIVE_INLIERS, matches / 2)
+
+
+def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
+    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation between
+    unrelated frames.
+
+    The latter is Bartlett's: the root of the sum, over all shifts, of the product of the two frames' autocorrelations,
+    over the number of pixels. By Parseval's theorem that sum is the one of the squared cross-correlation.
     """
     mask = covered(matrix, short.shape)
-    surface = correlation_surface(band_pass(short, blur), band_pass(_interpolated(long, matrix), blur), mask)
-    reach = int(np.ceil(SEARCH_MARGIN))
-    near = np.roll(surface, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
-    extreme = near.flat[np.argmax(np.abs(near))]
-    where = np.array(np.unravel_index(np.argmax(np.abs(surface)), surface.shape))
-    return float(extreme), float(np.hypot(*np.minimum(where, np.array(surface.shape) - where)))
+    bands = (band_pass(image, blur) for image in (short, _interpolated(long, matrix)))
+    first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
+    energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
+    surface = cross_correlation(first, second) / energy
+    return float(surface[0, 0]), float(np.linalg.norm(surface) / np.sqrt(mask.sum()))
 
 
 def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
@@ -241,14 +296,17 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
         found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
     matrix = found[motion]
-    checks = [correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0)]
-    clear = [abs(peak) for peak, distance in checks if abs(peak) >= CLEAR_PEAK and distance <= SEARCH_MARGIN]
+    fine, coarse = (correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0))
+    peak = max(abs(correlation) / deviation for correlation, deviation in (fine, coarse))
+    same = abs(fine[0]) >= SAME_SCENE and _turn(matrix) <= LARGEST_TURN and covered(matrix, short.shape).mean() >= 0.5
     error = _standard_error(short, long, matrix, motion)
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
-    conclusive = inlier.sum() >= max(CONCLUSIVE_INLIERS, guess.matches / 2)
-    if not (clear or conclusive) or error > LARGEST_ERROR:
+    proven = peak >= CLEAR_PEAK or same or _conclusive(int(inlier.sum()), guess.matches)
+    if not proven or error > LARGEST_ERROR or _turn(matrix, guess.matrix) > LARGEST_TURN:
         return None
+    if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
+        return None  # turned or magnified, any crystal lattice fits another
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
     return Registration(
         matrix,
@@ -258,7 +316,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
         guess.matches,
         rms,
         error,
-        max(abs(p) for p, _ in checks),
+        peak,
         sign < 0,
     )
 
@@ -280,14 +338,19 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
         motion
     ]
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
-    matrix = start.astype(np.float32)
+    centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
+    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # what a guess may be off by
     for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
         try:
-            _, matrix = cv2.findTransformECC(first, second, matrix, kind, criteria, None, blur)  # type: ignore[call-overload]
+            _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type: ignore[call-overload]
         except cv2.error:  # its way of saying that the iteration does not converge
+            moved = np.full_like(matrix, np.inf)
+        if np.linalg.norm((moved - start) @ centre) <= reach:
+            matrix = np.asarray(moved, float)
+        elif blur == 5:  # the coarse step may miss, as it cannot see a fine crystal lattice; this one may not
             return None
-    return np.asarray(matrix, float) if np.isfinite(matrix).all() else None
+    return matrix
 
 
 def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool_]) -> float:

@@ -20,6 +20,9 @@ RATIO = 0.8
 INLIER_DISTANCE = 2.0
 """Pixels within which a match agrees with a transform."""
 
+INVERTED = 0.8
+"""Weight of negative correlation: a crystal lattice moved by half a period resembles its negative, which is rarer than a move."""
+
 
 @dataclass(frozen=True)
 class Guess:
@@ -57,51 +60,46 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
         largest_angle: degrees searched either way, in steps that move the frame's edge by about a pixel and a half.
 
     Yields:
-        The best guess for the finest and for a coarser band, clearest peak first.
+        The best guess for the finest and for a coarser band.
     """
-    guesses = []
     for blur in (1.5, 4.0):
         factor = max(1, int(blur / 1.5), max(short.shape) // 512)
         first, second = (_binned(band_pass(image, blur), factor) for image in (short, long))
         step = np.degrees(3.0 / max(first.shape))
         angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
-        found = [_best_shift(first, second, angle) for angle in angles]
-        peak, matrix = max(found, key=lambda item: item[0])
-        matrix = _scaled(matrix, factor)
-        guesses.append((peak, Guess(matrix, "phase correlation", np.empty((0, 2, 2)), 0)))
-    yield from (guess for _, guess in sorted(guesses, key=lambda item: -item[0]))
+        _, matrix = max((_best_shift(first, second, angle) for angle in angles), key=lambda item: item[0])
+        yield Guess(_scaled(matrix, factor), "phase correlation", np.empty((0, 2, 2)), 0)
 
 
 def band_pass(image: Image, blur: float) -> Image:
-    """Remove noise finer than `blur` pixels and shading coarser than eight times that; mean 0, standard deviation 1."""
-    band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, 8 * blur)
+    """Remove noise finer than `blur` pixels and shading coarser than eight times that, or than a tenth of the frame; mean 0,
+    standard deviation 1."""
+    shading = min(8 * blur, blur + 0.1 * min(image.shape))
+    band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, shading)
     band = np.clip(band, *np.percentile(band, (0.05, 99.95)))
     return np.asarray((band - band.mean()) / max(band.std(), np.finfo(float).tiny))
 
 
-def correlation_surface(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
-    """Correlation of two frames at every shift, over its standard deviation at all shifts.
+def correlation_surface(first: Image, second: Image) -> Image:
+    """Correlation of two frames at every shift, times the root of their overlap.
 
-    Each shift is scaled by the root of its overlap, so that unrelated frames give unit variance everywhere; shifts that
-    leave less than a quarter of the frame are set to 0.
+    The root makes unrelated frames scatter alike at all shifts, and of the equal peaks of a crystal lattice it favours the
+    smallest shift. Shifts that leave less than a quarter of the frame are set to 0.
 
     Args:
-        first: (y, x) of mean 0.
-        second: (y, x) of mean 0.
-        mask: (y, x) pixels to use; all by default.
+        first: (y, x) of mean 0 and standard deviation 1.
+        second: (y, x) of mean 0 and standard deviation 1.
 
     Returns:
         (2y, 2x) or somewhat larger: value d is that of first(p)·second(p + d), with d = 0 at [0, 0].
     """
-    valid = np.ones(first.shape) if mask is None else mask.astype(float)
-    overlap = _cross_correlation(valid, valid)
-    enough = overlap > 0.25 * valid.size
-    surface = np.zeros_like(overlap)
-    surface[enough] = _cross_correlation(valid * first, valid * second)[enough] / np.sqrt(overlap[enough])
-    return surface / max(float(surface[enough].std()), np.finfo(float).tiny) if enough.any() else surface
+    overlap = cross_correlation(np.ones(first.shape), np.ones(first.shape))
+    enough = overlap > 0.25 * first.size
+    return np.asarray(np.where(enough, cross_correlation(first, second) / np.sqrt(overlap.clip(1)), 0.0))
 
 
-def _cross_correlation(first: Image, second: Image) -> Image:
+def cross_correlation(first: Image, second: Image) -> Image:
+    """Sums of products at every shift, without wrapping round; shapes as `correlation_surface`."""
     shape = [fft.next_fast_len(2 * n, real=True) for n in first.shape]
     product = np.conj(fft.rfft2(first, shape)) * fft.rfft2(second, shape)
     return np.asarray(fft.irfft2(product, shape))
@@ -155,13 +153,13 @@ def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
 
 
 def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image]:
-    """Height of the correlation's highest peak of either sign when `second` is turned back by `angle`, and its
-    matrix."""
+    """Height of the correlation's highest peak when `second` is turned back by `angle`, and its matrix."""
     import cv2
 
     turn = about_centre(angle, first.shape)
     turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    surface = np.abs(correlation_surface(first, np.asarray(turned, float)))
+    surface = correlation_surface(first, np.asarray(turned, float))
+    surface = np.maximum(surface, -INVERTED * surface)
     row, column = np.unravel_index(np.argmax(surface), surface.shape)
     shift = [
         float(index if index < size / 2 else index - size)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calibration.registration.align import CLEAR_PEAK, Registration, register
+from calibration.registration.align import Registration, register
 
 from ..conftest import expose, rigid, sparse_scene, textured_scene
 from ..simulators import exposed, random_scene
@@ -129,5 +129,4 @@ def test_many_matches_that_agree_register_frames_of_little_overlap():
     short, long = (exposed(generator, times * scene[:256, x : x + 256]) for times, x in ((1, 0), (16, 154)))
     found = register(short, long)
     assert found.inliers > 100
-    assert found.peak < CLEAR_PEAK  # the correlation alone would not do
     assert found.shift((256, 256)) == pytest.approx((-154, 0), abs=0.05)
