@@ -294,6 +294,12 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
         text = f"at equal signal the noise's variance differs by {field:.0%} rms across the field: the frames were divided by a "
         text += "flat field or corrected for shading, so that no single gain applies"
         found.append(Reason("uneven field", "doubtful", text + ". Give the uncorrected frames."))
+    for pair in pairs:
+        if pair.exposure_ratio is not None and not pair.one_setting:
+            text = f"the exposures' scale is {1 / pair.scaling.slope:.3g}, not the given ratio of {pair.exposure_ratio:.3g}, "
+            text += "which was not used: the ratio is wrong, or the exposures were taken with different gains or processed differently"
+            found.append(Reason("exposure ratio", "doubtful", text + ". Check --exposure-ratio, or leave it out."))
+            break
     shares = [full_share(pair) for pair in pairs]
     if max(shares) > 0.001:
         text = (

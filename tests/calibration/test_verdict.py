@@ -1,6 +1,7 @@
 """No figure is wrong without a flag, and clean exposures raise none."""
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -278,3 +279,12 @@ def test_a_faint_blur_shows_in_all_neighbours_together():
     found = correlation_of_residuals(residuals)
     assert found.found
     assert found.factor == pytest.approx(1 / np.mean([one.var() for one in blurred]), abs=0.01)
+
+
+def test_a_given_ratio_that_the_exposures_contradict_is_flagged():
+    case = CASES["clean, ratio known"](41)
+    right = measured(case)
+    wrong = measured(replace(case, options={"exposure_ratio": 24.0}))
+    assert "exposure ratio" not in [one.name for one in right.verdict.reasons]
+    assert "exposure ratio" in [one.name for one in wrong.verdict.reasons]
+    assert wrong.figures.gain.median == pytest.approx(2.0, rel=0.06)
