@@ -296,8 +296,8 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
         found.append(Reason("uneven field", "doubtful", text + ". Give the uncorrected frames."))
     for pair in pairs:
         if pair.exposure_ratio is not None and not pair.one_setting:
-            text = f"the exposures' scale is {1 / pair.scaling.slope:.3g}, not the given ratio of {pair.exposure_ratio:.3g}, "
-            text += "which was not used: the ratio is wrong, or the exposures were taken with different gains or processed differently"
+            text = f"the exposures' scale is {1 / pair.scaling.slope:.3g}, not the given ratio of {pair.exposure_ratio:.3g}. "
+            text += "The ratio was not used: it is wrong, or the exposures differ in gain or processing"
             found.append(Reason("exposure ratio", "doubtful", text + ". Check --exposure-ratio, or leave it out."))
             break
     shares = [full_share(pair) for pair in pairs]

@@ -171,18 +171,29 @@ def _of_interpolation(pair: AlignedPair) -> Image:
 
 
 def _period(residual: Residual) -> float:
-    """The period, in pixels, of the squares and of the neighbour products of residuals along either axis; 0 if none."""
-    from scipy.ndimage import median_filter
+    """The period, in pixels, of the squares and of the neighbour products of residuals along either axis, unless the scene has it
+    too; 0 if none."""
+    from scipy.ndimage import maximum_filter1d
 
     found = [0.0]
-    for z in (residual.z, residual.z.T):
+    scene = np.where(residual.mask, residual.z if residual.signal is None else residual.signal, 0.0)
+    for z, signal in ((residual.z, scene), (residual.z.T, scene.T)):
+        own = maximum_filter1d(_lines(signal.mean(0)), 3)
         for profile in ((z**2).mean(0), (z[:, 1:] * z[:, :-1]).mean(0)):
             if len(profile) < LEAST_PROFILE:
                 continue
-            power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2
-            usual = median_filter(power, min(31, len(power) // 2)) / np.log(2)
+            relative = _lines(profile)
             first = int(np.ceil(len(profile) / LONGEST_PERIOD))
-            relative = power[first:] / np.maximum(usual[first:], np.finfo(float).tiny)
-            if relative.size and relative.max() > PEAK:
-                found.append(len(profile) / (first + int(np.argmax(relative))))
+            seen = (relative[first:] > PEAK) & (own[first : len(relative)] < PEAK)
+            if seen.any():
+                found.append(len(profile) / (first + int(np.argmax(np.where(seen, relative[first:], 0.0)))))
     return max(found)
+
+
+def _lines(profile: Image) -> Image:
+    """Power spectrum over its neighbourhood's mean, the spectral lines of a profile."""
+    from scipy.ndimage import median_filter
+
+    power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2
+    usual = median_filter(power, min(31, len(power) // 2 + 1)) / np.log(2)
+    return np.asarray(power / np.maximum(usual, np.finfo(float).tiny))

@@ -16,6 +16,11 @@ _BLUR = 3.0
 _SHRINKS = 1 / (2 * np.sqrt(np.pi) * _BLUR)
 """What is left of white noise's standard deviation."""
 _LEAST_WEIGHT = 0.9
+_LITTLE_NOISE = 0.1
+"""Share of the residual's variance that is the signal's own, below which a signal hardly tells its own errors."""
+_LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
+"""Pixels over which the signal is averaged before it sorts the residuals: as few as its noise allows, for at the same average a
+crest in the dark part of a crystal lattice is noisier than a trough in the bright part."""
 CUT = 5.0
 """Standard deviations at which residuals are cut, so that a few defects do not speak for all pixels."""
 
@@ -54,29 +59,31 @@ class Residual:
         mask: (y, x) pixels to trust.
         share: of the residual's variance that is the signal's own noise.
         spread: (y, x) that standard deviation, counts.
+        signal: (y, x) counts; None for frames without a scene.
     """
 
     z: Image
     mask: Mask
     share: float
     spread: Image
+    signal: Image | None = None
 
 
 def residual_of(pair: AlignedPair) -> Residual:
     """The standardised residual of a pair."""
-    difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair)[pair.mask]
+    share = float(pair.share[pair.mask].mean())
+    blur = _LITTLE_BLUR if share < _LITTLE_NOISE else _MUCH_BLUR
+    difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
     spread = np.ones(pair.mask.shape)
     spread[pair.mask] = spread_by_level(level, difference)
     z = np.zeros(pair.mask.shape)
     cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
     z[pair.mask] = cut - cut.mean()  # not the median, which skewed noise has off its mean: pixels would seem correlated
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
-    return Residual(
-        z / max(scale, np.finfo(float).tiny), pair.mask, float(pair.share[pair.mask].mean()), spread * scale
-    )
+    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal)
 
 
-def smooth_signal(pair: AlignedPair, *, blur: float = 1.5) -> Image:
+def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
     """(y, x) the signal averaged over a Gaussian of `blur` pixels within the mask, counts."""
     weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
     inside = ndimage.gaussian_filter(np.where(pair.mask, pair.signal, 0.0), blur)

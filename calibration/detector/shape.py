@@ -17,6 +17,10 @@ from calibration.registration.aligned import AlignedPair
 MERGED = 4
 """Codes taken together where single ones are uneven: four of a usual comb hold equal shares."""
 
+SURE_FREEDOM = 200
+"""Degrees of freedom whose χ² scatters by a tenth of itself; fewer are filled up with ones that fit, so that a few hundred
+pixels do not raise an alarm by chance."""
+
 NEIGHBOURS = 9
 """Codes over which the shape of a distribution is straight, so that what is left is the codes' own."""
 
@@ -47,7 +51,7 @@ CHANCE = 40.0
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
-    """χ² per degree of freedom of the histograms, over cells where at least `least` pixel values are expected.
+    """χ² per degree of freedom of the histograms, in bins of neighbouring cells with at least `least` expected pixel values.
 
     Residuals of a burst share their mean, which takes less than one degree of freedom from each level.
 
@@ -61,10 +65,33 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, 
     for one, histogram, expected in _expected(levels, parameters):
         if one.absolute and merged > 1:
             histogram, expected = (_merged(values, merged) for values in (histogram, expected))
-        used = expected > least
-        squares += float(np.sum((histogram - expected)[used] ** 2 / expected[used]))
-        freedom += int(used.sum()) - len(histogram) - int(np.sum(one.scale < 0))
-    return squares / max(freedom, 1)
+        for row, own_mean in enumerate(one.scale < 0):
+            edges = _bins(expected[row], least)
+            if len(edges) > 2:
+                seen, known = (
+                    np.diff(np.concatenate([[0], np.cumsum(values[row])])[edges]) for values in (histogram, expected)
+                )
+                squares += float(np.sum((seen - known) ** 2 / known))
+                freedom += len(known) - 1 - int(own_mean)
+    missing = max(SURE_FREEDOM - freedom, 0)
+    return (squares + missing) / (freedom + missing)
+
+
+def _bins(expected: Image, least: float) -> list[int]:
+    """Edges of bins that expect `least` pixel values or more.
+
+    The far tails, where less than one value is expected in all, belong to no bin: there are outliers.
+    """
+    below, above = np.cumsum(expected), np.cumsum(expected[::-1])[::-1]
+    edges: list[int] = []
+    held = 0.0
+    for cell in np.flatnonzero((below >= 1) & (above >= 1)):
+        edges = edges or [int(cell)]
+        held += expected[cell]
+        if held >= least:
+            edges.append(int(cell) + 1)
+            held = 0.0
+    return edges
 
 
 def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 50.0) -> float:

@@ -218,8 +218,8 @@ def _beyond_doubt(found: Registration) -> bool:
 
 
 def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
-    """The transform moved by each of the eight smallest shifts at which a crystal lattice fits about as well;
-    none in other scenes."""
+    """The transform moved by shifts at which a crystal lattice fits about as well: the eight after which the frame's middle has
+    moved least; none in other scenes."""
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
@@ -228,9 +228,11 @@ def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
     tops = surface == ndimage.maximum_filter(surface, 3, mode="wrap")
     peaks = np.argwhere(tops & (surface > LATTICE * surface[0, 0]))
     shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
-    nearest = sorted(shifts[np.abs(shifts).max(axis=1) > 1], key=np.linalg.norm)[:8]
-    moved = (np.column_stack([matrix[:, :2], matrix[:, 2] + matrix[:, :2] @ shift]) for shift in nearest)
-    return [Guess(one, "phase correlation", np.empty((0, 2, 2)), 0) for one in moved]
+    centre = (np.array(short.shape[::-1]) - 1) / 2
+    linear, offset = matrix[:, :2], matrix[:, 2]
+    moved = [offset + linear @ shift for shift in shifts[np.abs(shifts).max(axis=1) > 1]]
+    least = sorted(moved, key=lambda one: float(np.linalg.norm(linear @ centre + one - centre)))[:8]
+    return [Guess(np.column_stack([linear, one]), "phase correlation", np.empty((0, 2, 2)), 0) for one in least]
 
 
 def _better(short: Image, long: Image, first: Registration, second: Registration) -> Registration:
@@ -242,9 +244,13 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
     both = masks[0] & masks[1]
     if not both.any():
         return max(first, second, key=lambda one: one.peak)
-    smooth = ndimage.gaussian_filter(long, 1.0)
-    gain = _information(short, smooth, second.matrix, both) - _information(short, smooth, first.matrix, both)
-    if abs(gain) < np.sqrt(both.sum()):
+    # both are smoothed: a crystal lattice of less contrast than its shading would fit better in a brighter place
+    short, long = (ndimage.gaussian_filter(image, 1.0) for image in (short, long))
+    independent = float(both.sum()) / (4 * np.pi)  # pixels, as many as that filter leaves
+    gain = (_information(short, long, second.matrix, both) - _information(short, long, first.matrix, both)) / (
+        4 * np.pi
+    )
+    if abs(gain) < np.sqrt(independent):
         gain = float(masks[1].sum()) - float(masks[0].sum())
     return second if gain > 0 else first
 
