@@ -40,13 +40,13 @@ def measured(name: str, make: Any, seed: int) -> Row:
     """One case of one seed."""
     from calibration.exposures.frames import Burst, ExposurePair
     from calibration.pipeline import measure_exposures
-    from recon.benchmarks.provenance import origin
+    from recon.benchmarks.provenance import machine, origin
 
     case = make(seed)
     options = dict(case.options)
     dark = options.pop("dark", None)
     started = time.process_time()
-    row: Row = {"case": name, "seed": seed, "truth": case.gain, "clean": case.clean, "line": None, **origin()}
+    row: Row = {"case": name, "seed": seed, "truth": case.gain, "clean": case.clean, "line": None, "machine": machine(), **origin()}
     try:
         exposures = Burst(case.short) if case.long is None else [ExposurePair(case.short, case.long, **options)]
         found = measure_exposures(exposures, dark=None if dark is None else Burst(dark, calibration=True))
@@ -111,8 +111,9 @@ def page(rows: list[Row]) -> str:
     )
     head = "| case | true gain | gain reported (90 %) | error | verdict | reasons | photon-transfer line |\n"
     cells = {str(index): row for index, row in enumerate(rows)}
+    machines = list({json.dumps(row.get("machine")): row.get("machine") for row in rows}.values())
     table = head + "|---|---|---|---|---|---|---|\n" + "\n".join(map(line, rows))
-    return f"{text}{table}\n\n{measured_on([{'cells': cells, 'machines': []}])}\n"
+    return f"{text}{table}\n\n{measured_on([{'cells': cells, 'machines': machines}])}\n"
 
 
 def draw(rows: list[Row]) -> None:
