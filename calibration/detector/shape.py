@@ -124,7 +124,7 @@ def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 
     ratio = counted / expected_all
     departure = ratio - ndimage.uniform_filter1d(ratio, NEIGHBOURS)
     noise = (1 - 1 / NEIGHBOURS) * ndimage.uniform_filter1d(ratio, NEIGHBOURS) / expected_all
-    excess = float(np.sum(departure**2 / noise)) - len(codes)
+    excess = float(np.sum(departure**2 / np.maximum(noise, np.finfo(float).tiny))) - len(codes)  # codes left out: 0 / 0
     share = float(np.sum(departure**2 - noise)) / len(codes)
     return float(np.sqrt(share)) if excess > CLEAR * np.sqrt(2 * len(codes)) and share > 0 else 0.0
 
