@@ -224,7 +224,9 @@ def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
     )
     for frame, name, grade in looked_at:
         kind = "in blocks of 8 × 8 pixels (JPEG)" if block_compressed(frame) else ""
-        kind = kind or ("by wavelets (JPEG 2000)" if wavelet_compressed(frame) else "")
+        kind = kind or (
+            "by wavelets (JPEG 2000), or interpolated between every second pixel," if wavelet_compressed(frame) else ""
+        )
         if kind and (name == "frame" or first.frames == 1):
             text = (
                 f"the {name} was compressed {kind} or the like, which removes noise and adds its own. Give raw frames."

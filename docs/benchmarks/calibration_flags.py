@@ -46,7 +46,15 @@ def measured(name: str, make: Any, seed: int) -> Row:
     options = dict(case.options)
     dark = options.pop("dark", None)
     started = time.process_time()
-    row: Row = {"case": name, "seed": seed, "truth": case.gain, "clean": case.clean, "line": None, "machine": machine(), **origin()}
+    row: Row = {
+        "case": name,
+        "seed": seed,
+        "truth": case.gain,
+        "clean": case.clean,
+        "line": None,
+        "machine": machine(),
+        **origin(),
+    }
     try:
         exposures = Burst(case.short) if case.long is None else [ExposurePair(case.short, case.long, **options)]
         found = measure_exposures(exposures, dark=None if dark is None else Burst(dark, calibration=True))
