@@ -21,11 +21,12 @@ _MOST_LEVELS = 2**16
 
 
 class Converter(Protocol):
-    """An analogue-to-digital converter: rounds to steps and clips at two limits, detector units."""
+    """An analogue-to-digital converter: rounds to steps from an origin and clips at two limits, detector units."""
 
     step: float
     low: float
     high: float
+    origin: float
 
 
 class DigitisedDistribution(NoiseDistribution):
@@ -48,6 +49,7 @@ class DigitisedDistribution(NoiseDistribution):
         super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
         self.base: NoiseDistribution = base
         self.step, self.low, self.high = detector.step, detector.low, detector.high
+        self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
         self._detector, self._signal = detector, signal
 
     @property
@@ -105,10 +107,6 @@ class DigitisedDistribution(NoiseDistribution):
         # if the high limit lies between two levels, only values that round to the level above it are clipped
         last = math.ceil(steps - 1e-3) - 1 if math.isfinite(steps) else steps
         return self.low + self.step / 2, self._origin + (last + 0.5) * self.step
-
-    @property
-    def _origin(self) -> float:
-        return self.low if math.isfinite(self.low) else 0.0
 
     def log_prob(self, value: Tensor) -> Tensor:
         value = self._fine(value)

@@ -77,5 +77,6 @@ def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
         level: constant level, detector units.
     """
     if isinstance(model, Digitised):
-        return Digitised(at_level(model.model, level), model.step, model.low + level, model.high + level)
+        low, high, origin = model.low + level, model.high + level, model.origin + level
+        return Digitised(at_level(model.model, level), model.step, low, high, origin)
     return AtLevel(model, level)

@@ -20,6 +20,7 @@ class Digitisation(NamedTuple):
     Attributes:
         step: rounding step, detector units; 0 if pixel values are not rounded.
         low, high: clipping limits, detector units; infinite if there is none.
+        origin: the level nearest to 0, detector units; not used if `low` is finite, which is a level itself.
 
     Example:
         >>> import noiseflow
@@ -32,6 +33,7 @@ class Digitisation(NamedTuple):
     step: float = 0.0
     low: float = -math.inf
     high: float = math.inf
+    origin: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -75,7 +77,14 @@ def detect_digitisation(readings: ArrayLike) -> Digitisation:
     if not values.size:
         return Digitisation()
     step = _step(values)
-    return Digitisation(step, _rail(values, step, high=False), _rail(values, step, high=True))
+    low, high = _rail(values, step, high=False), _rail(values, step, high=True)
+    return Digitisation(step, low, high, _origin(float(values.min()), step) if step and math.isinf(low) else 0.0)
+
+
+def _origin(level: float, step: float) -> float:
+    """The level nearest to 0, given any other; 0 within the rounding errors of the step."""
+    nearest = level - step * round(level / step)
+    return nearest if abs(nearest) > 1e-3 * step else 0.0
 
 
 def _step(values: NDArray[Any]) -> float:

@@ -25,6 +25,7 @@ class Digitised(ModelAround):
         model: the noise model before digitisation.
         step: rounding step, detector units; 0 for pixel values that are clipped but not rounded.
         low, high: clipping limits, detector units; infinite if there is none.
+        origin: one of the levels, which are whole steps apart; `low` is one if it is finite.
 
     Raises:
         ValueError: the step is negative, the limits are in the wrong order, or the model has row or column offsets.
@@ -41,8 +42,16 @@ class Digitised(ModelAround):
     step: float = math.nan  # set by __init__; these attributes hide those of the inner model
     low: float = math.nan
     high: float = math.nan
+    origin: float = math.nan
 
-    def __init__(self, model: nn.Module, step: float = 1.0, low: float = -math.inf, high: float = math.inf) -> None:
+    def __init__(
+        self,
+        model: nn.Module,
+        step: float = 1.0,
+        low: float = -math.inf,
+        high: float = math.inf,
+        origin: float = 0.0,
+    ) -> None:
         super().__init__(model)
         if step < 0:
             raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
@@ -51,6 +60,7 @@ class Digitised(ModelAround):
         if self.model.shared_axis is not None:
             raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
         self.step, self.low, self.high = float(step), float(low), float(high)
+        self.origin = self.low if math.isfinite(self.low) else float(origin)
 
     def forward(self, signal: Signal) -> DigitisedDistribution:
         return DigitisedDistribution(self, self.model(given_to(self.model, signal)), values_of(signal))
@@ -60,7 +70,7 @@ class Digitised(ModelAround):
 
     def without_rails(self) -> Digitised:
         """The same detector and inner model, with rounding but without clipping."""
-        return Digitised(self.model, step=self.step)
+        return Digitised(self.model, step=self.step, origin=self.origin)
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
         """Standardise the inner model on those of the (N,) pixels that clipping does not affect, if they suffice."""
@@ -71,7 +81,9 @@ class Digitised(ModelAround):
         span = {"span": (float(values.min()), float(values.max()))} if by_level else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)
         if not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
-            self.model.settle(values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high))
+            self.model.settle(
+                values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high, self.origin)
+            )
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values.
@@ -129,8 +141,8 @@ class Digitised(ModelAround):
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model."""
-        rails = {"low": self.low, "high": self.high}
-        return {"step": self.step} | {name: rail for name, rail in rails.items() if math.isfinite(rail)}
+        rails = {name: rail for name, rail in (("low", self.low), ("high", self.high)) if math.isfinite(rail)}
+        return {"step": self.step} | rails | ({"origin": self.origin} if self.origin and "low" not in rails else {})
 
     def extra_repr(self) -> str:
         return f"step={self.step:g}, low={self.low:g}, high={self.high:g}"

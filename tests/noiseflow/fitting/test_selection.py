@@ -22,7 +22,7 @@ def test_simplest_sufficient_model_is_chosen() -> None:
     signal, observation = noisy(count=20_000)
     found = select(signal, observation, num_steps=50)
     assert found.chosen.name == "Gaussian"
-    assert found.digitisation == (0.0, -math.inf, math.inf)
+    assert found.digitisation == noiseflow.Digitisation()
     few = {"Gaussian": noiseflow.Gaussian(), "SplineFlow": noiseflow.SplineFlow()}
     clipped = select(signal, observation.clamp(0, 1), candidates=few, num_steps=30)
     assert isinstance(clipped.chosen.model, noiseflow.Digitised)

@@ -22,18 +22,18 @@ def test_continuous_readings_are_not_digitised(scale: float, offset: float) -> N
 
 
 def test_rails_are_found_only_where_readings_pile_up() -> None:
-    assert detect_digitisation(READINGS.clip(0, 1)) == (0.0, 0.0, 1.0)
-    assert detect_digitisation(READINGS.clip(-9, 1)) == (0.0, -math.inf, 1.0)
-    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 255).astype(np.uint8)) == (1.0, 0.0, 255.0)
-    assert detect_digitisation(np.round(READINGS * 50)) == (1.0, -math.inf, math.inf)
-    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 20)) == (1.0, 0.0, 20.0)
+    assert detect_digitisation(READINGS.clip(0, 1)) == Digitisation(0.0, 0.0, 1.0)
+    assert detect_digitisation(READINGS.clip(-9, 1)) == Digitisation(0.0, -math.inf, 1.0)
+    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 255).astype(np.uint8)) == Digitisation(1.0, 0.0, 255.0)
+    assert detect_digitisation(np.round(READINGS * 50)) == Digitisation(1.0, -math.inf, math.inf)
+    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 20)) == Digitisation(1.0, 0.0, 20.0)
     assert detect_digitisation(np.array([3, 255, 7], np.uint8)).high == 255.0
 
 
 @pytest.mark.parametrize("rate", [0.05, 0.3, 1.0, 10.0])
 def test_counts_of_electrons_have_no_rail_at_zero(rate: float) -> None:
     counts = np.random.default_rng(0).poisson(rate, 100_000)
-    assert detect_digitisation(counts) == (1.0, -math.inf, math.inf)
+    assert detect_digitisation(counts) == Digitisation(1.0, -math.inf, math.inf)
 
 
 @pytest.mark.parametrize("step", [1.0, 16.0, 1 / 255, 0.1, 1 / 65535])
@@ -56,7 +56,7 @@ def test_integers_are_rounded_to_their_common_step() -> None:
 def test_readings_that_are_not_finite_do_not_hide_the_rest() -> None:
     clipped = READINGS.clip(0, 1)
     clipped[:5] = np.nan, np.inf, -np.inf, np.nan, np.inf
-    assert detect_digitisation(clipped) == (0.0, 0.0, 1.0)
+    assert detect_digitisation(clipped) == Digitisation(0.0, 0.0, 1.0)
     assert detect_digitisation(np.full(4, np.nan)) == NONE
     assert detect_digitisation(np.zeros(0)) == NONE
     assert detect_digitisation(np.zeros(100)) == NONE
@@ -76,7 +76,7 @@ def test_fit_finds_rounding_and_rails_and_says_so(caplog: pytest.LogCaptureFixtu
     with caplog.at_level(logging.WARNING, logger="noiseflow"):
         result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
     assert isinstance(result.noise_model, noiseflow.Digitised)
-    assert result.digitisation == pytest.approx((1 / 20, 0.0, 1.0))
+    assert result.digitisation == pytest.approx((1 / 20, 0.0, 1.0, 0.0))
     assert "rounded to steps of 0.05 and clipped at 0 and 1" in caplog.text
     assert float(result.noise_model.model.log_scale.detach().exp()) == pytest.approx(0.1, rel=0.03)
 
@@ -84,7 +84,7 @@ def test_fit_finds_rounding_and_rails_and_says_so(caplog: pytest.LogCaptureFixtu
 def test_fit_takes_integers_and_leaves_digitised_models_alone() -> None:
     signal, observation = image(1 / 20, integer=True)
     result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
-    assert result.digitisation == (1.0, -math.inf, math.inf)
+    assert result.digitisation == Digitisation(1.0, -math.inf, math.inf)
     assert float(result.noise_model.model.log_scale.detach().exp()) == pytest.approx(2.0, rel=0.03)
     for given in (noiseflow.Digitised(noiseflow.Gaussian(), step=1.0), noiseflow.Poisson()):
         result = noiseflow.fit(given, signal, observation, num_steps=2)
@@ -149,3 +149,19 @@ def test_likelihood_is_the_same_pixel_by_pixel_as_by_reading(step: float, rails:
     by_pixel = model(signals.repeat_interleave(9)).log_prob(readings.repeat(29)).view(29, 9)
     torch.testing.assert_close(by_reading, expected, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(by_pixel, by_reading)
+
+
+@pytest.mark.parametrize(("step", "origin"), [(2.0, 1.0), (0.1, 0.03), (4.0, -1.0)])
+def test_levels_that_are_no_multiples_of_the_step_are_sampled_where_they_are(step, origin, tmp_path):
+    values = origin + step * np.random.default_rng(0).normal(300, 20, 20_000).round()
+    found = detect_digitisation(values)
+    assert (found.step, found.origin) == (pytest.approx(step), pytest.approx(origin, abs=1e-3 * step))
+    model = noiseflow.Digitised(noiseflow.Gaussian(20 * step), *found)
+    noiseflow.save(model, tmp_path / "model.safetensors")
+    for one in (model, noiseflow.load(tmp_path / "model.safetensors")):
+        distribution = one(torch.full((4096,), 300 * step, dtype=torch.float64))
+        drawn = distribution.sample(generator=torch.Generator().manual_seed(0))
+        away = (drawn - origin) / step
+        assert torch.allclose(away, away.round(), atol=1e-2)
+        assert torch.isfinite(distribution.log_prob(drawn)).all()
+        assert bool(distribution.support.check(drawn).all())
