@@ -68,7 +68,7 @@ def calibrate(
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Measure a detector's gain, offset and read noise and fit a noise model: from exposure pairs, a burst, or flats and darks."""
+    """Measure a detector's gain, offset and read noise and fit a noise model, using exposure pairs, a burst, or flats and darks."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.camera import MAPS, map_path

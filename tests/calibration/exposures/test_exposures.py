@@ -77,7 +77,7 @@ def test_burst_is_read_from_a_stack_or_from_files(tmp_path):
     write(tmp_path / "b.npy", OTHER)
     stack, files = read_burst([tmp_path / "stack.tif"]), read_burst([tmp_path / "a.npy", tmp_path / "b.npy"])
     np.testing.assert_array_equal(stack.frames, files.frames)
-    with pytest.raises(ValueError, match=r"a\.npy holds only one frame"):
+    with pytest.raises(ValueError, match=r"a\.npy contains only one frame"):
         read_burst([tmp_path / "a.npy"])
-    with pytest.raises(ValueError, match="the dark frames hold only one frame"):
+    with pytest.raises(ValueError, match="the dark frames contain only one frame"):
         read_burst([tmp_path / "a.npy"], name="the dark frames", calibration=True)
