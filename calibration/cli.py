@@ -68,13 +68,14 @@ def calibrate(
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Measure a detector's gain, offset and read noise and fit a noise model, using exposure pairs, a burst, or flats and darks."""
+    """Measure a detector's gain, offset and read noise and fit a noise model, from exposure pairs, bursts, or flats and darks."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.camera import MAPS, map_path
     from calibration.detector.models import SIMPLE, require_kind
     from calibration.pipeline import saved_model
-    from calibration.report.page import LABELS, write_report
+    from calibration.report.figures import LABELS
+    from calibration.report.page import write_report
     from noiseflow.io import check_folder, check_output, require_other
     from noiseflow.io.model_files import MODEL_SUFFIXES
 

@@ -147,8 +147,8 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     """Find the transform from the short frame to the long one.
 
     The initial guess comes from SIFT matches, Lowe's ratio test and RANSAC, or from the peak of the cross-correlation if the
-    scene has too few features. Maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to sub-pixel
-    accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
+    scene has too few features. Maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
+    sub-pixel accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
 
     A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CLEAR_PEAK`); they correlate
     almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
@@ -243,7 +243,8 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
     """Select one of two registrations.
 
     If only one preserves the contrast, it is selected: shifted by half a period, a crystal lattice may equal its negative.
-    Otherwise the one with the higher likelihood on the common area is selected, or, within its statistical error, the one that covers more.
+    Otherwise the one with the higher likelihood on the common area is selected; within the statistical error of the likelihood,
+    the one that covers more.
     """
     if first.inverted != second.inverted:
         return second if first.inverted else first

@@ -19,7 +19,7 @@ from .conftest import textured_scene
 
 PARTS = (
     *("Photon transfer", "Posterior of gain", "Residuals of the held-out pixels", "QQ", "PIT", "row and column"),
-    *("before and after registration", "Verdict", "suffices", "are registered to", "excess noise"),
+    *("before and after registration", "Verdict", "suffices", "registered to within", "excess noise"),
 )
 """What a reader of the report must find."""
 
