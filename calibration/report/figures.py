@@ -214,7 +214,7 @@ def corner_figure(detector: Detector) -> Figure:
 def _legend_below(figure: Figure, axis: Any) -> None:
     """Place the legend of an axis below the figure, where long names cover no data."""
     handles, names = axis.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)), fontsize=9, frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)), fontsize=9, frameon=False)
 
 
 def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
