@@ -123,8 +123,7 @@ def calibrate_exposures(
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
     with bar("Fitting noise models", len(KINDS)) as progress:
-        scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type:
-        ignore[arg-type]
+        scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
     return replace(measured, pixels=pixels, scores=scores)
 
 

@@ -358,8 +358,7 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
     for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
         try:
-            _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type:
-            ignore[call-overload]
+            _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type: ignore[call-overload]
         except cv2.error:  # raised if the iteration does not converge
             moved = np.full_like(matrix, np.inf)
         if np.linalg.norm((moved - start) @ centre) <= reach:
