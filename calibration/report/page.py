@@ -278,7 +278,7 @@ def _add_models(page: Report, findings: Findings) -> None:
     )
     page.figure(
         pit_figure(findings.scores),
-        caption="Probability integral transform (PIT) of the held-out pixels, and QQ plot. Grey: expected range of a correct model.",
+        caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
     )
 
 
