@@ -159,7 +159,7 @@ class LevelMasses:
     def _transform(
         self, gain: Image, offset: Image, read_noise: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        """Return the transform of the cells at the significant frequencies, and its logarithmic derivative by the mean signals."""
+        """Return the cell transforms at the significant frequencies, and their logarithmic derivative by the mean signals."""
         number = min(max(self._number, self._least_number(gain, read_noise)), self._most)
         while True:
             frequency, cell = self._frequencies(number)
@@ -269,9 +269,7 @@ class LevelMasses:
         # electrons.
         rate = np.maximum(electrons, 1e-9)
         exponent = rate * cumulant / (1 - 0.5 * spread / rate * cumulant)
-        wide = np.flatnonzero(
-            levels.spread * lit > 0.3 * levels.variance
-        )  # the exact form is needed only for a wide spread
+        wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # only these need the exact form
         if wide.size:
             exponent[:, wide], _ = _gamma_mixed(cumulant[:, wide], electrons[:, wide], spread[:, wide], False)
         exponent = exponent + (1 + levels.read_share[:, None]) * read

@@ -20,7 +20,7 @@ _LITTLE_NOISE = 0.1
 """Share of the residual variance due to the signal below which little smoothing of the signal suffices."""
 _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
 """Smoothing of the signal that sorts the residuals, pixels. It is as small as the noise allows: at the same local average, a peak
-in the dark part of a crystal lattice is noisier than a trough in the bright part."""
+in the dark part of a crystal lattice is noisier than a valley in the bright part."""
 CUT = 5.0
 """Standard deviations at which residuals are clipped, to limit the effect of defects."""
 
