@@ -194,8 +194,8 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
         )
     if mean.mean() >= first.mean():
         raise ValueError(
-            f"{dark.name}: the mean is {mean.mean():.5g} counts, that of the exposure {first.mean():.5g}; dark frames must be "
-            "darker: swap the files, or record dark frames at the same offset setting"
+            f"{dark.name}: the mean is {mean.mean():.5g} counts, that of the exposure {first.mean():.5g}; dark frames must not "
+            "be brighter: swap the files, or record dark frames at the same offset setting"
         )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
     return None if np.var(mean) < 2 * noise else np.asarray(mean - mean.mean())

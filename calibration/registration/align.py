@@ -154,7 +154,8 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
     `CONCLUSIVE_INLIERS` matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
     cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
-    the most likely one is returned, which is the smallest for a perfect lattice, whose residuals are equal at all of them.
+    the most likely one is returned, which is the smallest for a perfect crystal lattice, whose residuals are equal at all of
+    them.
 
     Args:
         short: (y, x) detector units.
@@ -252,7 +253,7 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
     both = masks[0] & masks[1]
     if not both.any():
         return max(first, second, key=lambda one: one.peak)
-    # smooth both, or a lattice with less contrast than its shading would fit better in a brighter region
+    # smooth both, or a crystal lattice with less contrast than its shading would fit better in a brighter region
     short, long = (ndimage.gaussian_filter(image, 1.0) for image in (short, long))
     independent = float(both.sum()) / (4 * np.pi)  # number of independent pixels after the filter
     gain = (_information(short, long, second.matrix, both) - _information(short, long, first.matrix, both)) / (
@@ -363,7 +364,7 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
             moved = np.full_like(matrix, np.inf)
         if np.linalg.norm((moved - start) @ centre) <= reach:
             matrix = np.asarray(moved, float)
-        elif blur == 5:  # the coarse step may fail, because it blurs a fine lattice away
+        elif blur == 5:  # the coarse step may fail, because it blurs a fine crystal lattice away
             return None
     return matrix
 

@@ -21,7 +21,7 @@ INLIER_DISTANCE = 2.0
 """Largest distance between a match and the transform it agrees with, pixels."""
 
 INVERTED = 0.8
-"""Weight of a negative correlation: a lattice shifted by half a period resembles its negative, and a shift is more likely."""
+"""Weight of a negative correlation: a crystal lattice shifted by half a period resembles its negative; a shift is likelier."""
 
 
 @dataclass(frozen=True)

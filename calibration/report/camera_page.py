@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.camera import Camera, rows_of
-from calibration.report.figures import correlation_figure
+from calibration.report.figures import correlation_figure, plain_log_ticks
 from noiseflow.io import output_folder
 from noiseflow.report import Report, new_figure, provenance, show_image
 
@@ -51,7 +51,7 @@ def write_camera_report(
     page.table(("figure", "value"), rows_of(camera), prose=True)
     page.figure(
         transfer_figure(camera),
-        caption="Photon-transfer curve with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
+        caption="Photon transfer: variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
     )
     page.figure(
         correlation_figure(camera.figures.correlation),
@@ -98,6 +98,7 @@ def transfer_figure(camera: Camera) -> Figure:
     axes[0, 2].loglog(
         electrons[used], (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used], "o-", markersize=3
     )
+    plain_log_ticks(axes[0, 2])
     axes[0, 2].set_xlabel("electrons per pixel")
     axes[0, 2].set_ylabel("signal-to-noise ratio")
     return figure

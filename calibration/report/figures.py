@@ -179,6 +179,7 @@ def snr_figure(figures: Figures, brightest: float) -> Figure:
     noise = np.sqrt(electrons + (read.median**2 if read else 0.0))
     axes[0, 0].loglog(electrons, electrons / noise, label="this detector")
     axes[0, 0].loglog(electrons, np.sqrt(electrons), linestyle="--", color="0.5", label="shot-noise limit")
+    plain_log_ticks(axes[0, 0])
     axes[0, 0].set_xlabel("electrons per pixel")
     axes[0, 0].set_ylabel("signal-to-noise ratio")
     axes[0, 0].legend(fontsize=8)
@@ -209,6 +210,16 @@ def corner_figure(detector: Detector) -> Figure:
             if column == 0 and row > 0:
                 axis.set_ylabel(PARAMETERS[row], fontsize=9)
     return figure
+
+
+def plain_log_ticks(axis: Any) -> None:
+    """Label logarithmic axes at 1, 2 and 5 times powers of ten; the default labels overlap if the range is short."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    for one in (axis.xaxis, axis.yaxis):
+        one.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=10))
+        one.set_major_formatter("{x:g}")
+        one.set_minor_formatter(NullFormatter())
 
 
 def _legend_below(figure: Figure, axis: Any) -> None:
