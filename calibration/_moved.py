@@ -1,4 +1,4 @@
-"""Modules of this package before they were sorted into folders: old name → new. Kept for one version."""
+"""Former module names of this package: old name → new name. Kept for one version."""
 
 MOVED = {
     "align": "registration.align",

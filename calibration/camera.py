@@ -1,4 +1,4 @@
-"""A camera calibrated from flats and darks alone: EMVA 1288 figures, their verdict, per-pixel maps and a noise model."""
+"""Camera calibration from flats and darks: EMVA 1288 figures, their verdict, per-pixel maps and a noise model."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ if TYPE_CHECKING:
     from torch import nn
 
 EXCESS = 1.2
-"""F² from which on a detector multiplies electrons: direct detectors and electron-multiplying CCDs have 1.4 to 2."""
+"""Smallest excess-noise factor F² of a detector that multiplies electrons: direct detectors and EMCCDs have 1.4 to 2."""
 
 LARGEST_CHI_SQUARED = 4.0
-"""χ² per degree of freedom of the photon-transfer line above which it is bent."""
+"""χ² per degree of freedom above which the photon-transfer curve counts as nonlinear."""
 
 STEADY = 0.003
-"""Relative change of the light between equal frames that needs no warning."""
+"""Largest relative change of the light between equal frames without a warning."""
 
 LEAST_FRAMES = 8
-"""Frames from which on a pixel's own variance is known to a factor of 1.5, so that a map of it tells something."""
+"""Fewest frames for a variance map: each pixel's variance is then known to a factor of 1.5."""
 
 SURE = 10.0
-"""Standard errors by which the pixels' variances must differ: the logarithm of a variance of two frames has heavier tails than
-that error allows for."""
+"""Standard errors by which the variances of the pixels must differ. The threshold is high because the logarithm of a variance
+estimated from two frames has heavy tails."""
 
 COARSE = 0.5
-"""Rounding steps of read noise below which the variance of rounded values depends by over 3 % on where between two codes a
-pixel's mean lies, so that the pixels would differ though their noise does not."""
+"""Read noise, in rounding steps, below which the variance of rounded values depends by over 3 % on the position of the mean
+between two codes. Pixels with equal noise would then appear to differ."""
 
 LEAST_READ = 0.01
-"""Share of the usual variance below which no pixel's read noise is put: rounding hides less."""
+"""Lower bound of a pixel's read-noise variance, relative to the typical variance; rounding hides smaller values."""
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
-"""Names of the maps; offset and variance need dark frames."""
+"""Names of the maps; offset and variance require dark frames."""
 
 
 @described()
@@ -52,11 +52,11 @@ class Camera:
     """A calibrated camera.
 
     Attributes:
-        figures: what EMVA 1288 reports, the gain before any filter.
-        verdict: how far they can be believed.
-        maps: (y, x) by name: ``offset`` counts, ``variance`` counts² in darkness, ``response`` relative, ``gain`` counts per
-            electron if all pixels catch light alike, ``defects`` 1 where a pixel stands out of all others.
-        model: noise model with the maps of offset, response and, where the dark frames tell one, read-noise variance.
+        figures: EMVA 1288 figures; the gain is the one before any filter.
+        verdict: their reliability.
+        maps: (y, x) arrays by name: ``offset`` in counts, ``variance`` in darkness in counts², relative ``response``, ``gain`` in
+            counts per electron (assuming equal quantum efficiency), ``defects``, 1 for an outlier pixel.
+        model: noise model with the maps of offset, response and, where the dark frames determine it, read-noise variance.
     """
 
     figures: CameraFigures
@@ -72,7 +72,7 @@ def calibrate_camera(
     flat_times: Sequence[float] | None = None,
     dark_times: Sequence[float] | None = None,
 ) -> Camera:
-    """Calibrate a camera. Arguments and errors as `measure_camera`."""
+    """Calibrate a camera; see `measure_camera` for arguments and errors."""
     measured = measure_camera(flats, darks, flat_times=flat_times, dark_times=dark_times)
     figures = _before_filter(measured)
     maps = maps_of(figures)
@@ -80,7 +80,7 @@ def calibrate_camera(
 
 
 def judge_camera(figures: CameraFigures) -> Verdict:
-    """Test what the figures assume."""
+    """Test the assumptions behind the figures."""
     found: list[Reason] = []
 
     def add(name: str, grade: Grade, text: str) -> None:
@@ -88,62 +88,66 @@ def judge_camera(figures: CameraFigures) -> Verdict:
 
     correlation = figures.correlation
     if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
-        text = "neighbouring pixels' noise correlates: the frames were filtered, resampled or binned"
+        text = "the noise of neighbouring pixels is correlated: the frames were filtered, resampled or binned"
         if correlation.local and correlation.factor > 0.5:
             add(
                 "correlated pixels",
                 "doubtful",
-                f"{text}; the gain reported is the one before, {correlation.factor:.3g} times as large.",
+                f"{text}. The reported gain applies before this step and is {correlation.factor:.3g} times as large. "
+                "Use raw frames to be sure.",
             )
         else:
-            add("correlated pixels", "bad", f"{text}, or carry row noise or interference. Give raw frames.")
+            add("correlated pixels", "bad", f"{text}, or contain row noise or interference. Use raw frames.")
     if correlation.period:
         add(
             "periodic noise",
             "bad",
-            f"the noise repeats itself every {correlation.period:.3g} pixels: resampled or compressed. Give raw frames.",
+            f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled or compressed. "
+            "Use raw frames.",
         )
     found += frames_correlated(figures.lag)
     if figures.chi_squared > LARGEST_CHI_SQUARED:
-        text = f"variance against signal is no straight line (χ² per degree of freedom {figures.chi_squared:.1f})"
-        add("bent line", "doubtful", text + ": light that flickers, or a converter that is not linear.")
+        text = f"the variance is not linear in the signal (χ² per degree of freedom {figures.chi_squared:.1f})"
+        add(
+            "bent line",
+            "doubtful",
+            text + ": flickering light or a nonlinear converter. Check the photon-transfer plot.",
+        )
     flicker = max(level.flicker for level in figures.levels)
     if flicker > STEADY:
         add(
             "unsteady light",
             "doubtful",
-            f"the light changed by {flicker:.1%} between equal frames; its mean was taken out. Use a steadier source.",
+            f"the light changed by {flicker:.1%} between equal frames; this was corrected. Use a more stable source.",
         )
     if figures.dark is None:
         add(
             "no dark frames",
             "doubtful",
-            "without dark frames offset, dark noise, dynamic range, DSNU and PRNU are not determined.",
+            "there are no dark frames, so offset, dark noise, dynamic range, DSNU and PRNU are not determined. Give --dark.",
         )
     elif figures.dark.clipped:
-        text = f"{figures.dark.clipped:.1%} of the dark frames' pixel values lie at the converter's end: offset, dark noise, "
-        text += (
-            "dynamic range and DSNU are not those of the camera, and the gain is from the flats alone. Raise the offset"
-        )
+        text = f"{figures.dark.clipped:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
+        text += "DSNU are biased, and the gain is determined from the flats alone. Increase the camera's offset"
         add("clipped darkness", "doubtful", text + " setting.")
     elif figures.dark.coarse:
-        text = "the noise of the dark frames is finer than the converter's codes, which hide it: dark noise and dynamic range"
-        add("coarse codes", "doubtful", text + " are not determined. The gain is from the flats alone.")
+        text = "the noise of the dark frames is smaller than the converter's rounding step: dark noise and dynamic range are not "
+        add("coarse codes", "doubtful", text + "determined, and the gain is determined from the flats alone.")
     number = len(figures.linear)
     if number < 3:
         below = " below saturation" if number < len(figures.levels) else ""
         add(
             "few levels",
             "doubtful",
-            f"{number} level{'s' * (number > 1)} of light{below} cannot show a bent line; give three or more.",
+            f"{number} level{'s' * (number > 1)} of light{below} cannot reveal a nonlinear response. Give three or more.",
         )
     if not figures.saturated:
-        add("not saturated", "doubtful", "no level reaches saturation: capacity and dynamic range are lower bounds.")
+        add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
     return verdict_of([one for one in found if one.name != "not saturated"])
 
 
 def maps_of(figures: CameraFigures) -> dict[str, Image]:
-    """Maps of the pixels; without dark frames, of their response alone."""
+    """Return the per-pixel maps, each (y, x); without dark frames no ``offset`` and ``variance``."""
     response = figures.response
     maps = {"response": response, "gain": figures.gain.median * response}
     if figures.dark is not None:
@@ -153,10 +157,10 @@ def maps_of(figures: CameraFigures) -> dict[str, Image]:
 
 
 def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.Module:
-    """The noise model of raw frames: that of a mean pixel, seen through the maps of offset, response and read-noise variance.
+    """Return the noise model of raw frames: the average pixel's model with the maps of offset, response and read-noise variance.
 
-    Its signals are those of a mean pixel; what the maps cannot carry, such as pixels without response, is clipped. A detector
-    that multiplies electrons reads all pixels through one amplifier, so that it has no map of variance.
+    The model's signals are those of an average pixel. Values that the maps cannot represent, such as pixels without response, are
+    clipped. A detector that multiplies electrons reads all pixels through one amplifier and therefore has no variance map.
     """
     import noiseflow
 
@@ -183,16 +187,18 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
 
 
 def read_variance(figures: CameraFigures, step: float) -> Image | None:
-    """(y, x) read-noise variance, counts², as well as the dark frames tell it; None where the pixels do not differ, where
-    rounding hides it, or without dark frames.
+    """Estimate the read-noise variance of every pixel, (y, x) counts², by empirical Bayes (doi:10.2202/1544-6115.1027).
 
-    A variance of few frames scatters by itself. Its logarithm scatters by more where the pixels differ; the scaled inverse χ²
-    distribution of that spread is the prior, and the inverse of the posterior mean of 1/variance is returned, whose average is a
-    little below that of the variances (doi:10.2202/1544-6115.1027).
+    A variance estimated from few frames scatters even if all pixels are equal. The excess scatter of its logarithm determines a
+    scaled inverse χ² prior. The result is the inverse of the posterior mean of 1/variance; its average is slightly below that of
+    the variances.
 
     Args:
-        figures: of the camera.
-        step: of rounding, counts; its variance is not read noise.
+        figures: figures of the camera.
+        step: rounding step, counts; its variance is not part of the read noise.
+
+    Returns:
+        The map, or None if the pixels do not differ, rounding hides the variance, or there are no dark frames.
     """
     from scipy.optimize import brentq
     from scipy.special import digamma, polygamma
@@ -214,12 +220,12 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
 
 
 def map_path(model: Path, name: str) -> Path:
-    """Where the map of this name, one of `MAPS`, is written: beside the model file."""
+    """Return the path of a map, one of `MAPS`, next to the model file."""
     return model.with_name(f"{model.stem}_{name}.tif")
 
 
 def write_maps(camera: Camera, model: Path) -> list[Path]:
-    """Write each map as a 32-bit TIFF beside the model file; returns the paths."""
+    """Write each map as a 32-bit TIFF next to the model file, and return the paths."""
     from noiseflow.io import write
 
     paths = []
@@ -231,7 +237,7 @@ def write_maps(camera: Camera, model: Path) -> list[Path]:
 
 
 def rows_of(camera: Camera) -> list[tuple[str, str]]:
-    """The figures as names and texts."""
+    """Return the figures as (name, formatted value)."""
     figures = camera.figures
     gain, per_count = figures.gain, 1 / figures.gain.median
     rows = [
@@ -249,7 +255,7 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
             else ("" if figures.saturated else "≥ ")
             + f"{figures.dynamic_range:.4g} ({20 * np.log10(figures.dynamic_range):.1f} dB)",
         ),
-        ("largest SNR", f"{figures.snr_maximum:.4g} ({20 * np.log10(figures.snr_maximum):.1f} dB)"),
+        ("maximum SNR", f"{figures.snr_maximum:.4g} ({20 * np.log10(figures.snr_maximum):.1f} dB)"),
         (
             "linearity error",
             "not determined (give --flat-time)"
@@ -269,7 +275,7 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
 
 
 def summary_of(camera: Camera) -> dict[str, Any]:
-    """The figures as plain values."""
+    """Return the figures as plain values."""
     figures = camera.figures
     names = (
         "offset",
@@ -302,7 +308,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
 
 
 def _before_filter(figures: CameraFigures) -> CameraFigures:
-    """The figures with the gain before a filter that keeps the mean, where one is found."""
+    """Return the figures before a mean-preserving filter, if the correlation shows one."""
     correlation: Correlation = figures.correlation
     if not (correlation.found and correlation.local and correlation.factor > 3 * correlation.factor_error):
         return figures
@@ -321,7 +327,7 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
 
 
 def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
-    """Pixels that stand out of all others by eight robust standard deviations in offset or response, or by noise tenfold."""
+    """Pixels off the median by eight robust standard deviations in offset or response, or with ten times the median variance."""
     found = np.zeros(maps["response"].shape, bool)
     for name in ("response", "offset"):
         if name in maps:

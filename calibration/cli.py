@@ -29,25 +29,25 @@ def calibrate(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
     short: Annotated[
         list[Path] | None,
-        typer.Option(help="Short exposures, in order; without --long, the frames of a burst (a stack or files)."),
+        typer.Option(
+            help="Short exposures, in order. Without --long: the frames of a burst, as one stack or several files."
+        ),
     ] = None,
     long: Annotated[
-        list[Path] | None, typer.Option(help="Long exposures: one for each short one, or one for all.")
+        list[Path] | None, typer.Option(help="Long exposures: one per short exposure, or one for all.")
     ] = None,
     dark: Annotated[
-        list[Path] | None, typer.Option(help="Two or more frames without light; they fix the offset.")
+        list[Path] | None, typer.Option(help="Two or more frames taken without light; they determine the offset.")
     ] = None,
     flat: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Equal frames of even illumination; without --short, a stack for each level of light (EMVA 1288)."
-        ),
+        typer.Option(help="Frames of uniform illumination. Without --short: one stack per light level (EMVA 1288)."),
     ] = None,
     flat_time: Annotated[
-        list[float] | None, typer.Option(help="Exposure time of each level of --flat, in seconds.")
+        list[float] | None, typer.Option(help="Exposure time of each --flat level, in seconds.")
     ] = None,
     dark_time: Annotated[
-        list[float] | None, typer.Option(help="Exposure time of each stack of --dark, in seconds.")
+        list[float] | None, typer.Option(help="Exposure time of each --dark stack, in seconds.")
     ] = None,
     kind: Annotated[
         str,
@@ -59,22 +59,23 @@ def calibrate(
     exposure_ratio: Annotated[
         float | None,
         typer.Option(
-            help="Exposure time of the long over that of the short exposure, at one detector setting; it fixes the offset."
+            help="Ratio of the long to the short exposure time, at the same detector setting; it determines the offset."
         ),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Folder for report.html.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Folder to write report.html to.")] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """Learn a detector's gain, offset, read noise and noise model from exposure pairs, a burst, or flats and darks."""
+    """Measure a detector's gain, offset and read noise and fit a noise model, from exposure pairs, bursts, or flats and darks."""
     import noiseflow
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.camera import MAPS, map_path
     from calibration.detector.models import SIMPLE, require_kind
     from calibration.pipeline import saved_model
-    from calibration.report.page import LABELS, write_report
+    from calibration.report.figures import LABELS
+    from calibration.report.page import write_report
     from noiseflow.io import check_folder, check_output, require_other
     from noiseflow.io.model_files import MODEL_SUFFIXES
 
@@ -92,9 +93,13 @@ def calibrate(
         _calibrate_camera(flat or [], dark or [], flat_time, dark_time, output, report, seed, Output(json))
         return
     if flat_time or dark_time:
-        raise ValueError("--flat-time and --dark-time belong to flats without exposures of a scene; leave --short out")
+        raise ValueError(
+            "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
+        )
     if not long and exposure_ratio is not None:
-        raise ValueError("--exposure-ratio is given without --long; a burst of equal exposures has none")
+        raise ValueError(
+            "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
+        )
     exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
     findings = calibrate_exposures(
         exposures,
@@ -127,7 +132,7 @@ def _calibrate_camera(
     seed: int,
     out: Output,
 ) -> None:
-    """From flats and darks alone: figures as EMVA 1288 reports them, maps beside the model file."""
+    """Calibrate from flats and darks: report EMVA 1288 figures, and write maps next to the model file."""
     import noiseflow
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
     from calibration.exposures.frames import read_burst, read_levels
@@ -135,7 +140,7 @@ def _calibrate_camera(
 
     if not flat:
         raise ValueError(
-            "neither --short nor --flat was given; give exposures of a scene, or flat frames at several levels of light"
+            "neither --short nor --flat was given; give exposures of a scene, or flat frames at several light levels"
         )
     darks = []
     if dark:
@@ -160,7 +165,7 @@ def _calibrate_camera(
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """What the findings hold, as plain values: ``detector``, ``registration``, ``models``."""
+    """Return the findings as plain values: ``verdict``, ``reasons``, ``detector``, ``registration``, ``models``, ``burst``."""
     found: dict[str, Any] = {
         "verdict": findings.verdict.grade,
         "reasons": [vars(reason) for reason in findings.verdict.reasons],
@@ -174,7 +179,7 @@ def summary(findings: Findings) -> dict[str, Any]:
 
 
 def _device(name: str) -> Any:
-    """The device to fit on; with one thread on a processor: batches of some thousand pixels gain nothing from more."""
+    """Return the device to fit on, and limit a CPU to one thread: batches of a few thousand pixels gain nothing from more."""
     import torch
 
     chosen = choose_device(name)
@@ -198,9 +203,7 @@ def _report(out: Output, findings: Findings) -> None:
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"Pair {number}: {describe_registration(pair)}")
     out.line("\nDetector: " + describe_detector(findings))
-    out.line(
-        "\nDivergences in units of 1e-4, each beside its floor: the value that samples of the model itself would reach"
-    )
+    out.line("\nDivergences in units of 1e-4; floor: expected value for samples drawn from the model itself")
     out.table(TABLE_HEADER, table_rows(findings.scores))
     out.line("\n" + "\n".join(judge(findings)))
 

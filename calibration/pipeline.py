@@ -1,4 +1,4 @@
-"""The whole calibration in one call: align, measure the detector, fit and judge the noise models."""
+"""The complete calibration in one call: align, measure the detector, fit and evaluate the noise models."""
 
 from __future__ import annotations
 
@@ -30,31 +30,31 @@ if TYPE_CHECKING:
     from noiseflow.commands.console import Progress
 
 Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
-"""``bar(title, total)``: a context that gives a progress callback."""
+"""``bar(title, total)``: context manager that returns a progress callback."""
 
 CONTRADICTED = (
-    "the pixel values contradict every Poisson-Gaussian detector; give raw frames, neither compressed nor rescaled"
+    "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
 )
-"""Why likelihoods have no curvature left."""
+"""Message for a likelihood whose curvature matrix is singular."""
 
 
 @described()
 @dataclass(frozen=True)
 class Findings:
-    """All that a calibration found.
+    """Results of a calibration.
 
     Attributes:
         pairs: aligned pairs, or the frames of a burst.
-        pixels: what the models were fitted to and judged by.
-        scores: of the models.
-        detector: None where no gain shows.
-        no_detector: why not.
-        burst: what moved or faded; None for pairs.
-        figures: gain, offset and read noise as reported; None where no gain shows.
-        verdict: how far they can be believed.
-        correlation: between the residuals of neighbouring pixels.
-        repairs: what of the exposures was modelled before the detector was measured.
-        pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None: none was.
+        pixels: pixels used to fit and evaluate the models.
+        scores: scores of the models.
+        detector: the measured detector; None if the gain cannot be measured.
+        no_detector: the reason, if `detector` is None.
+        burst: drift and dose along a burst; None for pairs.
+        figures: reported gain, offset and read noise; None if the gain cannot be measured.
+        verdict: their reliability.
+        correlation: correlation of the residuals of neighbouring pixels.
+        repairs: violated assumptions that were modelled before the measurement.
+        pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -92,19 +92,19 @@ def calibrate_exposures(
     device: Any = "cpu",
     bar: Bar = lambda title, total: nullcontext(),
 ) -> Findings:
-    """Align exposures, measure the detector, and fit and judge every noise model.
+    """Align exposures, measure the detector, and fit and evaluate the noise models.
 
     Args:
-        exposures: pairs, or one burst.
-        dark: frames without light.
-        flat: equal frames of even illumination.
-        kinds: noise models to fit; see `fit_models`.
-        seed: of every random choice.
-        device: torch device of the fits.
-        bar: makes progress bars.
+        exposures: exposure pairs, or one burst.
+        dark: frames taken without light.
+        flat: frames of uniform illumination.
+        kinds: names of the noise models to fit; see `fit_models`.
+        seed: random seed.
+        device: torch device for the fits.
+        bar: function that creates progress bars.
 
     Raises:
-        ValueError: exposures that cannot be aligned, or a posterior that does not converge.
+        ValueError: the exposures cannot be aligned, or the posterior does not converge.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -135,7 +135,7 @@ def measure_exposures(
     seed: int = 0,
     bar: Bar = lambda title, total: nullcontext(),
 ) -> Findings:
-    """Align exposures, measure the detector and judge its figures, without fitting noise models. As `calibrate_exposures`."""
+    """Align exposures, measure the detector and test its results, without noise models; arguments as `calibrate_exposures`."""
     pattern = None
     for frames in (dark, flat):
         if frames is not None:
@@ -169,7 +169,7 @@ def measure_exposures(
 
 
 def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
-    """The pair with the signal's own noise from the exposures' scale: a filter has taken it out of the finest band."""
+    """Return the pair with the signal's noise computed from the exposure ratio: a filter removed it from the finest band."""
     if pair.frames > 1 or not 0 < pair.scaling.slope < 1:
         return pair
     share = pair.scaling.slope / (1 + pair.scaling.slope)
@@ -178,39 +178,38 @@ def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
 
 
 def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Image | None:
-    """The dark frames' fixed pattern, (y, x) counts of mean 0, where the mean dark frame knows it better than its own noise;
-    else None.
+    """Return the fixed pattern of the dark frames, (y, x) counts with mean 0; None if it is not significant.
 
-    The pattern's mean stays in the exposures, so that the offset does.
+    The mean is not part of the pattern, so the exposures keep their offset.
 
     Raises:
-        ValueError: dark frames of another size, or brighter than the exposures.
+        ValueError: the dark frames differ in size from the exposures, or are brighter.
     """
     mean = dark.frames.mean(0)
     first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
     if mean.shape != first.shape:
         raise ValueError(
-            f"{dark.name}: {mean.shape} pixels, but the exposures have {first.shape}; take dark frames with the same "
+            f"{dark.name}: {mean.shape} pixels, but the exposures have {first.shape}; record dark frames with the same "
             "binning and region"
         )
     if mean.mean() >= first.mean():
         raise ValueError(
-            f"{dark.name}: mean {mean.mean():.5g} counts, the exposure {first.mean():.5g}; dark frames cannot be the "
-            "brighter ones: swap them, or take them at the same offset setting"
+            f"{dark.name}: the mean is {mean.mean():.5g} counts, that of the exposure {first.mean():.5g}; dark frames must not "
+            "be brighter: swap the files, or record dark frames at the same offset setting"
         )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
     return None if np.var(mean) < 2 * noise else np.asarray(mean - mean.mean())
 
 
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
-    """Exposures less a fixed pattern, (y, x) counts."""
+    """Subtract a fixed pattern, (y, x) counts, from the exposures."""
     if isinstance(exposures, Burst):
         return replace(exposures, frames=exposures.frames - pattern)
     return [_less(pair, pattern) for pair in exposures]
 
 
 def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
-    """The model as it applies to raw frames: with the dark frames' pattern, where that was subtracted before it was fitted."""
+    """Return the model for raw frames: it adds the pattern of the dark frames if that was subtracted before the fit."""
     if findings.pattern is None:
         return model
     import noiseflow

@@ -1,4 +1,4 @@
-"""Gain, offset and read noise from aligned exposures, and which noise model suffices."""
+"""Gain, offset and read noise from aligned exposures, and selection of a noise model."""
 
 import lazy_loader as _lazy
 

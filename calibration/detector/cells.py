@@ -1,4 +1,4 @@
-"""Histograms of the pixel values themselves, at signal levels chosen by noisy estimates: what residuals blur stays visible."""
+"""Histograms of pixel values at signal levels selected by noisy estimates; they keep details that residuals blur."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
 
 LEVEL_WIDTH = 0.8
-"""Standard deviations of the noise that a level of unaltered pixel values spans."""
+"""Width of a level in a histogram of pixel values, in standard deviations of the noise."""
 
 LEAST_READINGS = 100
-"""Pixel values that such a level needs."""
+"""Smallest number of pixel values in such a level."""
 
 MOST_CELLS = 512
-"""Cells of such a level's histogram."""
+"""Largest number of histogram cells of such a level."""
 
 
 def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
-    """Sort pixel values by their own estimated signal and count them as they are, on the converter's own codes.
+    """Sort pixel values by their estimated signal and compute histograms on the converter's codes.
 
-    That keeps what a residual blurs: rounding, clipping and the peaks of single electrons. Choosing pixels by an estimate
-    that is noisy itself makes the true signals regress towards where signals are common; `true_moments` says how far.
+    These histograms keep what residuals blur: rounding, clipping and single-electron peaks. Selection by a noisy estimate causes
+    regression of the true signals towards more frequent signals, which `true_moments` quantifies.
 
     Args:
-        readings: of exposure pairs, each with its scale.
-        guess: gain, offset and read noise, to lay out the levels and to find the regression.
+        readings: pixel values of exposure pairs, each with its scaling.
+        guess: gain, offset and read noise, used to define the levels and compute the regression.
 
     Raises:
-        NotMeasurable: no level has `LEAST_READINGS`.
+        NotMeasurable: no level has `LEAST_READINGS` pixel values.
     """
     rows = [row for one in readings for row in _cell_levels(one, *guess)]
     if not rows:
         raise NotMeasurable(
-            "too few pixels of each brightness are left to compare; give larger frames, or more of them below saturation"
+            "too few pixels of each brightness are left to compare; use larger frames, or frames with more unsaturated pixels"
         )
     cells = max(len(row["histogram"]) for row in rows)
     for row in rows:
@@ -80,16 +80,16 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
 
 
 def true_moments(estimate: Image, density: Image, unit: float, variance: float) -> tuple[Image, Image, Image]:
-    """Density of noisy estimates, times 1, the mean and the mean square of the true values behind each.
+    """Return the density of noisy estimates times 1, the mean and the mean square of the true values given the estimate.
 
-    An estimate is a Poisson count of true/unit in that unit, plus Gaussian noise. Robbins' and Tweedie's formulas
-    (doi:10.1198/jasa.2011.tm11181) know the true values' moments from the density of the estimates alone.
+    An estimate is a Poisson count of mean true/unit, times unit, plus Gaussian noise. Robbins' and Tweedie's formulas
+    (doi:10.1198/jasa.2011.tm11181) give the moments of the true values from the density of the estimates alone.
 
     Args:
-        estimate: (N,) evenly spaced, above the offset.
-        density: (N,) of the estimates.
-        unit: counts of the estimate per electron of its own exposure; 0: no Poisson noise.
-        variance: of the Gaussian noise.
+        estimate: (N,) evenly spaced values above the offset, counts.
+        density: (N,) density of the estimates.
+        unit: counts of the estimate per electron of the long exposure; 0 without Poisson noise.
+        variance: variance of the Gaussian noise, counts².
     """
 
     def times_truth(values: Image) -> Image:
@@ -101,7 +101,7 @@ def true_moments(estimate: Image, density: Image, unit: float, variance: float) 
 
 
 def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: float) -> dict[str, Any]:
-    """Histogram of the pixel values of one level on whole steps, wide enough for what noise may do."""
+    """Histogram of the pixel values of one level on whole rounding steps, wide enough to include the noise."""
     observation, signal = one.observation[group], one.signal[group]
     span = 2 * REACH * deviation
     width = max(min(deviation / 6, finest), span / MOST_CELLS)
@@ -125,7 +125,7 @@ def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: fl
 
 
 def _density(values: Image, at: Image, blur: Image) -> Image:
-    """Pixel values per count at some places, by a Gaussian kernel."""
+    """Kernel density estimate, in pixel values per count, at the values `at` with bandwidths `blur`."""
     count, edges = np.histogram(values, bins=4000)
     centre = 0.5 * (edges[1:] + edges[:-1])
     distance = (centre - at[:, None]) / blur[:, None]

@@ -1,4 +1,4 @@
-"""Correlation of residuals between pixels: what filters, interpolation, afterglow and compression leave, and noise does not."""
+"""Correlation of residuals between pixels, as caused by filters, interpolation, afterglow and compression."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 
 REACH = 4
-"""Pixels either way within which pixels are compared; camera filters and resampling kernels are no longer."""
+"""Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
 
 CLEAR = 5.0
-"""Standard errors beyond which a correlation is one: among 40 lags noise reaches them once in 10⁵ frames."""
+"""Standard errors above which a correlation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
 
 PEAK = 25.0
-"""Power of a spectral line over its neighbourhood's mean. Noise exceeds it with probability exp(−25); the mean is known to 30 %,
-which leaves exp(−17), once in 10⁴ frames of 1000 lines."""
+"""Significant power of a spectral line, relative to the mean of its neighbourhood. Noise exceeds it with probability exp(−25).
+The mean is known to 30 %, which increases this to exp(−17): once in 10⁴ frames with 1000 lines."""
 
 ALIKE = 0.03
-"""Departure from a linear kernel's correlation within which frames count as interpolated by it: the places between pixels move it
-by up to 0.015, the noise of 200² pixels by as much at three standard errors, and cubic kernels are 0.09 and more away."""
+"""Largest deviation from the correlation of linear interpolation for which frames count as linearly interpolated. The sub-pixel
+positions change it by up to 0.015, and so do three standard errors of 200² pixels; cubic kernels differ by at least 0.09."""
 
 LONGEST_PERIOD = 10.0
-"""Pixels: blocks of image compression have 8, resampling by factors near 1 has more but then hardly changes the noise."""
+"""Longest period, pixels. Compression blocks have 8; resampling by factors near 1 has more, but hardly changes the noise."""
 
 LEAST_PROFILE = 64
-"""Pixels along an axis from which on a period can be distinguished from chance."""
+"""Fewest pixels along an axis for the detection of a period."""
 
 LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if dy > 0 or dx > 0]
 
@@ -39,16 +39,16 @@ LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) i
 @described()
 @dataclass(frozen=True)
 class Correlation:
-    """Correlation of the residuals of neighbouring pixels, beyond what the interpolated signal brings.
+    """Correlation of the residuals of neighbouring pixels, minus that caused by interpolation of the signal.
 
     Attributes:
         lags: (K, 2) distances (y, x), pixels.
         value: (K,) correlation coefficients.
         error: (K,) standard errors for independent pixels.
-        factor: spectral density of the noise at frequency 0 over its variance, 1 for independent pixels. A linear filter that
-            keeps the mean keeps that density, so variance times `factor` is the variance before the filter.
-        factor_error: its standard error.
-        period: pixels after which the noise repeats its variance or its correlation along x or y; 0 if it does not.
+        factor: spectral density of the noise at frequency 0 over its variance; 1 for independent pixels. A mean-preserving
+            linear filter preserves this density, so variance times `factor` is the variance before the filter.
+        factor_error: standard error of `factor`.
+        period: period of the variance or the correlation of the noise along x or y, pixels; 0 if there is none.
     """
 
     lags: Image
@@ -60,17 +60,17 @@ class Correlation:
 
     @property
     def local(self) -> bool:
-        """Whether the correlation dies out within `REACH`, as a filter's does and an interference's does not."""
+        """Whether the correlation decays within `REACH`, as for a filter but not for interference."""
         outer = np.abs(self.value[np.abs(self.lags).max(axis=1) == REACH]).max()
         return bool(outer < max(0.1 * np.abs(self.value).max(), CLEAR * self.error.max()))
 
     @property
     def step(self) -> float:
-        """Pixels of the frames before from one pixel to the next, if these were resampled by linear interpolation; else 1.
+        """Pixel spacing in pixels of the original frames, if the frames were resampled by linear interpolation; else 1.
 
-        Interpolation repeats itself after `period` pixels, so that the step is 1 ± 1/period. Which of the two it is, and that
-        the interpolation is linear, show in the neighbours' correlation: that of linear kernels so far apart. A step whose
-        neighbours are as good as uncorrelated (1.5) cannot be seen.
+        Interpolation is periodic with `period` pixels, so the spacing is 1 ± 1/period. The sign, and whether the interpolation is
+        linear, follow from the correlation of neighbours. A spacing of about 1.5, where neighbours are almost uncorrelated,
+        cannot be detected.
         """
         if self.period:
             for step in (1 + 1 / self.period, 1 - 1 / self.period):
@@ -82,25 +82,24 @@ class Correlation:
 
     @property
     def inflation(self) -> float:
-        """By how much correlation widens the standard error of a variance: the root of the sum of squared correlations."""
+        """Factor by which correlation increases the standard error of a variance: root of the sum of squared correlations."""
         return float(np.sqrt(1 + 2 * np.sum(np.maximum(self.value**2 - self.error**2, 0.0))))
 
     @property
     def found(self) -> bool:
-        """Whether pixels at any distance, or the nearest neighbours together, are correlated by more than `CLEAR` standard
-        errors."""
+        """Whether the correlation at any lag, or of the nearest neighbours together, exceeds `CLEAR` standard errors."""
         return bool(np.any(_clear(self.value, self.error)))
 
     def at(self, dy: int, dx: int) -> float:
-        """Correlation at one distance."""
+        """Return the correlation at one lag."""
         return float(self.value[np.all(self.lags == (dy, dx), axis=1)][0])
 
 
 def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
-    """Correlation of the residuals of all pairs together.
+    """Measure the correlation of the residuals of all pairs together.
 
     Args:
-        pairs: aligned, of one detector setting.
+        pairs: aligned pairs of one detector setting.
     """
     residuals = [residual_of(pair) for pair in pairs]
     expected = [one.share * _of_interpolation(pair) for one, pair in zip(residuals, pairs, strict=True)]
@@ -108,11 +107,11 @@ def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
 
 
 def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[Image] | None = None) -> Correlation:
-    """Correlation of standardised residuals of one detector.
+    """Measure the correlation of standardised residuals of one detector.
 
     Args:
-        residuals: of one frame each.
-        expected: (K,) for each, what is no correlation of the noise; None: nothing.
+        residuals: residuals, one per frame.
+        expected: (K,) correlation of each that is not due to the noise of the exposure; None for zero.
     """
     products, counts = np.zeros(len(LAGS)), np.zeros(len(LAGS))
     for one, known in zip(residuals, expected or [np.zeros(len(LAGS))] * len(residuals), strict=True):
@@ -134,14 +133,14 @@ def _overlap(distance: float) -> float:
 
 
 def _clear(value: Image, error: Image) -> Mask:
-    """(K,) the lags that stand out; both nearest neighbours where only their sum does, as after a faint blur."""
+    """Return the (K,) mask of significant lags; both nearest neighbours if only their sum is, as after a faint blur."""
     nearest = np.array([lag in ((0, 1), (1, 0)) for lag in LAGS])
     together = abs(float(value[nearest].sum())) > CLEAR * float(np.linalg.norm(error[nearest]))
     return np.asarray((np.abs(value) > CLEAR * error) | (nearest & together))
 
 
 def _near_clear(value: Image, error: Image) -> Mask:
-    """The lags that count towards the density at frequency 0: those that stand out, and their inner neighbours."""
+    """Return the (K,) mask of lags included in the density at frequency 0: significant lags and all shorter ones."""
     lags = np.abs(np.array(LAGS))
     clear = lags[_clear(value, error)]
     return (
@@ -152,14 +151,14 @@ def _near_clear(value: Image, error: Image) -> Mask:
 
 
 def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Views of a frame and of the same frame (dy, dx) further on; dy is not negative."""
+    """Return slices of a frame and of the same frame shifted by (dy, dx), dy ≥ 0."""
     right = slice(max(dx, 0), None if dx >= 0 else dx)
     left = slice(max(-dx, 0), -dx if dx > 0 else None)
     return (slice(dy, None), right), (slice(0, -dy if dy else None), left)
 
 
 def _of_interpolation(pair: AlignedPair) -> Image:
-    """(K,) correlation that warping gives to the white noise of the long exposure."""
+    """Return the (K,) correlation that warping introduces into white noise of the long exposure."""
     if pair.frames > 1:
         return np.zeros(len(LAGS))
     noise = np.random.default_rng(0).standard_normal(pair.long.shape)
@@ -171,8 +170,10 @@ def _of_interpolation(pair: AlignedPair) -> Image:
 
 
 def _period(residual: Residual) -> float:
-    """The period, in pixels, of the squares and of the neighbour products of residuals along either axis, unless the scene has it
-    too; 0 if none."""
+    """Return the period, pixels, of the squares or neighbour products of residuals along an axis; 0 if none.
+
+    A period that the scene has too is ignored.
+    """
     from scipy.ndimage import maximum_filter1d
 
     found = [0.0]
@@ -191,7 +192,7 @@ def _period(residual: Residual) -> float:
 
 
 def _lines(profile: Image) -> Image:
-    """Power spectrum over its neighbourhood's mean, the spectral lines of a profile."""
+    """Return the power spectrum of a profile, relative to the mean of its neighbourhood."""
     from scipy.ndimage import median_filter
 
     power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2

@@ -1,4 +1,4 @@
-"""Single electrons that show in the pixel values: peaks one gain apart, which tell gain and offset far better than variance."""
+"""Single-electron peaks in the pixel values, one gain apart; they determine gain and offset far better than the variance."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from calibration.detector.levels import Levels
 
 CLEAR_PEAKS = 25.0
-"""Power of the peaks, N·|mean of exp(2πi·value/gain)|², from which on they are there: N random values exceed it with probability
-exp(−25), and a search over gains tries a few hundred."""
+"""Significant power of the peaks, N·|mean of exp(2πi·value/gain)|². N random values exceed it with probability exp(−25), and a
+search tries a few hundred gains."""
 
 
 def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
-    """Whether histograms of pixel values have peaks one `gain` apart, as detectors with a read noise below about 0.4 e⁻ give.
+    """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
 
     Args:
-        levels: those of residuals are ignored: the noise of their signals blurs the peaks.
-        gain: counts per electron. Below two rounding steps the peaks cannot be told from the codes.
+        levels: histograms; those of residuals are ignored, because the noise of the signals blurs the peaks.
+        gain: counts per electron; below two rounding steps, peaks cannot be distinguished from codes.
     """
     total, count = 0j, 0.0
     for one in levels:

@@ -1,4 +1,4 @@
-"""What EMVA 1288 reports of a camera, from flat frames at several levels and dark frames, and maps of its pixels."""
+"""EMVA 1288 figures and per-pixel maps of a camera, from flat frames at several levels and dark frames."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from calibration.exposures.frames import Burst, Image
 from noiseflow.described import described
 
 LINEAR_RANGE = 0.7
-"""Share of the saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
+"""Fraction of saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
 
 LEVEL_ERROR = 0.003
-"""Relative error of a level's variance granted to the line: what steadiness of light and converter usually leave."""
+"""Relative model error added to the error of each level's variance: typical instability of light and converter."""
 
 NINETY = 1.645
 LEAST_LEVELS = 2
@@ -40,27 +40,28 @@ LEAST_LEVELS = 2
 )
 @dataclass(frozen=True)
 class CameraFigures:
-    """A camera's figures after EMVA 1288 (release 3.1, https://www.emva.org/standards-technology/emva-1288).
+    """Figures of a camera according to EMVA 1288 (release 3.1, https://www.emva.org/standards-technology/emva-1288).
 
     Attributes:
-        gain: overall system gain K, counts per electron (its inverse is in electrons per count); times the excess-noise factor
-            of a detector that has one.
+        gain: overall system gain K, counts per electron (its inverse is in electrons per count), times the excess-noise factor
+            if the detector has one.
         dark_noise: temporal noise in darkness, electrons rms; None without dark frames.
-        offset: mean of the dark frames, counts; None without.
-        saturation: electrons at the level of the largest temporal variance; the brightest level's where the variance still grows.
-        saturated: whether the variance was seen to fall, so that `saturation` is the capacity and not a lower bound.
-        dynamic_range: saturation over the electrons at which the signal equals the noise; None without dark frames.
-        snr_maximum: largest signal-to-noise ratio.
-        linearity_error: mean departure from the line through the levels' exposure times; None without times.
+        offset: mean of the dark frames, counts; None without dark frames.
+        saturation: electrons at the level with the largest temporal variance, or at the brightest level if the variance still
+            grows there.
+        saturated: whether a level beyond saturation was measured; otherwise `saturation` is a lower bound of the capacity.
+        dynamic_range: saturation over the signal, in electrons, that equals its noise; None without dark frames.
+        snr_maximum: maximum signal-to-noise ratio.
+        linearity_error: mean relative deviation from the line of signal against exposure time; None without times.
         dsnu: dark signal nonuniformity, electrons rms; None without dark frames.
-        prnu: photo response nonuniformity, of the signal at half saturation; None without dark frames.
-        dark_current: electrons per second and pixel; None without darks of two exposure times.
-        excess_factor: F² by the third moment of levels of three frames or more, with its 90 % interval; None where unknown.
-        levels: of the flats, by rising mean.
-        dark: of the dark frames; None without.
-        correlation: between neighbouring pixels' temporal noise.
-        chi_squared: of the photon-transfer line per degree of freedom.
-        lag: correlation of the noise of successive frames; 0: none was found.
+        prnu: photo response nonuniformity at half saturation, relative to the signal; None without dark frames.
+        dark_current: electrons per second and pixel; None without dark frames at two exposure times.
+        excess_factor: F² from the third moment of levels with at least three frames, with its 90 % interval; None if unknown.
+        levels: moments of the flats, in order of increasing mean.
+        dark: moments of the dark frames; None without dark frames.
+        correlation: correlation of the temporal noise of neighbouring pixels.
+        chi_squared: χ² per degree of freedom of the photon-transfer line.
+        lag: correlation of the noise of successive frames; 0 if not significant.
     """
 
     gain: Interval
@@ -83,12 +84,12 @@ class CameraFigures:
 
     @property
     def linear(self) -> list[Level]:
-        """The levels below saturation, which tell gain and response."""
+        """Levels below saturation, which determine gain and response."""
         return _linear(self.levels, self.offset or 0.0)
 
     @property
     def response(self) -> Image:
-        """(y, x) relative response of each pixel, mean 1, from all linear levels."""
+        """(y, x) relative response of each pixel, with mean 1, from all linear levels."""
         dark = self.dark.image if self.dark else np.full(self.levels[0].image.shape, self.offset or 0.0)
         signal = np.sum([level.image - dark for level in self.linear], axis=0)
         return np.asarray(signal / signal.mean())
@@ -101,16 +102,16 @@ def measure_camera(
     flat_times: Sequence[float] | None = None,
     dark_times: Sequence[float] | None = None,
 ) -> CameraFigures:
-    """Measure a camera by photon transfer on even illumination.
+    """Measure a camera by photon transfer on uniform illumination.
 
     Args:
-        flats: one burst of two or more equal frames for each level of light; levels in any order, saturated ones among them.
-        darks: bursts without light, the one with the flats' exposure time first.
-        flat_times, dark_times: exposure time of each, s.
+        flats: one burst of at least two frames per light level, in any order; saturated levels are allowed.
+        darks: bursts without light; the first must have the exposure time of the flats.
+        flat_times, dark_times: exposure time of each burst, seconds.
 
     Raises:
-        ValueError: no levels, sizes or numbers of times that differ.
-        NotMeasurable: too few levels, all of them saturated, or noise that does not grow with the signal.
+        ValueError: there are no levels, or sizes or numbers of exposure times differ.
+        NotMeasurable: there are too few levels, all are saturated, or the noise does not grow with the signal.
     """
     _require_equal(flats, darks, flat_times, dark_times)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
@@ -122,19 +123,19 @@ def measure_camera(
     used = _linear(levels, offset or 0.0)
     if not used:
         raise NotMeasurable(
-            "every level of the flat frames is saturated, so that their noise is cut off; give levels of less light"
+            "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
         )
     points = [level for level in ([dark, *used] if dark else used) if not (level.clipped or level.coarse)]
     if len(points) < LEAST_LEVELS:
         raise NotMeasurable(
-            "flats at one level tell no gain; give dark frames with them, or flats at several levels of light (levels whose "
-            "noise is cut off or finer than the rounding do not count)"
+            "flats at one level do not determine the gain; add dark frames, or flats at several light levels (levels whose "
+            "noise is clipped or smaller than the rounding step do not count)"
         )
     slope, error, intercept, chi_squared = _line(points, dark)
     if not slope > 3 * error:
         raise NotMeasurable(
-            "the noise of the flats does not grow with their signal, so the gain cannot be measured; give levels of light that "
-            "differ by more"
+            "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
+            "differ more"
         )
     unsaturated = [flat for flat, level in zip(ordered, levels, strict=True) if any(level is one for one in used)]
     residuals = [one for flat in unsaturated for one in _residuals(flat)]
@@ -168,20 +169,20 @@ def measure_camera(
 
 
 def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:
-    """Mean relative departure from the line of signal against exposure time, between 5 % and 95 % of the saturation.
+    """Mean relative deviation from the line of signal against exposure time, between 5 % and 95 % of saturation.
 
     Raises:
-        NotMeasurable: under three levels in that range.
+        NotMeasurable: there are fewer than three levels in that range.
     """
     signal, time = np.array([level.mean - offset for level in levels]), np.asarray(times, float)
     used = (signal > 0.05 * (top - offset)) & (signal < 0.95 * (top - offset))
     if used.sum() < 3:
         raise NotMeasurable(
-            f"{int(used.sum())} of {len(signal)} levels lie between 5 % and 95 % of the brightest; linearity needs three: "
-            "give more"
+            f"{int(used.sum())} of {len(signal)} levels lie between 5 % and 95 % of saturation, but linearity requires three; "
+            "add levels or omit --flat-time"
         )
     signal, time = signal[used], time[used]
-    weight = 1 / signal**2  # relative departures count (EMVA 1288, release 3.1, section 6.7)
+    weight = 1 / signal**2  # relative deviations (EMVA 1288, release 3.1, section 6.7)
     design = np.stack([np.ones_like(time), time])
     line = np.linalg.solve(design * weight @ design.T, design * weight @ signal) @ design
     return float(np.mean(np.abs(signal - line) / line))
@@ -196,7 +197,7 @@ def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
 
 
 def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
-    """Slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
+    """Return the slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
     mean, variance, error = (
         np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
     )
@@ -211,9 +212,9 @@ def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, fl
 
 
 def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> Interval | None:
-    """F² of a gain register or a deposited energy that varies as a gamma distribution, by the third moment.
+    """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
 
-    With K = g·F² the third central moment grows by K²·(2 − 1/F²) per count: by K² for Poisson noise, half more where F² = 2.
+    With K = g·F², the third central moment grows by K²·(2 − 1/F²) per count: K² for Poisson noise, 1.5·K² for F² = 2.
     """
     known = [one for one in points if one.third is not None]
     if len(known) < LEAST_LEVELS:
@@ -225,7 +226,7 @@ def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> I
     information = float(np.sum(weight * centred**2))
     ratio = float(np.sum(weight * centred * third)) / information / slope**2
     spread = 1 / np.sqrt(information) / slope**2
-    if spread > 0.1:  # tells 1 from 1.5 at three standard errors no more
+    if spread > 0.1:  # cannot distinguish the ratios 1 and 1.5 at three standard errors
         return None
     low, middle, high = (
         1 / (2 - np.clip(value, 1.0, 1.9)) for value in (ratio - NINETY * spread, ratio, ratio + NINETY * spread)
@@ -245,7 +246,7 @@ def _dark_current(darks: Sequence[Level], times: Sequence[float] | None, slope: 
 
 
 def _residuals(burst: Burst) -> list[Residual]:
-    """Standardised differences of successive frames, one frame of each pair used once."""
+    """Return standardised differences of successive frames; each frame is used once."""
     found = []
     mask: NDArray[np.bool_] = np.ones(burst.frames.shape[1:], bool)
     for first, second in zip(burst.frames[::2], burst.frames[1::2], strict=False):
@@ -274,11 +275,11 @@ def _require_equal(
     dark_times: Sequence[float] | None,
 ) -> None:
     if not flats:
-        raise ValueError("no flat frames were given; give two or more equal frames for each level of light")
+        raise ValueError("no flat frames were given; give two or more frames per light level")
     shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
     if len(shapes) > 1:
         raise ValueError(
-            f"flat and dark frames have the sizes {sorted(shapes)}; take all with the same binning and region"
+            f"flat and dark frames have different sizes {sorted(shapes)}; record all with the same binning and region"
         )
     for dark in darks:
         dark.require_unsaturated()
@@ -288,4 +289,4 @@ def _require_equal(
                 f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each"
             )
     if darks and min(float(flat.frames.mean()) for flat in flats) <= float(darks[0].frames.mean()):
-        raise ValueError("the dark frames are as bright as a flat level; give frames without light as dark ones")
+        raise ValueError("the dark frames are as bright as a flat level; give dark frames taken without light")

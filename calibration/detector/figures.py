@@ -1,4 +1,4 @@
-"""The figures that are reported: the posterior's, or what photon transfer and correlation leave of them."""
+"""Reported gain, offset and read noise: from the posterior or from photon transfer, corrected for pixel correlation."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from calibration.detector.repair import Repairs
 from noiseflow.described import described
 
 LARGEST_MISFIT = 1.3
-"""χ² per degree of freedom above which the pixel values do not come from a Poisson-Gaussian detector."""
+"""Largest χ² per degree of freedom of the histograms for a Poisson-Gaussian detector."""
 
 LARGEST_DISAGREEMENT = 0.02
-"""Relative difference of the posterior's gain from that of the photon-transfer line, beyond three errors of the line, at which
-the shape of the noise speaks against its variance: the goal for the gain."""
+"""Largest relative difference between the gain of the posterior and that of the photon-transfer line, unless it is within three
+standard errors of the line: the target accuracy of the gain."""
 
 LARGEST_UNEVENNESS = 0.05
-"""Relative deviation of the pixels' variances above which one gain and read noise do not describe them all: mixed so, the tails
-of the noise exceed any single pixel's by the square, a quarter of a percent, which pulls an offset but hardly a gain."""
+"""Largest relative deviation of the pixels' variances that one gain and read noise describe. The mixture then has tails heavier
+by its square, 0.25 %, which biases the offset but hardly the gain."""
 
 RESAMPLED_ERROR = 0.03
-"""Relative standard error of a gain from which linear interpolation was taken out: the places between pixels that it happened to
-take move its noise by this (frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
+"""Relative standard error of a gain corrected for linear interpolation, whose noise depends on the sampled sub-pixel positions
+(frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
 
 NINETY = 1.645
-"""Standard deviations either way of a 90 % interval."""
+"""Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
 
 @described(gain="counts per electron", offset="counts", read_noise="electrons")
@@ -37,12 +37,12 @@ class Figures:
     """Gain, offset and read noise as reported, with 90 % intervals.
 
     Attributes:
-        gain: counts per electron, times the excess-noise factor of a detector that has one.
-        offset: counts; None where the exposures do not determine it.
-        read_noise: electrons rms; None where the exposures do not determine it.
-        source: ``"posterior"``, or ``"photon transfer"`` where the noise is not Poisson-Gaussian: the line of variance against
-            signal holds for any detector of independent events.
-        factor: by which correlation between pixels, or resampling, had reduced the variance, taken out of the gain; 1: none.
+        gain: counts per electron, times the excess-noise factor if the detector has one.
+        offset: counts; None if the exposures do not determine it.
+        read_noise: electrons rms; None if the exposures do not determine it.
+        source: ``"posterior"``, or ``"photon transfer"`` if the noise is not Poisson-Gaussian. Photon transfer is valid for any
+            detector of independent events.
+        factor: correction of the gain for the variance lost by pixel correlation or resampling; 1 if none.
     """
 
     gain: Interval
@@ -53,29 +53,31 @@ class Figures:
 
 
 def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -> Figures:
-    """The figures to report.
+    """Select and correct the figures to report.
 
     Args:
-        detector: measured on repaired pairs.
-        correlation: of the same pairs.
-        repairs: what was modelled.
+        detector: detector measured on the repaired pairs.
+        correlation: correlation of the residuals of the same pairs.
+        repairs: violated assumptions that were modelled.
     """
     found = detector.posterior
     figures = Figures(_with_line(detector), found.offset, found.read_noise)
     if not poisson_gaussian(detector):
         figures = _by_line(detector)
-    if correctable(correlation, repairs) and not detector.electrons:  # no filter leaves single electrons
+    if (
+        correctable(correlation, repairs) and not detector.electrons
+    ):  # a filter would have blurred single-electron peaks
         return _decorrelated(figures, correlation)
     return figures
 
 
 def poisson_gaussian(detector: Detector) -> bool:
-    """Whether the shape of the noise agrees with that of a Poisson-Gaussian detector, and its gain with photon transfer."""
+    """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
     return detector.misfit <= LARGEST_MISFIT and not disagrees(detector) and detector.uneven <= LARGEST_UNEVENNESS
 
 
 def disagrees(detector: Detector) -> bool:
-    """Whether the posterior's gain departs from the photon-transfer line; where single electrons show, they are the gain."""
+    """Whether the posterior's gain differs from photon transfer; never if single-electron peaks determine the gain."""
     if detector.electrons:
         return False
     line, gain = detector.line, detector.posterior.gain.median
@@ -83,17 +85,17 @@ def disagrees(detector: Detector) -> bool:
 
 
 def correctable(correlation: Correlation, repairs: Repairs) -> bool:
-    """Whether the correlation is that of a short filter, and not of a scene that does not fit."""
+    """Whether the correlation is that of a short filter, and not caused by a misfit of the scene."""
     still = not repairs.refitted and repairs.changed < 0.5
     return correlation.found and correlation.local and still and correlation.factor > 3 * correlation.factor_error
 
 
 def _with_line(detector: Detector) -> Interval:
-    """The posterior's gain; where nothing but the noise tells the offset, with an interval that holds photon transfer's too.
+    """Return the posterior's gain; if only the noise determines the offset, the interval also covers that of photon transfer.
 
-    There the prior of read noise narrows the gain by what the noise's skewness says, to intervals that held the truth in 83 to
-    86 % of simulated pairs. The line's own held it in 91 %, and knows no prior. Single electrons that show tell it to a
-    thousandth.
+    In that case the read-noise prior narrows the interval of the gain through the skewness of the noise: it contained the true
+    value in 83 to 86 % of simulated pairs. The interval of photon transfer uses no prior and contained it in 91 %.
+    Single-electron peaks determine the gain to 0.1 % and need no correction.
     """
     gain, line = detector.posterior.gain, _normal(detector.line.gain, detector.line.gain_error)
     if detector.electrons or detector.offset is not None or any(one.common.any() for one in detector.levels):
@@ -102,7 +104,7 @@ def _with_line(detector: Detector) -> Interval:
 
 
 def _by_line(detector: Detector) -> Figures:
-    """Gain by photon transfer; offset and read noise only from dark frames."""
+    """Return the gain from photon transfer, and offset and read noise from dark frames only."""
     line = detector.line
     gain = _normal(line.gain, line.gain_error)
     if detector.offset is None:
@@ -114,8 +116,10 @@ def _by_line(detector: Detector) -> Figures:
 
 
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
-    """Variance before a filter that keeps the mean: the noise's spectral density at frequency 0, which is one per area of the
-    frames as they were before they were resampled."""
+    """Correct the variance for a mean-preserving filter, which preserves the noise's spectral density at frequency 0.
+
+    The density refers to the pixel area of the frames before resampling.
+    """
     area = correlation.step**2
     factor, error = area * correlation.factor, area * correlation.factor_error
     gain, resampled = figures.gain, RESAMPLED_ERROR if area != 1 else 0.0

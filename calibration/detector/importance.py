@@ -1,4 +1,4 @@
-"""The posterior by adaptive importance sampling: every evaluation counts, none is thrown away as a chain's first steps are."""
+"""Adaptive importance sampling of the posterior; unlike a Markov chain, it uses every evaluation."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image
 
 DRAWS = 256
-"""Draws of a round: enough to see a density of three parameters."""
+"""Number of draws per round, sufficient for a density of three parameters."""
 
 ROUNDS = 40
-"""Rounds, at most. A smooth posterior takes 3 to 6. Where single electrons may show, at a read noise of under 0.4 electrons,
-the likelihood is a field of narrow peaks: the first draw that meets one outweighs all others until later rounds have measured
-how narrow it is, which took 26 rounds in the worst of 34 trials."""
+"""Largest number of rounds. A smooth posterior takes 3 to 6. With single-electron peaks (read noise below 0.4 electrons) the
+likelihood has many narrow maxima. The first draw in one outweighs all others until later rounds resolve its width, which took up
+to 26 rounds in 34 trials."""
 
 ENOUGH = 600.0
-"""Effective samples: the 5 % and 95 % quantiles then err by 0.1 standard deviations."""
+"""Required number of effective samples; the 5 % and 95 % quantiles then have an error of 0.1 standard deviations."""
 
 FREEDOM = 5.0
-"""Degrees of freedom of the proposals' Student distributions, whose tails are heavier than the posterior's."""
+"""Degrees of freedom of the Student proposals, whose tails are heavier than those of the posterior."""
 
 BANDWIDTH = 0.6
-"""Width of a kernel, in the posterior's own: near Silverman's factor for 256 points in three dimensions, 0.44, and wider to be
-safe in the tails."""
+"""Width of a kernel relative to the posterior: larger than Silverman's factor for 256 points in three dimensions, 0.44, to cover
+the tails."""
 
 PARTS = 16
-"""Parameter sets evaluated at once, which bounds the memory."""
+"""Number of parameter sets evaluated at once, which limits memory."""
 
 
 @dataclass(frozen=True)
 class Weighted:
-    """Draws and their weights, which sum to 1.
+    """Weighted draws.
 
     Attributes:
-        draws: (S, 3).
-        weight: (S,).
-        half: (S,) 0 or 1: two independent halves.
+        draws: (S, 3) coordinates.
+        weight: (S,) weights with sum 1.
+        half: (S,) 0 or 1, for two independent halves.
     """
 
     draws: Image
@@ -48,11 +48,11 @@ class Weighted:
 
     @property
     def effective(self) -> float:
-        """Independent samples that the draws are worth."""
+        """Effective number of independent samples."""
         return float(1 / np.sum(self.weight**2))
 
     def disagreement(self) -> float:
-        """Scale reduction factor of the two halves' means, the largest over the parameters: 1 where they agree."""
+        """Return the scale reduction factor of the means of the two halves, the largest over the parameters; 1 if they agree."""
         found = []
         for values in self.draws.T:
             means, spreads = [], []
@@ -65,7 +65,7 @@ class Weighted:
         return float(max(found))
 
     def resampled(self, number: int, generator: np.random.Generator) -> Image:
-        """Equally weighted draws, (number, 3), by systematic resampling."""
+        """Return equally weighted draws, (number, 3), by systematic resampling."""
         place = (np.arange(number) + generator.random()) / number
         index = np.searchsorted(np.cumsum(self.weight), place).clip(0, len(self.draws) - 1)
         return np.asarray(self.draws[index])
@@ -77,19 +77,19 @@ def importance_sample(
     generator: np.random.Generator,
     progress: Callable[[int, str], None] | None = None,
 ) -> Weighted | None:
-    """Draw from a density by a mixture of kernels that adapts to it (doi:10.1111/j.1467-9469.2011.00756.x).
+    """Sample a density with an adaptive mixture of kernels (adaptive multiple importance sampling).
 
-    The first rounds draw around the `starts`; each further one from Student kernels around draws that are likely. All draws are
-    weighted by the mixture of all rounds' proposals, so that none is lost.
+    The first rounds draw around the `starts`, the others from Student kernels around likely draws. All draws are weighted by the
+    mixture of the proposals of all rounds (doi:10.1111/j.1467-9469.2011.00756.x).
 
     Args:
-        log_density: (W, 3) -> (W,) nats.
-        starts: (3,) points, the maximum first, and (3, 3) covariances, of a round each. A narrow peak gives no draws outside.
-        generator: of the draws.
-        progress: called with the evaluations done and a note.
+        log_density: function (W, 3) -> (W,) nats.
+        starts: (3,) points, the maximum first, with (3, 3) covariances; one round each.
+        generator: random generator.
+        progress: called with the number of evaluations done and a note.
 
     Returns:
-        The draws, or None where `ROUNDS` rounds are not worth `ENOUGH` samples.
+        The weighted draws, or None if `ROUNDS` rounds give fewer than `ENOUGH` effective samples.
     """
     kernels: list[tuple[Image, Image]] = [(start[None], _factor(2.0 * covariance)) for start, covariance in starts]
     draws, values, proposal = np.empty((0, 3)), np.empty(0), np.empty(0)
@@ -118,8 +118,8 @@ def importance_sample(
 
 
 def _next_kernels(found: Weighted, generator: np.random.Generator, first: Image) -> tuple[Image, Image]:
-    """Kernels around likely draws; while few carry all the weight, these and the first round's width."""
-    tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # flattened while one draw outweighs all others
+    """Return kernels around likely draws; their width includes a small part of the first round's."""
+    tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()
     centres = Weighted(found.draws, tempered, found.half).resampled(DRAWS, generator)
     middle = tempered @ found.draws
@@ -146,7 +146,7 @@ def _log_mixture(draws: Image, centres: Image, factor: Image) -> Image:
 
 
 def _in_parts(log_density: Callable[[Image], Image], draws: Image) -> Image:
-    """The density of draws in the order of their read noise: the least of a part settles how many frequencies all take."""
+    """Evaluate the density in order of the read noise, because the lowest in a part determines the number of frequencies."""
     order = np.argsort(draws[:, 2])
     parts = [log_density(draws[order[start : start + PARTS]]) for start in range(0, len(draws), PARTS)]
     return np.concatenate(parts)[np.argsort(order)]

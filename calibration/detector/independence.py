@@ -1,4 +1,4 @@
-"""Do frames share noise? Bursts whose frames follow one another, and long exposures that contain the short one."""
+"""Tests for shared noise: correlated successive frames, and long exposures that contain the short one."""
 
 from __future__ import annotations
 
@@ -13,45 +13,44 @@ from calibration.exposures.scaling import BLOCK, finest_band
 from calibration.registration.aligned import AlignedPair
 
 CLEAR = 5.0
-"""Standard errors beyond which frames share noise: a test or two of a calibration reach them by chance once in 10⁶."""
+"""Standard errors above which shared noise is significant; exceeded by chance once in 10⁶ calibrations."""
 
 LEAST_FRAMES = 3
-"""Of a burst, from which on some frames follow one another and others do not."""
+"""Fewest frames of a burst that include both successive and more distant frames."""
 
 MOST_FRAMES = 24
-"""Frames that are compared: 23 that follow one another tell a correlation of 1 % in 256 pixels each to five standard errors."""
+"""Largest number of frames compared: 23 successive pairs with 256² pixels each determine a correlation well below 1 %."""
 
 WHITE = 1.3
-"""Ratio of the power of two bands that noise of independent pixels fills alike, below which what fills them is such noise. Optics
-leave several times as much detail at the frequencies along one axis as at those along both."""
+"""Largest power ratio of two frequency bands for which their content counts as white noise. Images have several times as much
+power at high frequencies along one axis as along both."""
 
 LEVEL = 1.5
-"""Ratio of the shares found in the bright and in the dim half of the pixels, up to which it is one share. Patterns of the pixels'
-sensitivities and offsets are white detail too, but over the variance of shot noise they grow, or fade, as the signal does."""
+"""Largest ratio of the shares in bright and dim pixels for which they count as equal. Fixed patterns of sensitivity and offset
+are white too, but their ratio to the shot-noise variance depends on the signal."""
 
 LEAST_COMMON = 0.75
-"""Share of the long exposure's finest noise that must be the short exposure's for it to contain that exposure: then all of it is,
-while of two separate exposures none is."""
+"""Smallest share of the long exposure's finest noise in common with the short exposure, if it contains that exposure. The share
+is 1 in that case, and 0 for separate exposures."""
 
 
 def correlation_in_time(pairs: Sequence[AlignedPair]) -> float:
-    """Correlation of the noise of successive frames of a burst, beyond that of frames further apart; 0 where none shows.
+    """Correlation of the noise of successive frames of a burst, minus that of more distant frames; 0 if not significant.
 
-    Image lag, recursive filters and running means make frames follow one another. Their differences then have less than the
-    variance of two frames: by twice the correlation, if what is kept of one frame is taken from the next.
+    Image lag, recursive filters and running means correlate successive frames. This reduces the variance of their differences,
+    by twice the correlation if the next frame loses what the filter keeps of the previous one.
     """
     if pairs[0].frames == 1:
         return 0.0
     chosen = pairs[:MOST_FRAMES]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
     z = np.stack([residual_of(pair).z[mask] for pair in chosen])
-    return _of_successive(
-        [np.sqrt(1 - 1 / len(pairs)) * z]
-    )  # residuals from the mean of the others scatter more by that
+    # residuals from the mean of the others have a larger variance by 1/(1 − 1/n)
+    return _of_successive([np.sqrt(1 - 1 / len(pairs)) * z])
 
 
 def correlation_of_flats(bursts: Sequence[Burst]) -> float:
-    """The same of frames without a scene, all levels together; 0 also where every level has two frames."""
+    """Correlation of successive frames without a scene, all levels together; 0 if every level has only two frames."""
     standardised = []
     for burst in bursts:
         frames = burst.frames[:MOST_FRAMES].reshape(-1, burst.frames[0].size)
@@ -63,7 +62,7 @@ def correlation_of_flats(bursts: Sequence[Burst]) -> float:
 
 
 def _of_successive(bursts: Sequence[Image]) -> float:
-    """Mean product of successive frames less that of frames further apart, of (frame, pixel) residuals of unit variance."""
+    """Mean product of successive frames minus that of distant frames, for (frame, pixel) residuals of unit variance."""
     excess = information = 0.0
     for z in bursts:
         if len(z) < LEAST_FRAMES or not z.shape[1]:
@@ -79,13 +78,13 @@ def _of_successive(bursts: Sequence[Image]) -> float:
 
 
 def contained_share(pair: AlignedPair) -> float:
-    """Share of the signal that is the short exposure itself, as where the long one is a mean or sum of frames with the short one
-    among them; 0 where none shows.
+    """Share of the signal that is the short exposure itself; 0 if not significant.
 
-    The finest detail that both exposures show is then white noise, and all the noise that the long one has. Detail of a scene
-    is not white, for optics blur it, and leaves the long exposure a noise of its own.
+    The share is positive if the long exposure is a mean or sum of frames that include the short one. The finest detail common to
+    both exposures is then white, and includes all noise of the long one. Detail of a scene is not white because of the optics,
+    and the long exposure has additional noise.
     """
-    if pair.frames > 1 or pair.registration.warp(pair.long)[0] is not pair.long:  # the same frame lies on itself
+    if pair.frames > 1 or pair.registration.warp(pair.long)[0] is not pair.long:  # a contained frame needs no warping
         return 0.0
     inner = np.asarray(ndimage.binary_erosion(pair.mask, np.ones((5, 5)), border_value=0))
     inner &= np.abs(pair.short - pair.signal) < CLEAR * np.std((pair.short - pair.signal)[pair.mask])
@@ -109,7 +108,7 @@ def contained_share(pair: AlignedPair) -> float:
 
 
 def _fourth_difference(image: Image, axis: int) -> Image:
-    """Blind to detail that is smooth along one axis; of unit gain for white noise."""
+    """Fourth difference along one axis, which removes smooth detail; unit gain for white noise."""
     kernel = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70)
     return np.asarray(ndimage.convolve1d(image, kernel, axis=axis))
 

@@ -1,4 +1,4 @@
-"""Signal levels: the pixel values of like signal, counted into histograms that hold all the detector's likelihood needs."""
+"""Signal levels: histograms of pixel values with similar signal, as required by the detector's likelihood."""
 
 from __future__ import annotations
 
@@ -12,36 +12,33 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image
 
 NUM_LEVELS = 16
-"""Signal levels into which the pixels of a pair are sorted, equally filled."""
+"""Number of signal levels of equal pixel count into which the pixels of a pair are sorted."""
 
 NUM_BINS = 128
-"""Bins of each level's residual histogram."""
+"""Number of bins in the residual histogram of a level."""
 
 REACH = 8.0
-"""Standard deviations of the residual that the histogram covers either way; pixel values beyond it are defects, not
-noise."""
-
+"""Half-width of a residual histogram, in standard deviations; values beyond it are defects, not noise."""
 
 NUM_DARKEST = 64
-"""Pixels whose mean signal stands for the darkest of a scene: few enough to be the darkest, and known to an eighth of their
-scatter."""
+"""Number of pixels whose mean represents the darkest signal of a scene; its standard error is an eighth of their scatter."""
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Pixel values of one exposure beside an independent estimate of their signal.
+    """Pixel values of one exposure with an independent estimate of their signal.
 
     Attributes:
         observation: (N,) counts.
-        signal: (N,) estimate of its expectation, counts.
-        level: (N,) what sorts the pixels, known without the noise of either: the neighbours' signal.
-        shot_share: variance of the estimate's shot noise over that of the observation.
-        read_share: the same for read noise.
-        weight: independent information per pixel value, 1 unless pixel values share their estimates.
-        dark: taken without light: read noise alone.
+        signal: (N,) estimate of the expected observation, counts.
+        level: (N,) sort key of the pixels, independent of the noise of both: the signal of the neighbours.
+        shot_share: shot-noise variance of the estimate over that of the observation.
+        read_share: read-noise variance of the estimate over that of the observation.
+        weight: independent information per pixel value; below 1 if pixel values share their estimates.
+        dark: whether the exposure was recorded without light.
         step: rounding step of the observation, counts; 0 if it is not rounded.
-        rails: the converter's lower and upper clipping limit, counts; infinite where there is none.
-        scale: whose signals they are, see `Scale`; None where each level's mean is taken from its pixel values.
+        rails: lower and upper clipping limits of the converter, counts; infinite if there is none.
+        scale: scaling of the signals, see `Scale`; None if the mean of each level is taken from its pixel values.
     """
 
     observation: Image
@@ -56,12 +53,12 @@ class Readings:
     scale: Scale | None = None
 
     def darkest(self) -> tuple[float, float]:
-        """Mean signal of the pixels whose neighbours are the darkest, and its standard error."""
+        """Return the mean signal of the pixels with the darkest neighbours, and its standard error, counts."""
         signal = self.signal[np.argsort(self.level)[:NUM_DARKEST]]
         return float(signal.mean()), float(np.hypot(signal.std(), self.step) / np.sqrt(len(signal)))
 
     def rescaled(self, scale: Scale) -> Readings:
-        """The same pixel values with their signals on another scale of the same long exposure."""
+        """Return the same pixel values with signals computed by another scaling of the same long exposure."""
         old = self.scale or scale
         factor = scale.slope / old.slope
         signal = factor * (self.signal - old.intercept) + scale.intercept
@@ -70,13 +67,13 @@ class Readings:
 
 @dataclass(frozen=True)
 class Scale:
-    """How the signals of one exposure pair came from its long exposure, so that the likelihood may doubt it.
+    """Scaling of the long exposure of one pair to signals; the likelihood treats it as uncertain.
 
     Attributes:
         pair: number of the pair.
         slope, intercept: signal = slope·long + intercept, counts.
-        centre: a signal in the middle, counts.
-        common_offset: one detector setting took both exposures, so that intercept = offset·(1 − slope).
+        centre: central signal, counts.
+        common_offset: whether both exposures were recorded at one detector setting, so that intercept = offset·(1 − slope).
     """
 
     pair: int
@@ -86,34 +83,34 @@ class Scale:
     common_offset: bool = False
 
     def rescaled(self, factor: float, shift: float) -> Scale:
-        """When the signals become factor·signal + shift."""
+        """Return the scaling after the transformation signal → factor·signal + shift."""
         moved = {name: factor * getattr(self, name) + shift for name in ("intercept", "centre")}
         return replace(self, slope=factor * self.slope, **moved)
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Histograms at L signal levels, of residuals (observation − signal), or of the pixel values themselves.
+    """Histograms at L signal levels, of residuals (observation − signal) or of pixel values.
 
     Attributes:
         signal: (L,) mean signal, counts.
-        spread: (L,) variance of the true signals within the level, counts²; in histograms of pixel values that of the
-            estimated ones.
+        spread: (L,) variance of the true signals within the level, counts²; in histograms of pixel values, variance of the
+            estimated signals.
         variance: (L,) variance of observation − signal, counts².
-        count: (L,) pixel values.
-        width: (L,) of a histogram cell, counts.
+        count: (L,) number of pixel values.
+        width: (L,) width of a histogram cell, counts.
         origin: (L,) left edge of the first cell, counts.
-        histogram: (L, cells) pixel values.
+        histogram: (L, cells) number of pixel values per cell.
         shot_share, read_share, weight, dark, step: (L,) as in `Readings`.
-        low, high: (L,) clipping limits; the cells that hold them hold all pixel values beyond them too.
-        own: (L,) variance of the estimate's own noise that the next two go by, counts².
-        shift: (L,) how far the mean true signal lies above the mean estimate, counts.
-        excess: (L,) by how many times `own` the true signals' variance exceeds that of the estimates.
-        darkest, darkest_error: (L,) signal of the darkest pixels of an exposure and its standard error, counts, beside its first
-            level; infinite beside the others, and where no light was.
-        scales: of the pairs.
-        scale: (L,) index into `scales`; −1 where the mean of the level is its pixel values' own.
-        absolute: the histograms are of the pixel values themselves.
+        low, high: (L,) clipping limits, counts; their cells include all pixel values beyond them.
+        own: (L,) noise variance of the estimate for which `shift` and `excess` are given, counts².
+        shift: (L,) mean true signal minus mean estimate, counts.
+        excess: (L,) variance of the true signals minus that of the estimates, in units of `own`.
+        darkest, darkest_error: (L,) signal of the darkest pixels of an exposure and its standard error, counts, at its first
+            level; infinite at the other levels and in dark frames.
+        scales: scalings of the pairs.
+        scale: (L,) index into `scales`; −1 if the mean of the level is taken from its pixel values.
+        absolute: whether the histograms are of pixel values.
     """
 
     signal: Image
@@ -141,21 +138,21 @@ class Levels:
 
     @property
     def slope(self) -> Image:
-        """(L,) slope of each level's scale."""
+        """(L,) slope of the scaling of each level."""
         return np.array([self.scales[index].slope for index in self.scale])
 
     @property
     def intercept(self) -> Image:
-        """(L,) intercept of each level's scale, counts."""
+        """(L,) intercept of the scaling of each level, counts."""
         return np.array([self.scales[index].intercept for index in self.scale])
 
     @property
     def common(self) -> NDArray[np.bool_]:
-        """(L,) whether the offset is that of both exposures."""
+        """(L,) whether both exposures have the same offset."""
         return np.array([index >= 0 and self.scales[index].common_offset for index in self.scale])
 
     def clipped(self) -> Image:
-        """(L,) share of the pixel values in a clipping limit's cell."""
+        """Return the (L,) share of pixel values in the cell of a clipping limit."""
         cell = [
             np.floor((np.nan_to_num(rail, posinf=-1e300, neginf=-1e300) - self.origin) / self.width)
             for rail in (self.low, self.high)
@@ -168,10 +165,10 @@ class Levels:
         return np.asarray(sum(held) / self.count if self.absolute else np.zeros_like(self.signal))
 
     def rescaled(self, change: dict[int, tuple[float, float]]) -> Levels:
-        """The same pixel values when the signals of some scales become factor·signal + shift.
+        """Return the levels after the transformation signal → factor·signal + shift for some scalings.
 
         Args:
-            change: factor and shift by index of the scale.
+            change: factor and shift by index of the scaling.
         """
         factor, shift = np.ones_like(self.signal), np.zeros_like(self.signal)
         scales = list(self.scales)
@@ -195,14 +192,14 @@ class Levels:
 
 
 def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS) -> Levels:
-    """Sort pixel values into levels of like signal and count their residuals.
+    """Sort pixel values into levels of similar signal and compute the histograms of their residuals.
 
-    The neighbours sort the pixels, so that no pixel's own noise does. Rounded values are dithered by one step, so that their
-    steps do not beat with the bins; the likelihood knows.
+    Pixels are sorted by the signal of their neighbours, which is independent of their own noise. Rounded values are dithered by
+    one step to avoid aliasing with the bins; the likelihood accounts for the dither.
 
     Args:
-        readings: of one detector setting; each is sorted into levels of its own.
-        num_levels: at most, per exposure; fewer where a level would hold under 200 pixel values.
+        readings: pixel values of one detector setting; each item is sorted into levels of its own.
+        num_levels: largest number of levels per exposure; fewer if a level would have fewer than 200 pixel values.
 
     Example:
         >>> import calibration, numpy as np
@@ -233,7 +230,7 @@ def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolu
 
 
 def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, Any]]:
-    """The levels of an exposure, the darkest signal of all beside the first."""
+    """Add the darkest signal of the exposure to its first level."""
     if rows and not one.dark:
         rows[0]["darkest"], rows[0]["darkest_error"] = one.darkest()
     return rows

@@ -1,4 +1,4 @@
-"""The exact likelihood of a Poisson-Gaussian detector, by its characteristic function."""
+"""Exact likelihood of a Poisson-Gaussian detector, computed from its characteristic function."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from calibration.detector.levels import Levels, Scale
 from calibration.exposures.frames import Image
 
 LEAST_SIZE = 1e-8
-"""Size of a characteristic function that is left out: of 10⁷ pixel values it moves a tenth of one from its cell."""
+"""Magnitude below which the characteristic function is truncated; of 10⁷ pixel values, this misplaces 0.1."""
 
 LEAST_MASS = LEAST_SIZE
-"""Probability below which what was left out of the transform rules; outliers so far out all count alike."""
+"""Lower bound of a cell's probability, below which truncation errors dominate; all farther outliers count equally."""
 
 LARGEST_GAIN = 30.0
-"""Nats that another scale of the signals may gain: where it seems more, the second order no longer holds."""
+"""Largest gain in log-likelihood from rescaling the signals, nats; beyond it the second-order expansion is invalid."""
 
 Complex = NDArray[np.complex128]
 
@@ -25,14 +25,14 @@ Complex = NDArray[np.complex128]
 class DetectorLikelihood:
     """log p(histograms | gain, offset, read noise).
 
-    An observation is rounded and clipped gain·Poisson((signal − offset)/gain) + offset + gain·read_noise·normal. The Fourier
-    transform of its characteristic function gives the mass of every cell exactly, for Poisson counts of any size, for cells
-    as fine as the rounding, and for the clipping limits, whose cells hold all that lies beyond. Within a level true signals
-    spread as a gamma distribution of the measured variance. Residuals from a signal estimate that is noisy itself have the
-    characteristic function of both noises together; in them rounding counts as independent uniform noise.
+    An observation is gain·Poisson((signal − offset)/gain) + offset + gain·read_noise·normal, rounded and clipped. The Fourier
+    transform of its characteristic function gives the exact probability of every cell, for any Poisson mean, for cells as narrow
+    as the rounding step, and for the cells at the clipping limits, which include all values beyond. The true signals within a
+    level have a gamma distribution with the measured variance. The characteristic function of a residual includes the noise of
+    the signal estimate, and treats rounding as independent uniform noise.
 
-    The scale and offset that made signals of a long exposure are uncertain: the likelihood is integrated over them,
-    to second order around their estimates.
+    The scaling of a long exposure to signals is uncertain. The likelihood is integrated over it, to second order around its
+    estimate.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -61,13 +61,13 @@ class DetectorLikelihood:
         return total
 
     def rescaling(self, gain: float, offset: float, read_noise: float) -> dict[int, tuple[float, float]]:
-        """Factor and shift that each scale's signals need to be most likely at one parameter set."""
+        """Return the factor and shift of each scaling's signals that maximise the likelihood at one parameter set."""
         _, scales = self._sums(*(np.array([value]) for value in (gain, offset, read_noise)))
         change = {}
         for index, (gradient, information) in scales.items():
             scale = self._scale(index)
             step = _solve(information + self._prior(index), gradient)[0]
-            if scale.common_offset:  # offset + (1 + step)·(signal − image of the offset)
+            if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset)
                 image = scale.intercept + scale.slope * offset
                 change[index] = (1 + step[0], offset - (1 + step[0]) * image)
             else:
@@ -78,14 +78,14 @@ class DetectorLikelihood:
         return next(one.scales[index] for one in self.levels if index in one.scale)
 
     def _prior(self, index: int) -> Image:
-        """Information of a prior that the scale is right to a factor of two or so and to the whole range of the signals."""
+        """Information matrix of a weak prior: slope within a factor of about two, intercept within the range of the signals."""
         if self._scale(index).common_offset:
             return np.eye(1)
         signal = np.concatenate([one.signal[one.scale == index] for one in self.levels])
         return np.diag([1 / max(float(np.ptp(signal)), 1.0) ** 2, 1.0])
 
     def _sums(self, gain: Image, offset: Image, read_noise: Image) -> tuple[Image, dict[int, tuple[Image, Image]]]:
-        """Log-likelihood, and by scale its gradient (W, P) and information (W, P, P) in the scale's parameters."""
+        """Return the log-likelihood, and for each scaling the gradient (W, P) and information (W, P, P) in its parameters."""
         total = np.zeros(len(gain))
         scales: dict[int, tuple[Image, Image]] = {}
         for part in self.parts:
@@ -107,10 +107,10 @@ def _solve(information: Image, gradient: Image) -> Image:
 
 
 class LevelMasses:
-    """Cell masses of one set of levels.
+    """Cell probabilities of one set of levels.
 
     Args:
-        levels: all of residuals or all of pixel values.
+        levels: histograms of residuals or of pixel values.
     """
 
     def __init__(self, levels: Levels) -> None:
@@ -135,8 +135,12 @@ class LevelMasses:
     def terms(
         self, gain: Image, offset: Image, read_noise: Image
     ) -> tuple[Image, Image, Image, Callable[[int], Image]]:
-        """Log-likelihood (W,), its derivative by each level's mean signal and the information on it, (W, L), and how that mean
-        depends on the parameters of a scale, (W, L, P)."""
+        """Return the terms of the likelihood for W parameter sets.
+
+        Returns:
+            Log-likelihood (W,); its derivative with respect to the mean signal of each level, and the information on it, (W, L);
+            and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
+        """
         transform, slope = self._transform(gain, offset, read_noise, self._tracked)
         mass = np.maximum(self._folded(transform), LEAST_MASS)
         value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - self._darkness(offset)
@@ -149,14 +153,13 @@ class LevelMasses:
         return value, score, information, lambda index: self._design(index, offset)
 
     def masses(self, gain: Image, offset: Image, read_noise: Image) -> Image:
-        """Probability of each histogram cell, (W, L, cells)."""
+        """Return the probability of each histogram cell, (W, L, cells)."""
         return self._folded(self._transform(gain, offset, read_noise, False)[0])
 
     def _transform(
         self, gain: Image, offset: Image, read_noise: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        """Transform of the cells at as many leading frequencies as matter for these parameter sets, and its logarithmic
-        derivative by the levels' means."""
+        """Return the cell transforms at the significant frequencies, and their logarithmic derivative by the mean signals."""
         number = min(max(self._number, self._least_number(gain, read_noise)), self._most)
         while True:
             frequency, cell = self._frequencies(number)
@@ -169,27 +172,29 @@ class LevelMasses:
         return np.exp(exponent) * cell, slope
 
     def _least_number(self, gain: Image, read_noise: Image) -> int:
-        """Frequencies below which peaks of single electrons may return to the transform; 0 where read noise blurs them."""
+        """Number of frequencies that may contain single-electron peaks; 0 if read noise blurs them."""
         if not self.levels.absolute or read_noise.min() > np.sqrt(-2 * np.log(LEAST_SIZE)) / (2 * np.pi):
             return 0
         highest = np.sqrt(-2 * np.log(LEAST_SIZE)) / (gain * read_noise).min()
         return int(highest * self.levels.width.max() * self.num_cells / (2 * np.pi)) + 2
 
     def _frequencies(self, number: int) -> tuple[Image, Complex]:
-        """Leading frequencies of each level, radians per count, and the transforms of its cells, (L, F)."""
+        """Return the lowest frequencies of each level, radians per count, and the transforms of its cells, (L, F)."""
         if self._kept is None or self._kept[0].shape[1] < number:
             levels = self.levels
             turn = np.arange(2 * number) * 2 * np.pi / self.num_cells
             frequency = turn / levels.width[:, None]
             cell = np.sinc(turn / (2 * np.pi)) * np.exp(-1j * (0.5 * turn + frequency * levels.origin[:, None]))
-            if not levels.absolute:  # the converter's rounding, and our dither
+            if not levels.absolute:  # rounding and dither
                 cell = cell * np.sinc(frequency * levels.step[:, None] / (2 * np.pi)) ** 2
             self._kept = frequency, cell
         return self._kept[0][:, :number], self._kept[1][:, :number]
 
     def _folded(self, transform: Complex) -> Image:
-        """Cell masses from the transform at frequencies 0, 1, …, aliased as cells alias them; what lies beyond a clipping
-        limit joins its cell."""
+        """Convert the transform at frequencies 0, 1, … to cell probabilities, with aliasing by the cells.
+
+        Probability beyond a clipping limit is added to its cell.
+        """
         number = self.num_cells
         if transform.shape[-1] > number // 2 + 1:
             periods = -(-transform.shape[-1] // number)
@@ -211,14 +216,14 @@ class LevelMasses:
         return np.asarray(mass)
 
     def _moved(self, offset: Image) -> Image:
-        """(W, L) how far an offset common to both exposures moves the signals of their pair."""
+        """Return the (W, L) shift of the signals of a pair due to an offset common to both exposures, counts."""
         common = self.levels.common
         return np.where(common, (1 - self.levels.slope) * offset[:, None] - self.levels.intercept, 0.0)
 
     def _darkness(self, offset: Image) -> Image:
-        """(W,) nats against an offset above the darkest signal, where no light can be: half the square over its error.
+        """Return the (W,) penalty, nats, of an offset above the darkest signal: half the square of the excess in standard errors.
 
-        Without it such an offset would bend the variance line, as if dark pixels had read noise alone.
+        Without it, such an offset would bend the variance line, as if dark pixels had only read noise.
         """
         lack = np.maximum(offset[:, None] - self.levels.darkest - self._moved(offset), 0.0) / self.levels.darkest_error
         return np.asarray(0.5 * np.sum(lack**2, axis=1))
@@ -234,7 +239,7 @@ class LevelMasses:
     def _exponent(
         self, t: Image, gain: Image, offset: Image, read_noise: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        """Log characteristic function at (L, F) frequencies, (W, L, F), and its derivative by the level's mean signal."""
+        """Return the log characteristic function at (L, F) frequencies, (W, L, F), and its derivative by the mean signal."""
         levels = self.levels
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
         lit = 1 - levels.dark
@@ -259,11 +264,12 @@ class LevelMasses:
         if share.any():
             noise = np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
             cumulant = cumulant + noise
-        # a gamma distribution, as the fraction that agrees with it to second order: unlike the second order itself, it makes no
-        # probability above one of a spread much larger than its mean, as where an offset leaves a level no electrons
+        # The gamma distribution is approximated by a rational function that agrees to second order. A plain second-order
+        # expansion would give probabilities above one if the spread is much larger than the mean, as for levels without
+        # electrons.
         rate = np.maximum(electrons, 1e-9)
         exponent = rate * cumulant / (1 - 0.5 * spread / rate * cumulant)
-        wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # where that saves a logarithm
+        wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # only these need the exact form
         if wide.size:
             exponent[:, wide], _ = _gamma_mixed(cumulant[:, wide], electrons[:, wide], spread[:, wide], False)
         exponent = exponent + (1 + levels.read_share[:, None]) * read
@@ -273,7 +279,7 @@ class LevelMasses:
 
 
 def _gamma_mixed(unit: Complex, rate: Image, variance: Image, with_slope: bool) -> tuple[Complex, Complex | None]:
-    """log E exp(λ·unit) for λ of a gamma distribution with mean `rate`, and its derivative by that mean."""
+    """Return log E exp(λ·unit) for gamma-distributed λ with mean `rate`, and its derivative by that mean."""
     scale = np.maximum(np.minimum(variance / np.maximum(rate, 1e-9), np.maximum(rate, 1.0)), 1e-7)
     logarithm: Complex = np.log1p(-scale * unit)
     slope = -2 * logarithm / scale - unit / (1 - scale * unit) if with_slope else None

@@ -13,36 +13,36 @@ from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 
 NUM_RESCALINGS = 6
-"""Rounds, at most, of maximising the likelihood and bringing the signals to the scale it prefers."""
+"""Largest number of iterations of maximising the likelihood and rescaling the signals to the most likely scaling."""
 
 READ_NOISE_RANGE = (0.1, 300.0)
-"""Electrons rms: the prior, flat in the logarithm; from under the best detectors made to beyond the worst."""
+"""Support of the log-uniform prior of the read noise, electrons rms; it includes all existing detectors."""
 
 UNRESOLVED = 0.1, 0.4
-"""Read noise below which single electrons would show between the codes of a converter: in its steps, and at most so many
-electrons, beyond which no electron shows. The prior ends there. Coarser codes than electrons cannot tell less, and the
-likelihood would be a field of peaks where electrons and codes keep step."""
+"""Lower limit of the read noise in the prior: the smaller of the first value in rounding steps and the second in electrons rms,
+above which no single-electron peaks are visible. Below the limit, rounding hides the read noise, and the likelihood has many
+narrow peaks where electrons and codes coincide."""
 
 MOST_WRONG = 12
-"""Electrons by which a start may miss the offset: from 12 pixels of 10 electrons each the photon-transfer line extrapolates
-to the offset within this."""
+"""Largest error of the initial offset that is searched, electrons: the accuracy of the offset extrapolated from the
+photon-transfer line of 12 pixels with 10 electrons each."""
 
 MOST_ELECTRONS = 1e60
-"""Electrons of a pixel beyond which a proposal is impossible: their squares are still finite numbers. Noise that does not depend
-on the signal lets the posterior reach gains as small as its prior allows, far below this, by which it is recognised."""
+"""Largest number of electrons per pixel of a proposal, so that its square remains finite. If the noise does not depend on the
+signal, the posterior extends to the smallest gains of its prior, by which this case is detected."""
 
 
 class LogPosterior:
     """log p(parameters | levels) for rows of (log gain, offset or log variance, log read noise).
 
-    The data fix the line of variance against signal; along it the read noise and the offset trade places. Where nothing
-    else tells the offset, the second coordinate is the log variance at the mean signal, in which that ridge is straight. The
+    The data determine the line of variance against signal, along which read noise and offset are degenerate. If nothing else
+    determines the offset, the second coordinate is the log variance at the mean signal, in which this ridge is straight. The
     priors are flat in log gain, in log read noise within `READ_NOISE_RANGE` and above `UNRESOLVED`, and in the offset below the
-    brightest level; or the offset's is normal where it was measured.
+    brightest level; a measured offset has a normal prior.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
-        offset: measured offset and its standard error, counts; None: unknown.
+        offset: measured offset and its standard error, counts; None if unknown.
     """
 
     def __init__(self, levels: Sequence[Levels], offset: tuple[float, float] | None = None) -> None:
@@ -56,11 +56,11 @@ class LogPosterior:
         self.by_offset = offset is not None or any(one.common.any() for one in levels)
 
     def __call__(self, coordinates: Image) -> NDArray[np.float64]:
-        """(W, 3) -> (W,) nats, −inf outside the prior."""
+        """Return the log-posterior of (W, 3) coordinates, (W,) nats; −inf outside the prior."""
         coordinates = np.atleast_2d(coordinates)
         low, high = np.log(READ_NOISE_RANGE)
         inside = (coordinates[:, 2] > low) & (coordinates[:, 2] < high) & (np.abs(coordinates[:, 0]) < 50)
-        with np.errstate(over="ignore"):  # variances so far off that they overflow are refused in the next line
+        with np.errstate(over="ignore"):  # variances that overflow are rejected in the next line
             gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
         inside &= (offset < self.brightest) & (self.brightest - offset < MOST_ELECTRONS * gain)
         inside &= read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1])
@@ -74,7 +74,7 @@ class LogPosterior:
         return np.where(np.isnan(result), -np.inf, result)
 
     def parameters(self, coordinates: Image) -> tuple[Image, Image, Image]:
-        """Gain, offset and read noise of rows of coordinates, each (W,)."""
+        """Convert (W, 3) coordinates to gain, offset and read noise, each (W,)."""
         log_gain, second, log_read = np.atleast_2d(coordinates).T
         gain, read_noise = np.exp(log_gain), np.exp(log_read)
         if self.by_offset:
@@ -82,14 +82,14 @@ class LogPosterior:
         return gain, self.reference + gain * read_noise**2 - np.exp(second) / gain, read_noise
 
     def coordinates(self, gain: ArrayLike, offset: ArrayLike, read_noise: ArrayLike) -> Image:
-        """The coordinates of parameter sets, (W, 3)."""
+        """Convert parameter sets to (W, 3) coordinates."""
         g, o, r = (np.atleast_1d(np.asarray(value, float)) for value in (gain, offset, read_noise))
         variance = g * (self.reference - o) + (g * r) ** 2
         second = o if self.by_offset else np.log(np.maximum(variance, np.finfo(float).tiny))
         return np.column_stack([np.log(g), second, np.log(r)])
 
     def rescaled(self, best: Image) -> LogPosterior | None:
-        """The same posterior about the scales that are most likely at `best`; None if they are that already."""
+        """Return the posterior expanded about the most likely scalings at `best`; None if they are unchanged."""
         change = self.likelihood.rescaling(*(float(value[0]) for value in self.parameters(best)))
         moved = max((abs(factor - 1) + abs(shift) / self.brightest for factor, shift in change.values()), default=0.0)
         if moved < 1e-4:
@@ -100,14 +100,14 @@ class LogPosterior:
 def maximum_likelihood(
     log_posterior: LogPosterior, start: tuple[float, float, float] | None = None
 ) -> tuple[LogPosterior, Image]:
-    """The most likely coordinates.
+    """Find the maximum of the posterior.
 
     Args:
-        log_posterior: of the levels.
+        log_posterior: log-posterior of the levels.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
 
     Returns:
-        The posterior about the most likely scales of the signals, and the (3,) coordinates of its maximum.
+        The posterior expanded about the most likely scalings of the signals, and the (3,) coordinates of its maximum.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal.
@@ -133,7 +133,7 @@ def _climb(log_posterior: LogPosterior, start: Image) -> Image:
 
 
 def _by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
-    """The maximum beside others whose offset differs by whole electrons: where single electrons show, each has a peak there."""
+    """Compare the maximum with those whose offset differs by whole electrons; with single-electron peaks, each is a maximum."""
     gain, offset, read_noise = (value.item() for value in log_posterior.parameters(best))
     if read_noise > UNRESOLVED[1]:
         return best
@@ -144,7 +144,7 @@ def _by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
 
 
 def _start(log_posterior: LogPosterior) -> Image:
-    """The most likely of a set of guesses along the photon-transfer line, (3,)."""
+    """Return the most likely of several guesses along the photon-transfer line, (3,)."""
     line = fit_photon_transfer(log_posterior.levels)
     variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
     guesses = []
@@ -164,6 +164,6 @@ def _start(log_posterior: LogPosterior) -> Image:
 
 
 def _common_offsets(levels: Sequence[Levels]) -> list[float]:
-    """Offsets that the scales of pairs taken with one detector setting tell."""
+    """Return the offsets implied by the scalings of pairs recorded at one detector setting, counts."""
     found = {one.scales[index] for one in levels for index in one.scale[one.common]}
     return [scale.intercept / (1 - scale.slope) for scale in found]

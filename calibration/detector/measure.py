@@ -1,4 +1,4 @@
-"""From aligned exposures to the detector's parameters: pixel values collected, offset measured where it can be, posterior."""
+"""Measurement of the detector's parameters from aligned exposures: histograms, measured offset, posterior."""
 
 from __future__ import annotations
 
@@ -26,45 +26,45 @@ if TYPE_CHECKING:
     from noiseflow.commands.console import Progress
 
 EXCESS_NOISE = (
-    "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only gain times "
-    "the excess-noise factor: 'gain' is then this product."
+    "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only the "
+    "product of gain and excess-noise factor; the reported gain is then this product."
 )
 
 LEAST_GAIN = 1e-4
-"""Standard deviations of the noise below which a gain is none: such a noise would be that of 10⁸ electrons and more."""
+"""Smallest measurable gain, in standard deviations of the noise; below it the noise would be that of over 10⁸ electrons."""
 
 AGREEMENT = 3.0
-"""Standard errors within which the long exposure's measured shot noise agrees with that of one detector setting."""
+"""Largest difference between the measured and the expected shot noise of the long exposure for one setting, standard errors."""
 
 LOOSEST = 0.75
-"""Relative width of that test beyond which it would accept anything: of the signal's own noise, itself a sixteenth of all at a
-ratio of 16."""
+"""Largest relative tolerance of that test, beyond which it would accept any value. It refers to the noise of the signal, which is
+a sixteenth of the total at a ratio of 16."""
 
 LARGEST_SLOPE = 0.5
-"""Scale of the exposures above which the signal's own noise is too large a share to be taken on such a test."""
+"""Largest slope of the scaling for which the test is used; above it the noise of the signal is too large a share."""
 
 COLUMNS = ("observation", "signal", "level")
 
 FEW_ELECTRONS = 25.0
-"""Variance, in electrons², below which the shape of Poisson noise tells more than its variance."""
+"""Variance, electrons², below which the shape of Poisson noise contains more information than its variance."""
 
 
 @described(offset="counts")
 @dataclass(frozen=True)
 class Detector:
-    """A detector's parameters and what they rest on.
+    """Parameters of a detector and the data behind them.
 
     Attributes:
         posterior: gain, offset and read noise.
         line: the photon-transfer points and line.
         levels: the histograms.
-        offset: offset measured by dark frames and its standard error, counts; None without.
-        misfit: χ² per degree of freedom of the histograms: about 1 for a Poisson-Gaussian detector. Where the converter's codes
-            are uneven, of several codes together, which tell the shape of the noise.
-        uneven: relative deviation of the pixels' own variances, at equal signal, in a burst of four frames or more; 0: none.
-        codes: relative deviation (rms) of the widths of the converter's codes; 0: none.
-        electrons: single electrons show as peaks of the pixel values, one gain apart.
-        dark_deviation: of the dark frames over time, counts rms, without rounding; None without dark frames.
+        offset: offset measured from dark frames and its standard error, counts; None without dark frames.
+        misfit: χ² per degree of freedom of the histograms, about 1 for a Poisson-Gaussian detector. If the converter's codes are
+            uneven, groups of codes are used.
+        uneven: relative deviation (rms) of the pixels' variances at equal signal, in a burst of at least four frames; 0 if none.
+        codes: relative deviation (rms) of the converter's code widths; 0 if none.
+        electrons: whether the pixel values have single-electron peaks, one gain apart.
+        dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -97,14 +97,14 @@ def measure_detector(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Detector:
-    """Gain, offset and read noise from aligned pairs or a burst.
+    """Measure gain, offset and read noise from aligned pairs or a burst.
 
     Args:
         pairs: from `align_pair` or `align_burst`.
-        dark: frames without light: they measure the offset, and the read noise directly.
-        flat: equal frames of even illumination: one more level.
-        seed: of the sampler.
-        progress: called with the sampler's steps.
+        dark: frames taken without light; they determine offset and read noise directly.
+        flat: frames of uniform illumination; they add one level.
+        seed: random seed of the sampler.
+        progress: called with the number of steps of the sampler and a note.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.
@@ -131,15 +131,15 @@ def measure_detector(
     levels = [collect_levels(plain)] if plain else []
     start = None
     if cells:
-        with suppress(NotMeasurable) if plain else nullcontext():  # a few pixels beside many are left out
+        with suppress(NotMeasurable) if plain else nullcontext():  # optional if enough other pixels exist
             levels, start = _with_cells(levels, cells, offset, _guess(pairs))
     posterior = sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress)
     levels = list(posterior.levels)
     noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))
     if posterior.gain.median < LEAST_GAIN * noise:
         raise NotMeasurable(
-            "the noise grows so little with the signal that no gain can be measured; give the exposure ratio, "
-            "dark frames, or exposures of more electrons"
+            "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
+            "dark frames, or exposures with more electrons"
         )
     line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=MERGED if codes else 1)
@@ -162,8 +162,7 @@ def _with_cells(
     offset: tuple[float, float] | None,
     guess: tuple[float, float, float],
 ) -> tuple[list[Levels], tuple[float, float, float]]:
-    """Levels of residuals and of pixel values, the latter laid out by the parameters that a first fit of them finds; and
-    these."""
+    """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
     first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
     gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
     scales = first.levels[-1].scales
@@ -173,7 +172,7 @@ def _with_cells(
 
 
 def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
-    """Gain, offset and read noise as the variance lines of the pairs tell them, roughly."""
+    """Return rough estimates of gain, offset and read noise from the variance lines of the pairs."""
     found: list[tuple[float, float, float]] = []
     for pair in pairs:
         line, share = pair.total_variance, 1 + _shares(pair)[0]
@@ -189,18 +188,18 @@ def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
 
 
 def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
-    """The trusted pixels of a pair, in two parts: for residuals, and for histograms of the pixel values themselves.
+    """Split the valid pixels of a pair into those for residuals and those for histograms of pixel values.
 
-    The latter are those of few electrons, of a noise as fine as the rounding, or near the converter's clipping limits: their
-    residuals would lose what the likelihood can use. A burst, whose signals are as noisy as its pixel
-    values, has only residuals, clear of the clipping limits.
+    Histograms of pixel values are used for pixels with few electrons, with noise as small as the rounding step, or near the
+    clipping limits; residuals would lose information there. A burst, whose signals are as noisy as its pixel values, has only
+    residuals, away from the clipping limits.
 
     Args:
-        pair: aligned.
-        number: of the pair, for its scale.
+        pair: aligned pair.
+        number: number of the pair, which identifies its scaling.
 
     Raises:
-        NotMeasurable: too few pixels.
+        NotMeasurable: there are too few pixels.
     """
     level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
@@ -220,25 +219,25 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
     if not found[0] and not found[1]:
         raise NotMeasurable(
-            f"of {int(pair.mask.sum())} pixels none lie clear of the converter's limits, so that their noise is cut off; raise "
-            "the detector's offset, or expose for longer"
+            f"nearly all of {int(pair.mask.sum())} pixels are close to a clipping limit, so their noise is clipped; increase "
+            "the detector's offset, or use a longer exposure"
         )
     return found
 
 
 def _fine(pair: AlignedPair, level: Image, step: float) -> Mask:
-    """Pixels of few electrons, or whose noise is as fine as the rounding."""
+    """Return the mask of pixels with few electrons, or with noise as small as the rounding step."""
     variance = pair.total_variance(level)
     gain = max(pair.total_variance.rate, 0.0)
     return np.asarray((variance < FEW_ELECTRONS * gain**2) | (variance < (3 * step) ** 2))
 
 
 def _shares(pair: AlignedPair) -> tuple[float, float]:
-    """Variance of the signal estimate over that of the reading, for shot noise and for read noise.
+    """Return the variance of the signal estimate over that of the pixel value, for shot noise and for read noise.
 
-    One detector setting makes them the exposures' scale and its square, less what the interpolation smooths away. That is so
-    where a ratio was given, and taken to be so where the shot noise measured in the long exposure agrees; otherwise the
-    measured share stands for both.
+    For one detector setting they equal the slope of the scaling and its square, times the noise that interpolation preserves.
+    This is assumed if a ratio was given, or if the measured shot noise of the long exposure agrees; otherwise the measured
+    share is used for both.
     """
     ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else _plain_ratio(pair)
     if ratio is not None:
@@ -251,7 +250,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
 
 
 def _plain_ratio(pair: AlignedPair) -> float | None:
-    """The exposure ratio that the scale tells where the signal's own shot noise is what it then must be, else None."""
+    """Return the exposure ratio implied by the scaling if the measured shot noise of the signal agrees with it, else None."""
     own, total, slope = pair.signal_variance, pair.total_variance, pair.scaling.slope
     if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
         return None
@@ -260,20 +259,20 @@ def _plain_ratio(pair: AlignedPair) -> float | None:
 
 
 def _kept(pair: AlignedPair) -> float:
-    """Share of white noise in the long exposure that its interpolation keeps."""
+    """Return the fraction of white-noise variance that interpolation of the long exposure preserves."""
     noise = np.random.default_rng(0).standard_normal(pair.long.shape)
     return float(np.var(pair.registration.warp(noise)[0][pair.mask]))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:
-    """Mean of the dark frames and its standard error, from the scatter between frames."""
+    """Return the mean of the dark frames and its standard error, counts, including the scatter between frames."""
     means = dark.frames.mean(axis=(1, 2))
     scatter = float(np.std(dark.frames - dark.frames.mean(0), ddof=0)) / np.sqrt(dark.frames.size)
     return float(means.mean()), float(np.hypot(scatter, means.std(ddof=1) / np.sqrt(len(means))))
 
 
 def dark_deviation(dark: Burst | None) -> float | None:
-    """Deviation of dark frames over time, counts rms, without that of rounding; None without frames."""
+    """Return the temporal noise of dark frames without rounding, counts rms; None without frames."""
     if dark is None:
         return None
     rounding = rounding_step(dark.frames[0]) ** 2 / 12
@@ -281,7 +280,7 @@ def dark_deviation(dark: Burst | None) -> float | None:
 
 
 def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
-    """Every frame beside the mean of the others, with no scene to align."""
+    """Compare every frame with the mean of the others, without alignment."""
     number = len(burst.frames)
     others, share = (burst.frames.sum(0) - burst.frames) / (number - 1), 1 / (number - 1)
     signal = others + (burst.frames - others).mean(axis=(1, 2), keepdims=True)
@@ -293,8 +292,7 @@ def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
 
 
 def pooled(readings: Sequence[Readings]) -> list[Readings]:
-    """Pixel values with those of the frames of a burst taken together: one histogram of all frames at a level holds what a
-    hundred small ones do, and takes a hundredth of the time."""
+    """Merge the pixel values of all frames of a burst, so that each level needs only one histogram."""
     groups: dict[Any, list[Readings]] = {}
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)

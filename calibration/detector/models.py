@@ -1,4 +1,4 @@
-"""Which noise model suffices: fitted by the library's one selector on some blocks of pixels, judged on the others."""
+"""Selection of a noise model: models are fitted to some blocks of pixels and evaluated on the others."""
 
 from __future__ import annotations
 
@@ -31,47 +31,47 @@ KINDS: dict[str, str] = {
     "spline": "SplineFlow",
     "physics-flow": "PhysicsFlow",
 }
-"""Names of the noise models that compete, simplest first, and their classes in noiseflow."""
+"""Names of the candidate noise models, simplest first, and their classes in noiseflow."""
 
 BLOCK = 8
-"""Side, in pixels, of the blocks kept apart."""
+"""Side of the held-out blocks, pixels."""
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
-"""Those that are fitted always; the flexible ones only where these leave something to gain."""
+"""Models that are always fitted; flexible models are fitted only if these can be improved."""
 
 MOST_COUNTS = 1e4
-"""Mean counts above which values are no counts of single events: dead times of counters end there at exposures of a frame."""
+"""Largest mean of counts of single events: the dead time of counters limits them to fewer per frame."""
 
 FLEXIBLE = ("mixture", "flow", "spline", "physics-flow")
-"""Those of some thousand parameters."""
+"""Models with thousands of parameters."""
 
 NUM_STEPS = 200
-"""Optimisation steps of each model."""
+"""Number of optimisation steps per model."""
 
 MOST_PIXELS = 32_768
-"""Pixels that models are fitted to, as many as the selector screens them by."""
+"""Largest number of pixels for the fits, equal to that of the selector."""
 
 MOST_BLOCKS = 8192
-"""Blocks, half of them kept apart to judge: 262 000 pixels tell two models apart to 0.0003 nats, a tenth of `WORTH_FITTING`, and
-finite samples add 1e-5 to a divergence. More would take most of the time of a large exposure and change no choice."""
+"""Largest number of blocks, half of which are held out. 262 000 held-out pixels resolve 0.0003 nats between two models, a tenth
+of `WORTH_FITTING`, with a finite-sample bias of 1e-5 in a divergence. More would take time without changing the selection."""
 
 WORTH_FITTING = 2.5e-3
-"""Nats per pixel that a simple model must leave before flexible ones are fitted: half of what the choice may lose, 0.005."""
+"""Attainable improvement, nats per pixel, above which flexible models are fitted: half the tolerated loss of 0.005."""
 
 GROUPS = 16
-"""Signal levels, and cells of the probability integral transform in each, that the test for flexible models compares."""
+"""Number of signal levels, and of cells of the probability integral transform per level, in the test for flexible models."""
 
 
 @described(signal="counts", observation="counts")
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of all pairs in one row, ready to fit and to judge.
+    """Pixels of all pairs, for fitting and evaluating noise models.
 
     Attributes:
         signal: (N,) counts.
         observation: (N,) counts; whole numbers where the detector rounds.
-        held_out: (N,) those that judge.
-        block: (N,) number of the block each belongs to.
+        held_out: (N,) whether a pixel is used for evaluation.
+        block: (N,) number of the block of each pixel.
     """
 
     signal: NDArray[np.float64]
@@ -83,16 +83,16 @@ class Pixels:
 @described(nll="nats per pixel", nll_error="nats per pixel", excess="nats per pixel", excess_error="nats per pixel")
 @dataclass(frozen=True)
 class ModelScore:
-    """A fitted noise model and its figures on the pixels kept apart.
+    """A fitted noise model and its scores on the held-out pixels.
 
     Attributes:
         name: one of `KINDS`.
         model: the fitted model.
         nll: mean negative log-likelihood, nats per pixel.
-        nll_error: its standard error, from the scatter between blocks.
-        excess: nll above the best model's, nats per pixel.
-        excess_error: its standard error, paired block by block.
-        evaluation: divergences of the residuals' histogram from the model's own bin masses, each with its floor; PIT.
+        nll_error: standard error of `nll`, from the scatter between blocks.
+        excess: difference of `nll` from that of the best model, nats per pixel.
+        excess_error: standard error of `excess`, from paired differences of blocks.
+        evaluation: divergences between the histogram of the residuals and the model, each with its finite-sample floor; PIT.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -115,14 +115,14 @@ class ModelScore:
 
 
 def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: float = 0.5) -> Pixels:
-    """Gather the trusted pixels of all pairs, with whole blocks kept apart for judging.
+    """Collect the valid pixels of all pairs, and hold out whole blocks for the evaluation.
 
-    Blocks lie at the same places in every pair, so that a pixel's scene never sits on both sides.
+    The held-out blocks have the same positions in every pair, so no part of the scene is in both sets.
 
     Args:
         pairs: aligned pairs.
-        seed: of the choice of blocks.
-        fraction: of the blocks kept apart.
+        seed: random seed of the selection of blocks.
+        fraction: fraction of the blocks to hold out.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -144,21 +144,21 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
 
 
 def _thinned(pixels: Pixels, seed: int) -> Pixels:
-    """`MOST_BLOCKS` random blocks of the pixels, or all where there are fewer."""
+    """Select at most `MOST_BLOCKS` random blocks of the pixels."""
     blocks = np.unique(pixels.block)
     if len(blocks) <= MOST_BLOCKS:
         return pixels
-    generator = np.random.default_rng([seed, 1])  # not the one that chose the blocks kept apart
+    generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
     kept = np.isin(pixels.block, generator.permutation(blocks)[:MOST_BLOCKS])
     return Pixels(pixels.signal[kept], pixels.observation[kept], pixels.held_out[kept], pixels.block[kept])
 
 
 def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:
-    """(y, x) the observation of a pair, as whole numbers if the exposure's are.
+    """Return the (y, x) observation of a pair, as integers if the exposure has integers.
 
-    Taking the signal's own noise out moves observations off the converter's steps. They are rounded again, and shrunk a little
-    more for the twelfth of a squared step that this adds; clipped pixel values stay at their limit. Where the noise is as fine
-    as the rounding, they stay as recorded.
+    The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, and the
+    correction is increased to compensate the added rounding variance, step²/12. Clipped pixel values keep their limit. If the
+    noise is as small as the rounding step, pixel values stay as recorded.
     """
     step = rounding_step(pair.short)
     if not step:
@@ -180,22 +180,22 @@ def fit_models(
     device: Any = "cpu",
     progress: Progress | None = None,
 ) -> list[ModelScore]:
-    """Fit noise models and judge them on the pixels kept apart.
+    """Fit noise models and evaluate them on the held-out pixels.
 
     Args:
         pixels: from `collect_pixels`.
-        kinds: names in `KINDS`; by default the simple ones, and the flexible ones where the best of these leaves more than
-            `WORTH_FITTING` nats per pixel to gain.
-        detector: gain, offset and read noise as measured, for the Poisson-Gaussian model; None: fitted.
-        seed: of every random choice.
-        device: torch device to fit on.
-        progress: called with the models done, and a note.
+        kinds: names in `KINDS`; by default the simple models, and the flexible ones if these can be improved by more than
+            `WORTH_FITTING` nats per pixel.
+        detector: measured gain, offset and read noise for the Poisson-Gaussian model; None to fit them.
+        seed: random seed.
+        device: torch device for the fits.
+        progress: called with the number of models done and a note.
 
     Returns:
-        One score per kind, simplest first; models on the CPU.
+        One score per kind, simplest first, with the models on the CPU.
 
     Raises:
-        ValueError: an unknown kind, or a model that cannot be fitted.
+        ValueError: a kind is unknown, or a model cannot be fitted.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -224,16 +224,17 @@ def fit_models(
 
 
 def _special(pixels: Pixels) -> tuple[str, ...]:
-    """Models of other detectors: one that multiplies electrons; and a counter with dead time, for whole numbers that scatter less
-    than Poisson counts, as such a counter's do."""
+    """Return the models of other detectors: excess noise, and a counter with dead time for integers with sub-Poisson variance."""
     whole = pixels.observation.min() >= 0 and np.array_equal(pixels.observation, np.round(pixels.observation))
     return ("counting", "excess-noise") if whole and _scatters_as_counts(pixels) else ("excess-noise",)
 
 
 def _scatters_as_counts(pixels: Pixels) -> bool:
-    """Whether variances at `GROUPS` levels of the signal are those of a counter with dead time, signal·(1 − signal·dead time)²,
-    so nearly that a model of such counts may be the best: variances that are off by a factor of 1 + δ cost δ²/4 nats, and N
-    values seem off by half a nat over N."""
+    """Whether the variances at `GROUPS` signal levels agree with those of a counter with dead time.
+
+    Their expected value is signal·(1 − signal·dead time)². A relative error δ of the variance costs δ²/4 nats per pixel, and
+    the scatter of each level's variance 0.5 nats over its number of pixels.
+    """
     order = np.argsort(pixels.signal)
     signal, squares = (
         np.array([values[group].mean() for group in np.array_split(order, GROUPS)])
@@ -248,9 +249,9 @@ def _scatters_as_counts(pixels: Pixels) -> bool:
 
 
 def attainable(model: nn.Module, pixels: Pixels) -> float:
-    """Nats per pixel that another model could gain; 0 where that is within two standard errors of nothing.
+    """Return the attainable improvement over a model, nats per pixel; 0 if it is within two standard errors of zero.
 
-    The divergence of the model's probability integral transform from uniform, in `GROUPS` levels of the signal.
+    It is the divergence of the model's probability integral transform from uniform, at `GROUPS` signal levels.
     """
     from noiseflow.metrics.evaluation import probability_integral_transform
 
@@ -268,7 +269,7 @@ def attainable(model: nn.Module, pixels: Pixels) -> float:
 
 
 def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
-    """The simplest model whose held-out likelihood lies within one standard error of the best one's.
+    """Return the simplest model whose held-out likelihood is within one standard error of the best.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -284,7 +285,7 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
 
 
 def require_kind(name: str) -> None:
-    """Refuse, before long work, a kind of model that does not exist."""
+    """Raise ValueError if a kind of model does not exist, before any computation starts."""
     if name != "auto":
         _rank(name)
 
@@ -298,7 +299,7 @@ def _rank(name: str) -> int:
 def _fitted(
     names: Sequence[str], pixels: Pixels, detector: tuple[float, float, float] | None, seed: int, device: Any
 ) -> dict[str, nn.Module]:
-    """Models by name, fitted by the selector to pixels not kept apart; the Poisson-Gaussian one as measured, if it is."""
+    """Fit models, by name, to the pixels that are not held out; a measured detector gives the Poisson-Gaussian model."""
     import torch
 
     import noiseflow
@@ -342,7 +343,7 @@ def _score(
 
 
 def _losses(model: nn.Module, pixels: Pixels) -> NDArray[np.float64]:
-    """Negative log-likelihood of each pixel kept apart, nats."""
+    """Return the negative log-likelihood of each held-out pixel, nats."""
     from noiseflow.metrics.evaluation import pixel_log_prob
 
     return -np.asarray(pixel_log_prob(model, *_tensors(pixels, pixels.held_out)).numpy())
@@ -356,9 +357,9 @@ def _tensors(pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[Tensor, Tensor]
 
 
 def _mean_and_error(values: NDArray[np.float64], block: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean, and its standard error from the scatter of whole blocks (pixels of one block may err alike)."""
+    """Mean, and its standard error from the scatter between blocks (pixels of one block may be correlated)."""
     mean = float(values.mean())
-    if not np.isfinite(mean):  # a pixel value that the model holds impossible
+    if not np.isfinite(mean):  # a pixel value has probability 0 under the model
         return mean, float("nan")
     _, index = np.unique(block, return_inverse=True)
     departure = np.bincount(index, values - mean)

@@ -1,4 +1,4 @@
-"""Moments of equal frames, over time and over pixels: what figures of a camera are made of."""
+"""Temporal and spatial moments of equal frames, the basis of the camera figures."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from noiseflow.described import described
 
 MOST_CLIPPED = 1e-3
-"""Share of the pixel values at an end of the converter that leaves a variance as it is: cut three standard deviations out, it
-loses 0.3 %."""
+"""Largest share of clipped pixel values that hardly affects the variance: clipping at three standard deviations reduces it by
+0.3 %."""
 
 COARSE = 0.24
-"""Variance in squared rounding steps, rounding's included, below which that of rounded values depends on where between two codes
-they lie (EMVA 1288, release 3.1, section 6.5)."""
+"""Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between
+two codes (EMVA 1288, release 3.1, section 6.5)."""
 
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
@@ -25,18 +25,18 @@ class Level:
 
     Attributes:
         mean: counts.
-        variance: over time, averaged over pixels, counts², without rounding's.
-        variance_error: standard error.
-        third: third central moment over time, counts³; None for two frames.
-        third_error: its standard error.
-        spatial: variance of the pixels' means over the frame, without that of the temporal noise, counts².
+        variance: temporal variance, averaged over pixels, without rounding noise, counts².
+        variance_error: standard error of `variance`, counts².
+        third: third central temporal moment, counts³; None for two frames.
+        third_error: standard error of `third`, counts³.
+        spatial: spatial variance of the mean frame, without the contribution of temporal noise, counts².
         image: (y, x) mean frame, counts.
-        noise: (y, x) variance of each pixel over time, counts².
+        noise: (y, x) temporal variance of each pixel, counts².
         frames: number of frames.
-        flicker: relative deviation of the frames' means beyond what their noise explains.
-        clipped: share of pixel values at either end of the converter.
-        coarse: whether the noise is finer than the rounding, which hides its variance.
-        end: upper end of the converter, counts; infinite where no pixel value reaches it.
+        flicker: relative standard deviation of the frame means, without the contribution of pixel noise.
+        clipped: share of pixel values at either clipping limit.
+        coarse: whether the noise is too small, relative to the rounding step, to measure its variance.
+        end: upper clipping limit, counts; infinite if no pixel value reaches it.
     """
 
     mean: float
@@ -55,7 +55,7 @@ class Level:
 
 
 def level_of(burst: Burst) -> Level:
-    """Moments of equal frames."""
+    """Compute the moments of equal frames."""
     frames, number = burst.frames, len(burst.frames)
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
     rounding = rounding_step(frames[0]) ** 2 / 12

@@ -1,4 +1,4 @@
-"""Photon transfer: how the scatter of pixel values grows with their signal, level by level."""
+"""Photon transfer: variance of the pixel values as a function of the signal."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
 
 MODEL_ERROR = 0.005
-"""Relative error of a level's variance that is granted to the straight line itself, so that one level of a million dark pixels
-does not rule all others."""
+"""Relative model error added to the error of each level's variance, so that one level with very many pixels does not dominate the
+fit."""
 
 
 class NotMeasurable(ValueError):
-    """The exposures cannot tell the detector's gain, though a noise model can still be fitted."""
+    """Raised if the exposures do not determine the detector's gain; a noise model can still be fitted."""
 
 
 @described(
@@ -36,13 +36,13 @@ class PhotonTransfer:
 
     Attributes:
         signal: (L,) counts.
-        variance: (L,) of the exposure alone, counts².
-        variance_error: (L,) standard error.
-        clipped: (L,) share of the values at a clipping limit; levels with any are left out of the line where others suffice.
+        variance: (L,) variance of the exposure alone, counts².
+        variance_error: (L,) standard error of `variance`.
+        clipped: (L,) share of values at a clipping limit; levels with any are excluded from the fit if enough others remain.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
-        gain_error: standard error of the gain, grown by the root of `chi_squared` where that is above 1.
-        chi_squared: of the points about the line per degree of freedom, with half a percent of the variance granted to the line.
+        gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
+        chi_squared: χ² per degree of freedom of the points about the line, with `MODEL_ERROR` included.
 
     Example:
         >>> import calibration, numpy as np
@@ -67,7 +67,7 @@ class PhotonTransfer:
 
     @property
     def bent(self) -> bool:
-        """Whether the points depart from the line by more than their errors and by over 2 % of the variance anywhere."""
+        """Whether at least two points deviate from the line significantly and by over 2 % of the largest variance."""
         free = self.clipped < 1e-3
         if free.sum() < 5:
             return False
@@ -80,8 +80,11 @@ class PhotonTransfer:
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     """Fit the line of variance against signal.
 
+    Args:
+        levels: from `collect_levels` and `collect_cells`.
+
     Raises:
-        NotMeasurable: the variance does not grow with the signal, so that no gain shows.
+        NotMeasurable: the variance does not increase with the signal.
 
     Example:
         >>> import calibration, numpy as np
@@ -103,16 +106,17 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if not line.rate > 0:
         raise NotMeasurable(
-            "the noise does not grow with the signal, so the gain cannot be measured; give exposures with more "
+            "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more "
             "contrast, or flat frames at several levels"
         )
     return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
 
 
 def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[VarianceLine, float, float]:
-    """The line, the standard error of its slope, and χ² per degree of freedom.
+    """Return the line, the standard error of its slope, and χ² per degree of freedom.
 
-    Errors grow with the line's own level, not with the point's, which would favour points that are too low by chance.
+    Errors are proportional to the fitted variance; errors proportional to the measured one would favour points that are low by
+    chance.
     """
     relative = error / np.maximum(variance, np.finfo(float).tiny)
     line = fit_line(signal, variance)

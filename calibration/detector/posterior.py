@@ -1,4 +1,4 @@
-"""Gain, offset and read noise of a detector with honest error bars: maximum likelihood, then the posterior by emcee."""
+"""Posterior of gain, offset and read noise: maximum likelihood, then importance sampling or emcee."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
 NUM_WALKERS = 16
 
 NUM_TIMES = 50
-"""Autocorrelation times that a chain must last (doi:10.1086/670067)."""
+"""Smallest length of a chain, in autocorrelation times (doi:10.1086/670067)."""
 
 LARGEST_RHAT = 1.05
-"""Potential scale reduction above which chains do not agree (doi:10.1214/20-BA1221)."""
+"""Largest potential scale reduction factor of converged chains (doi:10.1214/20-BA1221)."""
 
 FARTHEST = 12.0
-"""Nats below the maximum beyond which a walker has gone astray."""
+"""Largest distance of a walker below the maximum of the log-posterior, nats."""
 
 LEAST_STEPS = DRAWS * ROUNDS // NUM_WALKERS
-"""Steps of the chain that cost what importance sampling may; where fewer are allowed, only the chain is tried."""
+"""Number of chain steps with the cost of importance sampling; if fewer are allowed, only the chain is used."""
 
 LARGEST_NUM_STEPS = 4000
-"""Steps of the chain: 64 000 evaluations, up to two minutes where single electrons show; then the posterior is refused, and
-earlier where the autocorrelation time found so far would take more."""
+"""Largest number of chain steps: 64 000 evaluations, up to two minutes with single-electron peaks. Sampling fails earlier if the
+autocorrelation time requires more."""
 
 NUM_SAMPLES = 2000
-"""Equally weighted samples that are kept."""
+"""Number of equally weighted samples that are kept."""
 
 SMOOTH_SPREAD = 0.5
-"""Standard deviation of the logarithm of read noise in the draws about the photon-transfer line: it is hardly known there."""
+"""Standard deviation of the log read noise in draws around the photon-transfer line, which hardly constrains it."""
 
 BURN_IN = 60
-"""Steps that only find out where the posterior lies."""
+"""Number of burn-in steps, which locate the posterior."""
 
 
 @described()
 @dataclass(frozen=True)
 class Interval:
-    """Median and 5 % and 95 % quantiles of a parameter."""
+    """Median, 5 % quantile and 95 % quantile of a parameter."""
 
     median: float
     q05: float
@@ -64,10 +64,11 @@ class DetectorPosterior:
     Attributes:
         samples: (S, 3) gain (counts/electron), offset (counts), read noise (electrons rms).
         most_likely: (3,) maximum of the posterior.
-        autocorrelation_time: steps per independent sample: of a chain the longest of the three parameters'.
-        rhat: potential scale reduction of the chain's walkers, or of the two halves of independent draws; the largest of three.
-        num_steps: steps kept of a chain, or draws.
-        levels: as sampled, about the most likely scales of their signals.
+        autocorrelation_time: steps per independent sample; for a chain, the largest of the three parameters.
+        rhat: potential scale reduction factor of the walkers, or of the two halves of independent draws; the largest of the
+            three parameters.
+        num_steps: number of chain steps kept, or of draws.
+        levels: sampled levels, at the most likely scalings of their signals.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -91,26 +92,27 @@ class DetectorPosterior:
 
     @property
     def gain(self) -> Interval:
-        """Counts per electron; on a detector with excess noise, gain times the excess-noise factor.
+        """Gain, counts per electron, times the excess-noise factor if the detector has one.
 
-        By both priors of `read_noise`: the noise's third moment is that of the shot noise, so that a prior of little read noise
-        puts the gain too low by a fifth of its error where nothing else tells them apart.
+        The interval covers both priors of `read_noise`. The third moment of the noise is that of the shot noise, so a prior that
+        favours low read noise biases the gain by −0.2 standard errors if nothing else determines the read noise.
         """
         return self._by_both_priors(0)
 
     @property
     def offset(self) -> Interval:
-        """Counts without light; from the lower quantile of one prior to the higher of the other, as `read_noise`."""
+        """Offset, counts; the interval covers both priors, as for `read_noise`."""
         return self._by_both_priors(1)
 
     @property
     def read_noise(self) -> Interval:
-        """Electrons rms.
+        """Read noise, electrons rms.
 
-        Exposures without darks hardly tell read noise from offset, so that the prior decides: one that is flat in the logarithm
-        of the read noise favours none at all, one that is flat in its variance (Jeffreys', along the line of constant total
-        variance, whose third moment is linear in it) favours much. The interval reaches from the lower quantile of the one to
-        the higher of the other, and the median is the latter's. Where the exposures tell both, the two are one.
+        Exposures without dark frames hardly distinguish read noise from offset, so the prior matters. A prior that is flat in the
+        log read noise favours low values; a prior that is flat in its variance (Jeffreys' prior along the line of constant total
+        variance, whose third moment is linear in it) favours high values. The interval extends from the smaller lower to the
+        larger upper quantile of the two, and the median is that of the second. If the exposures determine both parameters, the
+        priors agree.
         """
         return self._by_both_priors(2)
 
@@ -124,7 +126,7 @@ class DetectorPosterior:
         return Interval(by_variance.median, min(flat.q05, by_variance.q05), max(flat.q95, by_variance.q95))
 
     def _reference(self) -> float:
-        """Mean signal, counts."""
+        """Return the mean signal, counts."""
         signal = np.concatenate([one.signal[one.dark == 0] for one in self.levels])
         return float(np.average(signal, weights=np.concatenate([one.count[one.dark == 0] for one in self.levels])))
 
@@ -141,22 +143,22 @@ def sample_posterior(
 ) -> DetectorPosterior:
     """Sample the posterior of gain, offset and read noise.
 
-    Adaptive importance sampling, and where that is not worth enough samples emcee (doi:10.1086/670067): walkers start around
-    the maximum and move by differential evolution, its snooker variant and stretches; then also by independent draws from a
-    Student distribution fitted to where they went. The chain is prolonged until it lasts `NUM_TIMES` autocorrelation times
-    and its halves and walkers agree.
+    Adaptive importance sampling is tried first. If it yields too few effective samples, emcee is used (doi:10.1086/670067). The
+    walkers start around the maximum and use differential-evolution, snooker and stretch moves, later also independent proposals
+    from a Student distribution fitted to their positions. The chain is extended until it is `NUM_TIMES` autocorrelation times
+    long and its halves and walkers agree.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
-        offset: measured offset and its standard error, counts; None: unknown.
+        offset: measured offset and its standard error, counts; None if unknown.
         start: see `maximum_likelihood`.
-        num_steps: steps before the first check.
-        largest_num_steps: steps after which it gives up.
-        seed: of the walkers and their moves.
-        progress: called with the steps done, of `largest_num_steps` at most, and a note.
+        num_steps: number of steps before the first convergence check.
+        largest_num_steps: largest number of steps.
+        seed: random seed.
+        progress: called with the number of steps done, at most `largest_num_steps`, and a note.
 
     Raises:
-        ValueError: the chain has not converged; the message says how many steps it needs.
+        ValueError: the chain has not converged; the message states how many steps are required.
 
     Example:
         >>> import calibration, numpy as np
@@ -194,11 +196,11 @@ def _chain(
     seed: int,
     progress: Progress | None,
 ) -> tuple[Any, float, float]:
-    """A converged chain, its autocorrelation time and its scale reduction factor."""
+    """Run a chain until it converges; return it with its autocorrelation time and potential scale reduction factor."""
     if len(walkers) < NUM_WALKERS:
         raise ValueError(
-            "the posterior has no width that numbers can resolve: the pixel values contradict every Poisson-Gaussian detector; "
-            "give raw frames, neither gamma-encoded nor rescaled"
+            "the posterior is too narrow to sample: the pixel values do not fit a Poisson-Gaussian detector; "
+            "use raw frames, neither gamma-encoded nor rescaled"
         )
     first = _sampler(log_posterior, _local_moves(1.0), seed)
     state = first.run_mcmc(walkers[:NUM_WALKERS], BURN_IN)
@@ -218,7 +220,7 @@ def _chain(
             progress(len(chain), f"{len(chain) / time:.0f} autocorrelation times")
         if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
             return sampler, time, rhat
-        if max(2 * len(chain), NUM_TIMES * time) > largest_num_steps:  # a short chain underestimates its time
+        if max(2 * len(chain), NUM_TIMES * time) > largest_num_steps:  # short chains underestimate it
             raise ValueError(_not_converged(len(chain), time, rhat))
 
 
@@ -229,7 +231,7 @@ def _local_moves(weight: float) -> list[Any]:
 
 
 def _independent_move(visited: Image, *, freedom: float = 5.0) -> Any:
-    """Metropolis–Hastings proposals from a Student distribution of the mean and covariance of `visited`, (S, 3)."""
+    """Create Metropolis–Hastings proposals from a Student distribution with the mean and covariance of `visited`, (S, 3)."""
     from emcee import moves
     from scipy.stats import multivariate_t
 
@@ -246,8 +248,8 @@ def _sampler(log_posterior: LogPosterior, moves: list[Any], seed: int) -> Any:
     import emcee
 
     sampler = emcee.EnsembleSampler(NUM_WALKERS, 3, log_posterior, moves=moves, vectorize=True)
-    sampler.log_prob_fn = log_posterior  # not in emcee's wrapper, which prints a traceback on Ctrl-C
-    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own generator is of this kind
+    sampler.log_prob_fn = log_posterior  # without emcee's wrapper, which prints a traceback on Ctrl-C
+    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee requires this type of generator
     return sampler
 
 
@@ -255,13 +257,13 @@ def _not_converged(num_steps: int, time: float, rhat: float) -> str:
     needed = max(int(np.ceil(NUM_TIMES * time)), 2 * num_steps)
     return (
         f"the posterior has not converged after {num_steps} steps (autocorrelation time {time:.0f}, R-hat {rhat:.3f}); it "
-        f"needs about {needed - num_steps} more: raise largest_num_steps to {2 * needed}, or give dark frames, which fix "
-        "the offset; pixel values that were gamma-encoded or rescaled never get there: give raw frames"
+        f"needs about {needed - num_steps} more: raise largest_num_steps to {2 * needed}, or add dark frames, which determine "
+        "the offset; gamma-encoded or rescaled pixel values never converge: use raw frames"
     )
 
 
 def potential_scale_reduction(chain: Image) -> float:
-    """Rank-normalised split R̂ (doi:10.1214/20-BA1221), the largest over the parameters.
+    """Return the rank-normalised split R̂ (doi:10.1214/20-BA1221), the largest over the parameters.
 
     Args:
         chain: (step, walker, parameter).
@@ -280,9 +282,9 @@ def potential_scale_reduction(chain: Image) -> float:
 
 
 def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
-    """The best of some points on the photon-transfer line and the line's own spread, where nothing else tells the offset.
+    """Return the best of several points on the photon-transfer line with its covariance, if nothing else determines the offset.
 
-    There the maximum may be a narrow peak, where a comb of single electrons fits the pixel values by chance.
+    In that case the maximum may be a narrow peak, where single-electron peaks fit the pixel values by chance.
     """
     if log_posterior.by_offset:
         return []
@@ -298,8 +300,10 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
 
 
 def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Generator) -> Image:
-    """Points where the posterior is high, (W, 3): drawn from the Gaussian of its curvature at the maximum where it has one,
-    else along the coordinates."""
+    """Draw (W, 3) points of high posterior density from a Gaussian with its curvature at the maximum.
+
+    If the curvature is not positive definite, the scales along the coordinates are used.
+    """
     highest = log_posterior(best)[0]
     scale = np.empty(3)
     for axis, unit in enumerate(np.eye(3)):
@@ -307,19 +311,18 @@ def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Gene
         around = np.stack([log_posterior(best + sign * steps[:, None] * unit) for sign in (1, -1)])
         scale[axis] = steps[np.argmax(around.max(axis=0) > highest - 1.0)]
     spread: Image = np.diag(scale**2)
-    for factor in (0.5, 1.0):  # the second time with steps along the axes of the first's ellipsoid
+    for factor in (0.5, 1.0):  # the second pass uses steps along the axes of the first ellipsoid
         axes = factor * np.linalg.cholesky(spread).T
         spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
     found = best + generator.standard_normal((6 * NUM_WALKERS, 3)) @ np.linalg.cholesky(spread).T
-    nearer = [
-        best + share * (found[:NUM_WALKERS] - best) for share in (0.1, 0.01, 0.001)
-    ]  # the maximum may be at an edge
+    # the maximum may lie at an edge of the prior
+    nearer = [best + share * (found[:NUM_WALKERS] - best) for share in (0.1, 0.01, 0.001)]
     found = np.concatenate([found, *nearer])
     return np.asarray(found[log_posterior(found) > highest - FARTHEST])
 
 
 def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback: Image) -> Image:
-    """Inverse curvature at the maximum by differences along the rows of `axes`; `fallback` where it is no ellipsoid."""
+    """Inverse curvature at the maximum, by finite differences along the rows of `axes`; `fallback` if it is not an ellipsoid."""
     pairs = [(0, 1), (0, 2), (1, 2)]
     steps = np.concatenate([np.zeros((1, 3)), axes, -axes, [axes[i] + axes[j] for i, j in pairs]])
     value = log_posterior(best + steps)

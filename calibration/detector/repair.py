@@ -1,4 +1,4 @@
-"""What of a broken assumption can be modelled: places that changed, a signal that does not fit, offsets of rows and columns."""
+"""Correction of violated assumptions: changed regions, a misfit of the signal, offsets of rows and columns."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 
 LEAST_SHARE = 0.003
-"""Share of the residual's variance below which what follows the scene moves the gain by less than its 2 % goal: the share lies
-where the scene is bright or steep, which multiplies it in the slope by a few."""
+"""Share of the residual variance that may follow the scene: it changes the gain by less than 2 %, the target accuracy. The gain
+error is a few times the share, because the misfit is concentrated where the scene is bright or steep."""
 
 LEAST_OFFSETS = 0.1
-"""Deviation of row offsets, in those of the noise, below which they change a variance by less than 1 %."""
+"""Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
 
 CLEAR = 5.0
-"""Standard errors beyond which row offsets are there."""
+"""Standard errors above which row offsets are significant."""
 
 
 @described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")
 @dataclass(frozen=True)
 class Repairs:
-    """What was found and modelled before the detector was measured.
+    """Violated assumptions that were modelled before the detector was measured.
 
     Attributes:
-        changed: share of the pixels in places that changed between the exposures, which were left out.
-        scene: how the signal of each pair fitted the scene, before.
-        scene_after: the same after a kernel was fitted between the exposures; as `scene` where none was.
-        refitted: whether any was.
-        rows, columns: standard deviation of the offsets taken out of each row or column; 0: none was.
-        join: brightness from which on a second converter read the pixels; infinite: none. A few are treated as clipped.
-        joined: share of those pixels.
+        changed: share of pixels in regions that changed between the exposures; they were excluded.
+        scene: fit of each pair's signal to the scene before any correction.
+        scene_after: the same after a kernel was fitted between the exposures; equal to `scene` if none was.
+        refitted: whether a kernel was fitted for any pair.
+        rows, columns: standard deviation of the offsets subtracted from rows or columns, counts; 0 if none were.
+        join: brightness above which a second converter was used, counts; infinite if none. If few, these pixels are clipped.
+        joined: share of pixels above `join`.
     """
 
     changed: float = 0.0
@@ -52,10 +52,13 @@ class Repairs:
 
 
 def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
-    """The pairs with what broke their assumptions modelled, and what that was.
+    """Correct the pairs for violated assumptions.
 
     Args:
-        pairs: from `align_pair` or `align_burst`; a burst loses changed places when it is aligned.
+        pairs: from `align_pair` or `align_burst`, which already excludes changed regions of a burst.
+
+    Returns:
+        The corrected pairs, and the corrections.
     """
     single = [pair.frames == 1 for pair in pairs]
     offsets = [_without_offsets(pair) for pair in pairs]
@@ -66,7 +69,7 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
     share = float(np.mean([mask.sum() / pair.mask.sum() for mask, pair in zip(changed, found, strict=True)]))
     scene = tuple(fit_scene(pair) for pair in found)
     misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in scene]
-    if 0 < share < 0.5:  # else the places are everywhere: no part of the scene stands still
+    if 0 < share < 0.5:  # with half the frame or more, no part of the scene is static
         found = [without_places(pair, mask) for pair, mask in zip(found, changed, strict=True)]
         misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in map(fit_scene, found)]
     found = [refitted(pair) if bad and one else pair for pair, bad, one in zip(found, misfits, single, strict=True)]
@@ -79,7 +82,7 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
 
 
 def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
-    """The pair without the offsets of its rows and of its columns, and their deviations, counts; 0 where there are none."""
+    """Subtract row and column offsets; return the pair and the standard deviations of the offsets, counts; 0 if none."""
     deviations = []
     for axis in (1, 0):
         residual = residual_of(pair)
@@ -90,7 +93,7 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
         number = np.maximum(residual.mask.sum(axis, keepdims=True), 1)
         mean = np.where(pair.mask, pair.short - pair.signal, 0.0).sum(axis, keepdims=True) / number
         short = pair.short - np.where(pair.mask, mean, 0.0)
-        factor = 1 / (1 - 1 / float(np.median(number)))  # what the mean takes of the noise with it
+        factor = 1 / (1 - 1 / float(np.median(number)))  # the mean removes part of the noise
         total = fit_line(pair.signal[pair.mask], factor * ((short - pair.signal) ** 2)[pair.mask])
         own = pair.signal_variance
         pair = replace(pair, short=short, total_variance=VarianceLine(total.floor, total.rate), signal_variance=own)
@@ -99,21 +102,20 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
 
 
 def _shared(z: Image, mask: Mask, axis: int) -> tuple[float, float]:
-    """Deviation that all pixels of a row share, and the standard error of its square.
+    """Standard deviation of the offsets common to the pixels of a row, and the standard error of its square.
 
-    The covariance of the means of even and odd runs of 16 pixels along the row, which correlated neighbours hardly touch.
+    It is the covariance of the means of even and odd runs of 16 pixels along the row; correlated neighbours hardly affect it.
     """
     run = np.indices(z.shape)[axis] // 16 % 2
     parts = [mask & (run == part) for part in (0, 1)]
-    known = np.min([part.sum(axis) for part in parts], axis=0) > 8  # a row counts where both of its halves are known
+    known = np.min([part.sum(axis) for part in parts], axis=0) > 8  # both halves of a row must have enough pixels
     number = int(known.sum())
     if number < 16:
         return 0.0, 1.0
     means = [np.where(part, z, 0.0).sum(axis)[known] / part.sum(axis)[known] for part in parts]
     first, second = (one - one.mean() for one in means)
-    smooth = np.convolve(
-        np.mean(means, axis=0), np.ones(9) / 9, mode="same"
-    )  # a slow change is of the scene, not of rows
+    # slow changes belong to the scene, not to the rows
+    smooth = np.convolve(np.mean(means, axis=0), np.ones(9) / 9, mode="same")
     first, second = first - (smooth - smooth.mean()), second - (smooth - smooth.mean())
     covariance = float(np.mean(first * second)) / (1 - 1 / 9)
     error = float(np.sqrt(np.mean(first**2) * np.mean(second**2) / number))

@@ -1,4 +1,4 @@
-"""What is left of the short exposure beside its signal: noise, and whatever changed between the exposures."""
+"""Residual of the short exposure from its signal: noise, and changes between the exposures."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from calibration.registration.aligned import AlignedPair
 
 _BLUR = 3.0
 _SHRINKS = 1 / (2 * np.sqrt(np.pi) * _BLUR)
-"""What is left of white noise's standard deviation."""
+"""Standard deviation of smoothed white noise, relative to that before smoothing."""
 _LEAST_WEIGHT = 0.9
 _LITTLE_NOISE = 0.1
-"""Share of the residual's variance that is the signal's own, below which a signal hardly tells its own errors."""
+"""Share of the residual variance due to the signal below which little smoothing of the signal suffices."""
 _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
-"""Pixels over which the signal is averaged before it sorts the residuals: as few as its noise allows, for at the same average a
-crest in the dark part of a crystal lattice is noisier than a trough in the bright part."""
+"""Smoothing of the signal that sorts the residuals, pixels. It is as small as the noise allows: at the same local average, a peak
+in the dark part of a crystal lattice is noisier than a valley in the bright part."""
 CUT = 5.0
-"""Standard deviations at which residuals are cut, so that a few defects do not speak for all pixels."""
+"""Standard deviations at which residuals are clipped, to limit the effect of defects."""
 
 
 def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
-    """The residual averaged over a Gaussian of 3 pixels, of unit variance where it is white noise, and its weight.
+    """Smooth the residual with a Gaussian of 3 pixels, normalised to unit variance for white noise.
 
     Returns:
-        (y, x) residual, in standard deviations of smoothed noise, zero where hardly any pixel is trusted; (y, x) weight, 0 to 1.
+        (y, x) residual in standard deviations of smoothed noise, zero where few pixels are valid; (y, x) weight, 0 to 1.
     """
     spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
     residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
@@ -40,10 +40,10 @@ def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
 
 
 def structured_share(pair: AlignedPair) -> float:
-    """The share of the residual's variance that is smooth over 3 pixels, which noise of independent pixels is not.
+    """Return the share of the residual variance that is smooth over 3 pixels, unlike the noise of independent pixels.
 
-    It is what changed between the exposures, or was not registered, and passes for noise. Zero within its error where
-    nothing is there; NaN where too few pixels are trusted.
+    It is caused by changes between the exposures or by misregistration. It is zero within its error for pure noise, and NaN if
+    too few pixels are valid.
     """
     smooth, weight = smoothed_residual(pair)
     inside = smooth[weight > _LEAST_WEIGHT]
@@ -52,13 +52,13 @@ def structured_share(pair: AlignedPair) -> float:
 
 @dataclass(frozen=True)
 class Residual:
-    """What a pair's short exposure leaves beside its signal, standardised.
+    """Standardised residual of a pair's short exposure.
 
     Attributes:
-        z: (y, x) residual over the standard deviation at its level, cut at `CUT`, 0 outside the mask.
-        mask: (y, x) pixels to trust.
-        share: of the residual's variance that is the signal's own noise.
-        spread: (y, x) that standard deviation, counts.
+        z: (y, x) residual over the standard deviation at its level, clipped at `CUT`, 0 outside the mask.
+        mask: (y, x) valid pixels.
+        share: share of the residual variance due to the noise of the signal.
+        spread: (y, x) standard deviation at the level, counts.
         signal: (y, x) counts; None for frames without a scene.
     """
 
@@ -70,7 +70,7 @@ class Residual:
 
 
 def residual_of(pair: AlignedPair) -> Residual:
-    """The standardised residual of a pair."""
+    """Compute the standardised residual of a pair."""
     share = float(pair.share[pair.mask].mean())
     blur = _LITTLE_BLUR if share < _LITTLE_NOISE else _MUCH_BLUR
     difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
@@ -78,13 +78,13 @@ def residual_of(pair: AlignedPair) -> Residual:
     spread[pair.mask] = spread_by_level(level, difference)
     z = np.zeros(pair.mask.shape)
     cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
-    z[pair.mask] = cut - cut.mean()  # not the median, which skewed noise has off its mean: pixels would seem correlated
+    z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
     return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal)
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
-    """(y, x) the signal averaged over a Gaussian of `blur` pixels within the mask, counts."""
+    """Return the (y, x) signal smoothed with a Gaussian of `blur` pixels within the mask, counts."""
     weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
     inside = ndimage.gaussian_filter(np.where(pair.mask, pair.signal, 0.0), blur)
     middle = float(pair.signal[pair.mask].mean())

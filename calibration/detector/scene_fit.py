@@ -1,4 +1,4 @@
-"""Does the signal fit the scene of the short exposure? What residuals owe to blur, drift, illumination and curved response."""
+"""Fit of the signal to the scene of the short exposure: residuals due to blur, drift, illumination and nonlinear response."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
 BLUR = 1.5
-"""Pixels over which the signal is smoothed before its derivatives are taken, so that its noise hardly enters them."""
+"""Smoothing of the signal before differentiation, pixels, which suppresses its noise."""
 
 CLEAR = 5.0
-"""Standard deviations of the χ² of noise beyond which the scene is held to show in the residual."""
+"""Standard deviations of the χ² of noise above which the residual is considered to follow the scene."""
 
 KERNEL_REACH = 4
-"""Pixels either way of the kernel that may stand between the two exposures."""
+"""Half-width of the kernel fitted between the exposures, pixels."""
 
 MOST_FITTED = 120_000
-"""Pixels that a refit uses; 100 coefficients are then known to 0.1 % of the variance in all."""
+"""Largest number of pixels in a refit; the errors of 100 coefficients then add 0.1 % to the variance."""
 
 PATCH_BLUR = 3.0
-"""Pixels over which residuals are averaged to find places that changed."""
+"""Smoothing of the residuals in the search for changed regions, pixels."""
 
 PATCH_DEVIATIONS = 6.0
-"""Robust standard deviations of that average that noise of 10⁷ pixels does not reach."""
+"""Threshold of the smoothed residuals, robust standard deviations; noise of 10⁷ pixels does not reach it."""
 
 ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "xy": (1, 1), "yy": (2, 0)}
 
@@ -41,13 +41,13 @@ ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "x
 )
 @dataclass(frozen=True)
 class SceneFit:
-    """Shares of the residual's variance that follow the scene, zero within `error` where the signal fits.
+    """Shares of the residual variance that follow the scene; zero within `error` if the signal fits.
 
     Attributes:
-        blur: by the gradient and curvature of the scene: blur, drift, motion, another scale.
-        illumination: by position: the light or the dose changed across the field.
-        response: by the square of the signal: one exposure is not linear.
-        error: standard error of each.
+        blur: share explained by gradient and curvature of the scene: blur, drift, motion, magnification.
+        illumination: share explained by the position: light or dose changed across the field.
+        response: share explained by the square of the signal: one exposure is not linear.
+        error: standard error of each share.
     """
 
     blur: float
@@ -57,21 +57,22 @@ class SceneFit:
 
     @property
     def largest(self) -> tuple[str, float]:
-        """The largest of the shares and its name."""
+        """Name and value of the largest share."""
         shares = {name: getattr(self, name) for name in ("blur", "illumination", "response")}
         name = max(shares, key=lambda key: shares[key])
         return name, shares[name]
 
     @property
     def clear(self) -> bool:
-        """Whether the largest share stands out of its error."""
+        """Whether the largest share is significant."""
         return self.largest[1] > CLEAR * self.error
 
 
 def fit_scene(pair: AlignedPair) -> SceneFit:
-    """Regress the residual on what the scene would leave in it.
+    """Regress the residual on derivatives, position and square of the signal.
 
-    The noise of the signal enters residual and regressors; its part is known from the signal's own variance and taken out.
+    The noise of the signal affects both the residual and the regressors; this contribution is known from its variance and
+    subtracted.
     """
     residual = residual_of(pair)
     mask, scale = pair.mask, residual.spread[pair.mask]
@@ -107,7 +108,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
 
 
 def changed_places(pair: AlignedPair) -> Mask:
-    """(y, x) places of the scene that changed between the exposures: there the residual's average stands out."""
+    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the smoothed residual."""
     residual = residual_of(pair)
     weight = ndimage.gaussian_filter(pair.mask.astype(float), PATCH_BLUR)
     average = ndimage.gaussian_filter(residual.z, PATCH_BLUR)
@@ -119,7 +120,7 @@ def changed_places(pair: AlignedPair) -> Mask:
 
 
 def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
-    """The pair without some places, and with its variance lines as the others tell them; as it was where too few are left."""
+    """Exclude regions from a pair and refit its variance line; the pair is unchanged if too few pixels would remain."""
     mask = pair.mask & ~changed
     if mask.sum() < MINIMUM_PIXELS or not changed.any():
         return pair
@@ -129,10 +130,10 @@ def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
 
 
 def refitted(pair: AlignedPair) -> AlignedPair:
-    """The pair with its signal made from the long exposure by a kernel, an illumination and a curved response.
+    """Recompute the signal of a pair from the long exposure with a kernel, an illumination and a nonlinear response.
 
-    The kernel of `KERNEL_REACH` pixels either way is the linear filter that predicts the short exposure best; it undoes a blur or
-    drift of the long exposure, or repeats that of the short one. The signal's own variance grows with the kernel's square.
+    The kernel, of half-width `KERNEL_REACH`, is the linear filter that best predicts the short exposure. It compensates blur or
+    drift of the long exposure, or reproduces that of the short one. The variance of the signal is scaled accordingly.
     """
     mask = ndimage.binary_erosion(pair.mask, np.ones((3, 3)), border_value=0) if pair.mask.all() else pair.mask
     chosen = np.flatnonzero(mask)
@@ -153,7 +154,7 @@ def refitted(pair: AlignedPair) -> AlignedPair:
 
 
 def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Image) -> tuple[Image, Image, list[Image]]:
-    """Gram matrix and moments of the kernel's shifts and of the smooth terms; and the images these stand for."""
+    """Return the Gram matrix and moments of the shifted signals and the smooth terms, and the images of the terms."""
     middle = float(pair.signal[pair.mask].mean())
     filled = np.where(pair.mask, pair.signal, smooth_signal(pair))
     smooth = smooth_signal(pair) - middle

@@ -1,4 +1,4 @@
-"""How far the histograms depart from a Poisson-Gaussian detector's: in shape, in the converter's codes, from pixel to pixel."""
+"""Deviations from a Poisson-Gaussian detector: shape of the histograms, converter codes, differences between pixels."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from calibration.exposures.scaling import fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
 
 MERGED = 4
-"""Codes taken together where single ones are uneven: four of a usual comb hold equal shares."""
+"""Number of codes that are merged if the codes are uneven; groups of four are typically even."""
 
 SURE_FREEDOM = 200
-"""Degrees of freedom whose χ² scatters by a tenth of itself; fewer are filled up with ones that fit, so that a few hundred
-pixels do not raise an alarm by chance."""
+"""Minimum degrees of freedom, at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to avoid
+false alarms with a few hundred pixels."""
 
 NEIGHBOURS = 9
-"""Codes over which the shape of a distribution is straight, so that what is left is the codes' own."""
+"""Number of codes over which a distribution is nearly linear, so that deviations are due to the code widths."""
 
 LEAST_DEVIATION = 2.0
-"""Codes per standard deviation of the noise, from which on neither shape nor single electrons alternate from code to code."""
+"""Fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then resolved."""
 
 CLEAR = 5.0
-"""Standard errors beyond which codes are held to be uneven."""
+"""Standard errors above which codes count as uneven."""
 
 CLEAR_PIXELS = 4.0
-"""Standard errors beyond which pixels are: two tests of a burst reach them by chance once in 10⁴ bursts."""
+"""Standard errors above which pixels count as uneven; the two tests of a burst exceed them by chance once in 10⁴ bursts."""
 
 ROUNDS = 12
-"""Orders in which the frames of a burst are paired: each pairing adds information, twelve hold nearly all of it."""
+"""Number of random pairings of the frames of a burst; twelve contain nearly all the information."""
 
 PER_LEVEL = 5000
-"""Differences that tell the spread at a level: to 2 % of its variance."""
+"""Frame differences per level: they determine its variance to 2 %."""
 
 LEAST_VARIANCE = 0.05
-"""Of the mean variance, below which the line of variance is not followed: at no light it may cross zero, and pixels there would
-count as many times noisier than it says."""
+"""Lower bound of the variance line, relative to the mean variance. Without light the line may cross zero, and dark pixels would
+appear many times noisier than expected."""
 
 CUT = 5.0
-"""Standard deviations at which differences are cut, so that single outliers do not speak for all pixels."""
+"""Standard deviations at which differences are clipped to limit the effect of outliers."""
 
 CHANCE = 40.0
-"""χ² of five terms that chance exceeds once in 10⁷ frames."""
+"""χ² with five degrees of freedom that is exceeded by chance once in 10⁷ frames."""
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
-    """χ² per degree of freedom of the histograms, in bins of neighbouring cells with at least `least` expected pixel values.
+    """Return χ² per degree of freedom of the histograms, in bins of neighbouring cells.
 
-    Residuals of a burst share their mean, which takes less than one degree of freedom from each level.
+    Residuals of a burst share their mean, which removes less than one degree of freedom from each level.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
-        least: pixel values expected.
-        merged: neighbouring cells of the pixel values' histograms that are taken together.
+        least: smallest number of expected pixel values per bin.
+        merged: number of neighbouring cells to merge in histograms of pixel values.
     """
     squares, freedom = 0.0, -3
     for one, histogram, expected in _expected(levels, parameters):
@@ -78,9 +78,9 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, 
 
 
 def _bins(expected: Image, least: float) -> list[int]:
-    """Edges of bins that expect `least` pixel values or more.
+    """Return the edges of bins with at least `least` expected pixel values.
 
-    The far tails, where less than one value is expected in all, belong to no bin: there are outliers.
+    The far tails, with less than one expected value in total, are excluded because they contain outliers.
     """
     below, above = np.cumsum(expected), np.cumsum(expected[::-1])[::-1]
     edges: list[int] = []
@@ -95,15 +95,15 @@ def _bins(expected: Image, least: float) -> list[int]:
 
 
 def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 50.0) -> float:
-    """Relative deviation (rms) of the widths of the converter's codes from their neighbours'; 0 where none stands out.
+    """Return the relative deviation (rms) of the converter's code widths from their neighbours; 0 if not significant.
 
-    A converter's differential non-linearity, or whole numbers that were rescaled and rounded again, favour some codes in
-    every level alike. Only codes fine enough for the noise are compared, so that no peaks of single electrons alternate.
+    Differential nonlinearity of a converter, or integers that were rescaled and rounded again, favour the same codes at every
+    level. Levels whose noise spans too few codes (`LEAST_DEVIATION`) are not used.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
-        least: pixel values expected of a code.
+        least: smallest number of expected pixel values per code.
     """
     seen: dict[int, list[float]] = {}
     gain, _, read_noise = parameters
@@ -130,26 +130,24 @@ def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 
 
 
 def unevenness(pairs: Sequence[AlignedPair]) -> float:
-    """Relative deviation (rms) of the pixels' variances at equal signal, in a burst.
+    """Return the relative deviation (rms) of the pixels' variances at equal signal, in a burst.
 
-    Squares of differences of disjoint pairs of frames correlate over the pixels only where some pixels are noisier than
-    others. Dim pixels, where read noise is seen, count more.
+    The squared differences of disjoint pairs of frames are correlated over the pixels only if some pixels are noisier than
+    others. A second test gives more weight to dim pixels, where read noise is visible.
 
     Returns:
-        0 for fewer than four frames or a moving scene, or where nothing stands out of `CLEAR_PIXELS` standard errors.
+        The deviation; 0 for fewer than four frames, a drifting burst, or a result below `CLEAR_PIXELS` standard errors.
     """
     if len(pairs) < 4 or pairs[0].frames == 1 or _moved(pairs):
         return 0.0
     mask = np.logical_and.reduce([pair.mask for pair in pairs])
     frames = np.stack([(pair.short[mask] - pair.scaling.intercept) / pair.scaling.slope for pair in pairs])
-    level = frames.mean(
-        0
-    )  # of the frames themselves: given it, Poisson counts have just its variance, however steep the scene
+    level = frames.mean(0)  # includes the pixels' own values: given it, Poisson counts have its variance on any scene
     squares = frames.var(axis=0, ddof=1)
     line = fit_line(level, squares)
     spread = np.sqrt(np.maximum(line(level), LEAST_VARIANCE * squares.mean()))
     differences = (frames[1::2] - frames[:-1:2]) / spread
-    number = min(24, differences.size // PER_LEVEL + 1)  # so that the levels' own errors are no unevenness
+    number = min(24, differences.size // PER_LEVEL + 1)  # so that errors of the levels do not count as unevenness
     spread *= spread_by_level(np.tile(level, len(differences)), differences.ravel(), num_levels=number)[: len(level)]
     products, power = _products(frames, spread)
     independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
@@ -162,10 +160,10 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
 
 
 def field_deviation(pairs: Sequence[AlignedPair]) -> float:
-    """Relative deviation (rms) over the field of the noise's variance at equal signal, as a polynomial of second order in the
-    position has it; 0 where that is within what chance gives.
+    """Return the relative deviation (rms) of the noise variance over the field at equal signal; 0 if not significant.
 
-    A flat-field division changes the gain with the place, a camera does not.
+    The variance is modelled as a second-order polynomial of the position. A flat-field division makes the gain depend on the
+    position, a camera does not.
     """
     gram, moment, power, number = np.zeros((5, 5)), np.zeros(5), 0.0, 0
     for pair in pairs:
@@ -185,8 +183,11 @@ def field_deviation(pairs: Sequence[AlignedPair]) -> float:
 
 
 def _products(frames: Image, spread: Image) -> tuple[Image, float]:
-    """(N,) mean product of the squares of two disjoint frame differences, less 1 each; its mean is the squared unevenness. And
-    the variance of such a square, about 2."""
+    """Return the (N,) mean products of two disjoint squared frame differences minus 1, and the variance of such a square (about
+    2).
+
+    The mean of the products is the squared unevenness.
+    """
     generator = np.random.default_rng(0)
     total, power = np.zeros(frames.shape[1]), 0.0
     for _ in range(ROUNDS):
@@ -201,14 +202,14 @@ def _products(frames: Image, spread: Image) -> tuple[Image, float]:
 
 
 def _moved(pairs: Sequence[AlignedPair]) -> bool:
-    """Whether frames were moved onto each other before they were compared: then their differences are of other pixels."""
+    """Whether the frames were warped before the comparison: differences then involve different detector pixels."""
     others = (np.sum([pair.short for pair in pairs[1:]], axis=0)) / (len(pairs) - 1)
     first, mask = pairs[0], pairs[0].mask
     return bool(np.std((first.long - others)[mask]) > 0.05 * np.std((first.short - others)[mask]))
 
 
 def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Levels, Image, Image]]:
-    """Each set of levels, its histograms and those expected, (L, cells)."""
+    """Yield each set of levels with its measured and expected histograms, (L, cells)."""
     gain, offset, read_noise = (np.array([value]) for value in parameters)
     for one in levels:
         number = one.histogram.sum(axis=1, keepdims=True)

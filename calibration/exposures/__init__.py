@@ -1,4 +1,4 @@
-"""Frames, exposure pairs and bursts; masks and scales of them."""
+"""Frames, exposure pairs and bursts, with their masks and scaling."""
 
 import lazy_loader as _lazy
 

@@ -1,4 +1,4 @@
-"""Codes of the converter that grow coarser with brightness: two converters joined into one frame, or companded values."""
+"""Detection of codes that become coarser with brightness: two converters combined in one frame, or companded values."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
 
 WINDOW = 32
-"""Codes that are counted together: the density of pixel values is even within, beside a noise of ten codes or more."""
+"""Codes counted together: with a noise of ten codes or more, the density of pixel values is uniform within a window."""
 
 COARSER = 0.6
-"""Share of the codes in use, relative to that of darker pixels, below which bright codes are coarser: every second code is left
-out at most joins, seven of eight are used by a converter that misses one code in eight."""
+"""Fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined converters
+skip every second code; a converter with one missing code in eight uses seven eighths."""
 
 LEAST_PIXELS = 0.005
-"""Share of the pixels above a join from which on their variance moves the photon-transfer line by as much."""
+"""Smallest share of pixels above a join that is considered; it shifts the photon-transfer line by about as much."""
 
 MOST_JOINED = 0.1
-"""Share of the pixels above a join up to which those below can be measured alone: noise scatters the clipped ones over the scene,
-and their neighbours are lost with them."""
+"""Largest share of pixels above a join for which the pixels below are measured alone. Noise scatters the clipped pixels over the
+scene, and their neighbours are excluded with them."""
 
 
 def coarser_above(frame: Image) -> float | None:
-    """The brightness above which a frame uses fewer of its codes than below; None where it uses them alike.
+    """Return the brightness, counts, above which a frame uses fewer of its codes; None if it uses them evenly.
 
     Args:
         frame: (y, x) pixel values.
@@ -33,13 +33,13 @@ def coarser_above(frame: Image) -> float | None:
     if not rounding_step(frame):
         return None
     code, count = np.unique(frame, return_counts=True)
-    whole = code < code[0] + (code[-1] - code[0]) // WINDOW * WINDOW  # the last window is cut short
+    whole = code < code[0] + (code[-1] - code[0]) // WINDOW * WINDOW  # the last window is incomplete
     if whole.sum() < 4 * WINDOW:
         return None
     code, count = code[whole], count[whole]
     window = ((code - code[0]) // WINDOW).astype(int)
     pixels, used = np.bincount(window, count), np.bincount(window)
-    expected = WINDOW * -np.expm1(pixels * np.log1p(-1 / WINDOW))  # codes that as many pixels hit by chance
+    expected = WINDOW * -np.expm1(pixels * np.log1p(-1 / WINDOW))  # expected number of codes hit by so many pixels
     filled = np.flatnonzero(pixels >= WINDOW)
     used, expected, above = used[filled], expected[filled], pixels[::-1].cumsum()[::-1][filled] / frame.size
     if len(filled) < 3:
@@ -54,11 +54,11 @@ def coarser_above(frame: Image) -> float | None:
 def below_joins(
     exposures: Sequence[ExposurePair] | Burst,
 ) -> tuple[Sequence[ExposurePair] | Burst, tuple[float, float]]:
-    """Exposures clipped where their codes grow coarser, so that one converter made all that is left; if these are few.
+    """Clip exposures where their codes become coarser, so that the remaining pixel values come from one converter.
 
     Returns:
-        The exposures, clipped where at most `MOST_JOINED` of the pixels are; the lowest brightness of a join, counts, and the
-        largest share of pixels beyond: infinity and 0 where there is none.
+        The exposures, clipped if this affects at most `MOST_JOINED` of the pixels; the lowest brightness of a join, counts, and
+        the largest share of pixels above it (infinity and 0 if there is no join).
     """
     frames = [exposures.frames[0]] if isinstance(exposures, Burst) else [pair.short for pair in exposures]
     joins = [np.inf if join is None else join for join in map(coarser_above, frames)]

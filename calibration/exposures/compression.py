@@ -1,6 +1,6 @@
-"""Image compression: coefficients that gather at few values on the compressor's own raster, and on no other.
+"""Detection of lossy compression: transform coefficients are quantised on the compressor's own block grid, and on no other.
 
-JPEG and its successors round cosine coefficients of 8 × 8 blocks; JPEG 2000 rounds coefficients of wavelets.
+JPEG and its successors quantise cosine coefficients of 8 × 8 blocks; JPEG 2000 quantises wavelet coefficients.
 """
 
 from __future__ import annotations
@@ -11,39 +11,41 @@ from calibration.exposures.frames import Image
 from noiseflow.models.digitisation import detect_digitisation
 
 SIDE = 8
-"""Pixels of a block's side in JPEG and its successors."""
+"""Side of a block in JPEG and its successors, pixels."""
 
 MOST = 512
-"""Pixels of the frame's side that are looked at."""
+"""Largest side of the region that is tested, pixels."""
 
 CLEAR = 8.0
-"""Standard deviations among the 64 rasters by which the compressed one stands out; among 63 equal ones 4 occurs by chance."""
+"""Standard deviations by which the compressed one of the 64 block grids must differ; 4 occurs by chance among 63 equal ones."""
 
 
 CLEAR_LOSS = 5.0
-"""The same for their power, where one raster must also lose `LEAST_LOSS`."""
+"""The same threshold for the power, where one grid must also lose `LEAST_LOSS`."""
 
 LEAST_LOSS = 0.1
-"""Power, in nats, that the fine coefficients of the compressed raster lack. That of noise in the thousand blocks of 256² pixels
-differs by 0.01 between rasters; a compressor that leaves only rounding takes 1.5, one that keeps more moves no gain by 2 %."""
+"""Smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in the 1000 blocks
+of 256² pixels differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5; compression below the
+threshold changes the gain by less than 2 %."""
 
 LIFTING = ((-1 / 2, 1 / 4), (-1.586134342, -0.052980118, 0.882911075, 0.443506852))
-"""Lifting steps of the two wavelets of JPEG 2000 (ITU-T T.800, annex F): 5/3 and 9/7."""
+"""Lifting coefficients of the two JPEG 2000 wavelets, 5/3 and 9/7 (ITU-T T.800, annex F)."""
 
 CLEAR_LATTICE = 40.0
-"""Power, N·|mean of exp(2πi·coefficient/step)|², at which wavelet coefficients are multiples of a step: 20 000 frequencies, bands
-and rasters together exceed it by chance once in 10¹³ frames."""
+"""Power, N·|mean of exp(2πi·coefficient/step)|², above which wavelet coefficients count as multiples of a step. By chance, the
+20 000 combinations of frequency, band and grid exceed it once in 10¹³ frames."""
 
 ALONE = 4.0
-"""By which the compressor's raster exceeds another. Values that are multiples of a step themselves show on all four alike. After
-strong compression, which leaves few coefficients, two others resemble the compressor's."""
+"""Factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids alike. After
+strong compression few coefficients are left, and two other grids resemble the compressor's."""
 
 
 def block_compressed(frame: Image) -> bool:
-    """Whether a frame went through a block compression such as JPEG's.
+    """Test whether a frame was compressed in blocks, as by JPEG.
 
-    A compressor rounds the coefficients of its own blocks, fine ones to zero. On every other raster of blocks they spread again.
-    Where all of them are zero, rounding of the pixel values is left there, and the edges of the blocks on the others.
+    The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
+    coefficients have a continuous distribution. If all of them are zero, only the rounding of the pixel values remains on the
+    compressor's grid, while the other grids contain the edges of the blocks.
 
     Args:
         frame: (y, x) pixel values.
@@ -68,9 +70,9 @@ def block_compressed(frame: Image) -> bool:
 
 
 def wavelet_compressed(frame: Image) -> bool:
-    """Whether a frame went through a lossy wavelet compression, that of JPEG 2000, or has every second pixel from its neighbours.
+    """Test whether a frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
-    The compressor rounds wavelet coefficients to multiples of a step. On its own raster, one of four, they still are.
+    The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.
 
     Args:
         frame: (y, x) pixel values.
@@ -85,7 +87,7 @@ def wavelet_compressed(frame: Image) -> bool:
 
 
 def _lattice(values: Image) -> float:
-    """The largest power of exp(2πi·value/step) over steps from 3 rounding steps to a standard deviation of the values."""
+    """Largest power of exp(2πi·value/step) over steps between 3 rounding steps and one standard deviation of the values."""
     values = values.ravel() - np.median(values)
     deviation = float(np.diff(np.percentile(values, (15.87, 84.13)))[0]) / 2
     inner = values[np.abs(values) < 8 * max(deviation, 4.0)]
@@ -97,14 +99,14 @@ def _lattice(values: Image) -> float:
 
 
 def _finest_bands(image: Image, steps: tuple[float, ...]) -> tuple[Image, Image, Image]:
-    """The wavelet coefficients of the finest level: high frequencies along y, along x, and along both."""
+    """Wavelet coefficients of the finest level: high frequencies along y, along x, and along both."""
     low, high = _split(image, steps, 1)
     (_, along_y), (along_x, both) = _split(low, steps, 0), _split(high, steps, 0)
     return along_y, along_x, both
 
 
 def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Image]:
-    """Low and high frequencies along an axis, by lifting: odd samples less their prediction by even ones, and in turn."""
+    """Split an image into low and high frequencies along an axis, by lifting steps that predict odd from even samples."""
     image = np.moveaxis(image, axis, 0)
     image = image[: len(image) // 2 * 2]
     low, high = image[::2].copy(), image[1::2].copy()

@@ -1,4 +1,4 @@
-"""Frames, exposure pairs and bursts, checked once: what comes after may trust them."""
+"""Frames, exposure pairs and bursts. They are validated once, on construction."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from noiseflow.models.digitisation import detect_digitisation
 Image = NDArray[np.float64]
 
 MINIMUM_SIDE = 32
-"""Smallest frame side, in pixels, that can be registered and judged."""
+"""Smallest frame side, in pixels, that can be registered and measured."""
 
 
 @described(short="detector units", long="detector units")
 @dataclass(frozen=True)
 class ExposurePair:
-    """One scene taken twice: a short, noisy exposure and a long, cleaner one.
+    """A short, noisy exposure and a long, cleaner exposure of one scene.
 
     Args:
-        short: (y, x) frame whose noise is to be learned, detector units; an array or a tensor.
-        long: (y, x) frame that tells its signal, in any linear scale of detector units.
-        exposure_ratio: exposure time (or dose) of the long frame over that of the short one, > 1; None: unknown.
-        short_name: how messages call the short frame.
-        long_name: how messages call the long frame.
+        short: (y, x) frame whose noise is measured, detector units; an array or a tensor.
+        long: (y, x) frame that provides the signal, in any linear scale of detector units.
+        exposure_ratio: ratio of the long to the short exposure time (or dose), > 1; None if unknown.
+        short_name: name of the short frame in messages.
+        long_name: name of the long frame in messages.
 
     Raises:
-        ValueError: a frame is not one grey image, too small, has NaN or infinite pixels, is flat or saturated; the two
-            differ in size or are identical; the ratio is not above 1.
+        ValueError: a frame is not a single grey image, is too small, has NaN or infinite pixels, is constant or saturated; the
+            frames differ in size or are identical; the ratio is not above 1.
 
     Example:
         >>> import calibration, numpy as np
@@ -59,12 +59,12 @@ class ExposurePair:
         _require_same_size(self.short, self.short_name, self.long, self.long_name)
         if np.array_equal(self.short, self.long):
             raise ValueError(
-                f"{self.short_name} and {self.long_name} hold identical pixels; "
+                f"{self.short_name} and {self.long_name} have identical pixels; "
                 "give two separate exposures of one scene"
             )
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
-                f"the exposure ratio is {self.exposure_ratio:g}; it is long over short and must be above 1: "
+                f"the exposure ratio (long over short) is {self.exposure_ratio:g} but must be above 1: "
                 "swap --short and --long, or give equal exposures as a burst"
             )
 
@@ -72,15 +72,15 @@ class ExposurePair:
 @described(frames="detector units")
 @dataclass(frozen=True)
 class Burst:
-    """Equal exposures of one scene: every frame is judged against the mean of the others.
+    """Equal exposures of one scene; each frame is compared with the mean of the others.
 
     Args:
-        frames: (frame, y, x) in the order taken, detector units, two frames or more; an array or a tensor.
-        name: how messages call the burst.
-        calibration: dark or flat frames, which need no scene; flat ones may be saturated.
+        frames: (frame, y, x) in the order recorded, detector units, at least two frames; an array or a tensor.
+        name: name of the burst in messages.
+        calibration: dark or flat frames, which need no scene; flat frames may be saturated.
 
     Raises:
-        ValueError: fewer than two frames, two equal ones, or a frame that `checked_frame` refuses.
+        ValueError: there are fewer than two frames, two frames are identical, or `checked_frame` rejects a frame.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -99,7 +99,7 @@ class Burst:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             raise ValueError(
-                f"{self.name} {_holds(self.name)} one frame only (shape {frames.shape}); noise shows between frames: give "
+                f"{self.name} {_holds(self.name)} only one frame (shape {frames.shape}); to measure the noise, give "
                 + (
                     "at least two"
                     if self.calibration
@@ -112,15 +112,15 @@ class Burst:
             for i, frame in enumerate(frames)
         ]
         for i, (first, second) in enumerate(pairwise(checked)):
-            if np.array_equal(first, second) and np.ptp(first) > 0:  # saturated frames are equal as a matter of course
-                raise ValueError(f"{self.name}: frames {i} and {i + 1} hold identical pixels; remove the copy")
+            if np.array_equal(first, second) and np.ptp(first) > 0:  # saturated frames are always equal
+                raise ValueError(f"{self.name}: frames {i} and {i + 1} have identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
 
     def require_unsaturated(self) -> None:
-        """Refuse calibration frames whose noise is cut off, where that is needed.
+        """Reject calibration frames whose noise is clipped.
 
         Raises:
-            ValueError: a frame is flat, or half of it saturated.
+            ValueError: a frame is constant, or over half of its pixels are saturated.
         """
         for i, frame in enumerate(self.frames):
             _require_unsaturated(frame, f"{self.name}, frame {i}")
@@ -129,16 +129,17 @@ class Burst:
 def checked_frame(
     data: NDArray[Any], name: str, *, least_side: int = MINIMUM_SIDE, may_saturate: bool = False
 ) -> Image:
-    """One grey frame as float64, refused where calibration could not use it.
+    """Validate one grey frame and return it as float64, (y, x).
 
     Args:
-        data: (y, x), or (1, y, x); any real number type.
-        name: how the message calls it.
-        least_side: pixels that each side needs.
-        may_saturate: accept a frame that is saturated, or flat.
+        data: (y, x) or (1, y, x), any real number type.
+        name: name of the frame in messages.
+        least_side: smallest side, pixels.
+        may_saturate: accept saturated or constant frames.
 
     Raises:
-        ValueError: not one grey image, smaller than `least_side`, NaN, flat, or half of it saturated.
+        ValueError: the frame is not a single grey image, is smaller than `least_side`, has NaN or infinite pixels, is constant,
+            or over half of its pixels are saturated.
     """
     data = as_array(data)
     if data.ndim == 3 and data.shape[0] == 1:
@@ -147,10 +148,12 @@ def checked_frame(
         raise ValueError(f"{name} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim != 2:
         raise ValueError(
-            f"{name} has shape {data.shape}; one 2D frame is needed here (a stack alone is read as a burst)"
+            f"{name} has shape {data.shape}, but a single 2D frame is required (give a stack alone to read it as a burst)"
         )
     if min(data.shape) < least_side:
-        raise ValueError(f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} per side are needed")
+        raise ValueError(
+            f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} per side are required"
+        )
     require_finite(data, name)
     if not may_saturate:
         _require_unsaturated(data, name)
@@ -162,13 +165,13 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
     saturated = float(np.mean(data >= rail))
     if saturated > 0.5 and (saturated < 1 or rail == _largest_value(data)):
         raise ValueError(
-            f"{name} is saturated: {saturated:.0%} of its pixels read {rail:g}; expose it for a shorter time"
+            f"{name} is saturated: {saturated:.0%} of its pixels have the value {rail:g}; use a shorter exposure"
         )
     require_contrast(data, name)
 
 
 def saturation_level(frame: NDArray[Any]) -> float:
-    """The upper clipping limit of the analogue-to-digital converter, or infinity where the frame shows none.
+    """Return the upper clipping limit of the analogue-to-digital converter, or infinity if the frame shows none.
 
     Args:
         frame: any shape, detector units.
@@ -177,12 +180,12 @@ def saturation_level(frame: NDArray[Any]) -> float:
 
 
 def rounding_step(frame: Image) -> float:
-    """1 where all pixel values are whole numbers, else 0: not rounded."""
+    """Return 1 if all pixel values are whole numbers, else 0 (not rounded)."""
     return 1.0 if np.array_equal(frame, np.round(frame)) else 0.0
 
 
 def rails(frame: Image) -> tuple[float, float]:
-    """Lower and upper clipping limit of the converter as the frame shows them; infinite where it shows none."""
+    """Return the lower and upper clipping limits of the converter, as detected in the frame; infinite if not detected."""
     found = detect_digitisation(frame)
     return (0.0 if frame.min() == 0 else found.low), found.high
 
@@ -194,16 +197,16 @@ def _largest_value(data: NDArray[Any]) -> float:
 def read_pairs(
     short: Sequence[str | Path], long: Sequence[str | Path], *, exposure_ratio: float | None = None
 ) -> list[ExposurePair]:
-    """Read exposure pairs, in the order given; one long exposure may serve several short ones.
+    """Read exposure pairs in the order given.
 
     Args:
         short: files of the short exposures.
-        long: as many files of the long exposures, or one for all.
-        exposure_ratio: of every pair; None: unknown.
+        long: files of the long exposures: one per short exposure, or one for all.
+        exposure_ratio: exposure ratio of every pair; None if unknown.
 
     Raises:
         FileNotFoundError: a file does not exist.
-        ValueError: the lists do not match, a file cannot be read, or `ExposurePair` refuses a pair.
+        ValueError: the lists do not match, a file cannot be read, or `ExposurePair` rejects a pair.
 
     Example:
         >>> import calibration, noiseflow, pathlib
@@ -215,12 +218,14 @@ def read_pairs(
     if len(long) not in (1, len(short)) or not short:
         raise ValueError(
             f"{len(short)} short and {len(long)} long exposures were given; "
-            "give one long exposure per short one, or one for all"
+            "give one long exposure per short exposure, or one for all"
         )
     longs = list(long) * (len(short) if len(long) == 1 else 1)
     for one, other in zip(short, longs, strict=True):
         if Path(one).resolve() == Path(other).resolve():
-            raise ValueError(f"{one} was given as short and as long exposure; give two separate exposures of one scene")
+            raise ValueError(
+                f"{one} was given as both short and long exposure; give two separate exposures of one scene"
+            )
     return [
         ExposurePair(read(one).data, read(other).data, exposure_ratio, str(one), str(other))
         for one, other in zip(short, longs, strict=True)
@@ -228,16 +233,16 @@ def read_pairs(
 
 
 def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False) -> Burst:
-    """Read a burst from one stack, or from files of one frame each in the order taken.
+    """Read a burst from one stack, or from single-frame files in the order recorded.
 
     Args:
         paths: the files.
-        name: how messages call it; by default the file, or "the burst".
-        calibration: dark or flat frames.
+        name: name of the burst in messages; by default the file name, or "the burst".
+        calibration: whether these are dark or flat frames.
 
     Raises:
         FileNotFoundError: a file does not exist.
-        ValueError: a file cannot be read, sizes differ, or `Burst` refuses the frames.
+        ValueError: a file cannot be read, the frames differ in size, or `Burst` rejects them.
 
     Example:
         >>> import calibration, noiseflow, numpy as np, pathlib, tempfile
@@ -253,26 +258,27 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibrat
             raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
         frames += list(data) if data.ndim == 3 else [data]
     for frame in frames[1:]:
-        _require_same_size(frames[0], "the first frame", frame, "a later one")
+        _require_same_size(frames[0], "the first frame", frame, "a later frame")
     return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"), calibration)
 
 
 def _holds(name: str) -> str:
-    """The verb after the name of frames, such as "the burst" or "the dark frames"."""
-    return "hold" if name.endswith("frames") else "holds"
+    """Return the verb for a name such as "the burst" or "the dark frames"."""
+    return "contain" if name.endswith("frames") else "contains"
 
 
 def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -> list[Burst]:
-    """Read flat frames at several levels of light: each stack is a level, and so are files of one frame each that follow one
-    another with equal means.
+    """Read flat frames at several light levels.
+
+    Each stack is one level. Consecutive single-frame files with equal means also form one level.
 
     Args:
         paths: the files.
-        name: how messages call them.
+        name: name of the frames in messages.
 
     Raises:
         FileNotFoundError: a file does not exist.
-        ValueError: a file cannot be read, or a level has one frame only.
+        ValueError: a file cannot be read, or a level has only one frame.
     """
     levels: list[list[NDArray[Any]]] = []
     single = False
@@ -289,7 +295,7 @@ def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -
 
 
 def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
-    """Whether two frames are of one level: their means differ by under 1 %, as light sources flicker."""
+    """Test whether two frames belong to one level: their means differ by less than 1 %, the flicker of typical light sources."""
     if first.shape != second.shape:
         return False
     one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
@@ -299,6 +305,6 @@ def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
 def _require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
     if first.shape != second.shape:
         raise ValueError(
-            f"{first_name} is {first.shape} and {second_name} is {second.shape} pixels; both must have one size: "
-            "take them with the same binning and region"
+            f"{first_name} is {first.shape} and {second_name} is {second.shape} pixels; the sizes must be equal: "
+            "record both with the same binning and region"
         )

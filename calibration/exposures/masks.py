@@ -1,4 +1,4 @@
-"""Pixels that cannot be trusted: hot, dead, saturated, and those no exposure covers."""
+"""Masks of unusable pixels: hot, dead, saturated, changing, or not covered by both exposures."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ Mask = NDArray[np.bool_]
 DEFECT_DEVIATIONS = 8.0
 """Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
 
-
 CUT = 2.5
-"""Robust standard deviations at which residuals are cut before neighbours are compared."""
+"""Standard deviations at which residuals are clipped before neighbours are compared."""
 
 
 @dataclass(frozen=True)
 class MaskCounts:
-    """How many pixels of a frame were left out, and why (a pixel counts once, for the first reason)."""
+    """Number of pixels of a frame that were excluded, by reason (each pixel counts once, for the first reason)."""
 
     outside: int
     saturated: int
@@ -33,17 +32,16 @@ class MaskCounts:
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
-    """Hot and dead pixels: those that differ from their neighbours in the same direction in every frame of one
-    detector.
+    """Find hot and dead pixels: they differ from their neighbours in the same direction in every frame.
 
-    Judged in detector coordinates, before any frame is warped. A real feature of the scene spreads over neighbours
-    through the optics; a single noisy pixel value does not repeat.
+    The frames must be in detector coordinates, before any is warped. Features of the scene spread over neighbouring pixels
+    through the optics, and noise does not repeat between frames.
 
     Args:
-        frames: (frame, y, x).
+        frames: (frame, y, x) frames of one detector.
 
     Returns:
-        Two (y, x) masks.
+        Masks of the hot and of the dead pixels, each (y, x).
     """
     hot = np.ones(frames.shape[1:], bool)
     dead = hot.copy()
@@ -55,7 +53,7 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
 
 
 def saturated(frame: Image, *, margin: int = 0) -> Mask:
-    """Pixels at the upper clipping limit, grown by `margin` pixels."""
+    """Return the (y, x) mask of pixels at the upper clipping limit, dilated by `margin` pixels."""
     at_rail = frame >= saturation_level(frame)
     return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
 
@@ -63,14 +61,14 @@ def saturated(frame: Image, *, margin: int = 0) -> Mask:
 def clear_of_rails(
     frame: Image, level: Image, mask: Mask, *, deviations: float = 3.5, upper_only: bool = False
 ) -> Mask:
-    """Pixels whose level lies at least some standard deviations off the converter's clipping limits, so that no noise is cut off.
+    """Return the (y, x) mask of pixels far enough from the converter's clipping limits that their noise is not clipped.
 
     Args:
         frame: (y, x) pixel values.
-        level: (y, x) the signal by other pixel values than the frame's own: a choice by these would cut their noise.
-        mask: (y, x) pixels to judge the noise by.
-        deviations: the distance asked for.
-        upper_only: the lower limit does not count.
+        level: (y, x) signal, estimated from other pixel values: a selection by the values themselves would truncate their noise.
+        mask: (y, x) pixels used to estimate the noise.
+        deviations: required distance from a limit, standard deviations.
+        upper_only: ignore the lower limit.
     """
     low, high = rails(frame)
     low = -np.inf if upper_only else low
@@ -78,26 +76,29 @@ def clear_of_rails(
     for rail, side in ((low, 1.0), (high, -1.0)):
         if np.isfinite(rail):
             near = mask & (side * level < np.percentile(side * level[mask], 25))
-            middle, far = np.percentile(side * (frame - level)[near], (50, 84.13))  # the other side is the clipped one
+            middle, far = np.percentile(
+                side * (frame - level)[near], (50, 84.13)
+            )  # the side away from the limit, which is not clipped
             clear &= side * (level - rail) > deviations * (far - middle)
     return clear
 
 
 def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0) -> Mask:
-    """Places where a burst does not stand still: neighbouring pixels there rise and fall together.
+    """Find regions of a burst that change between frames: the residuals of neighbouring pixels are correlated there.
 
-    Noise, however uneven or heavy-tailed, is independent between pixels, or correlated alike everywhere; what moves or
-    blinks spreads over neighbours through the optics. Residuals are cut at some deviations, so that two outliers side
-    by side condemn nothing.
+    Noise is independent between pixels, or equally correlated everywhere. Objects that move or blink spread over neighbouring
+    pixels through the optics. Residuals are clipped at `CUT`, so that two adjacent outliers are not flagged.
 
     Args:
-        residual: (frame, y, x) each of two frames or more, less the mean of the others.
+        residual: (frame, y, x) residuals from the mean of the other frames, at least two frames.
         level: (y, x) mean of the frames.
-        mask: (y, x) pixels to judge.
-        side: of the neighbourhood judged as one, and condemned as one, pixels.
-        deviations: standard deviations by which the neighbours' covariance exceeds the frame's usual one.
+        mask: (y, x) pixels to test.
+        side: side of the neighbourhood that is tested and excluded as a whole, pixels.
+        deviations: threshold: standard deviations of the neighbours' covariance above its typical value.
     """
-    residual = residual - np.median(residual, axis=0)  # an outlier of one frame shifts the mean that others are held to
+    residual = residual - np.median(
+        residual, axis=0
+    )  # an outlier in one frame shifts the mean that the others are compared with
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
@@ -121,7 +122,7 @@ def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviat
 
 
 def _deviation(frame: Image) -> Image:
-    """Departure from the median of the eight neighbours, over its robust spread among pixels of like brightness."""
+    """Difference from the median of the eight neighbours, in robust standard deviations among pixels of similar brightness."""
     ring = np.ones((3, 3), bool)
     ring[1, 1] = False
     middle = ndimage.median_filter(frame, footprint=ring)

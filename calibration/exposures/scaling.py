@@ -1,4 +1,4 @@
-"""One scale for two exposures that are both noisy: slope, intercept and the long one's own noise."""
+"""Linear scaling between two noisy exposures: slope, intercept, and the noise of the long exposure."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from noiseflow.described import described
 Mask = NDArray[np.bool_]
 
 CUT = 4.0
-"""Standard deviations at which a residual is cut before its level's spread is taken: noise hardly reaches them; one outlier in a
-hundred then adds 7 % to the deviation."""
+"""Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
+outliers then increase the standard deviation by 7 %."""
 
 BLOCK = 8
-"""Side, pixels, of blocks whose sums are independent: the filter of the finest band and an interpolation reach 3 pixels."""
+"""Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
 
 
 @described(intercept="counts", intercept_error="counts", level_error="counts")
 @dataclass(frozen=True)
 class Scaling:
-    """signal = slope·long + intercept, in the short exposure's units.
+    """Linear scaling signal = slope·long + intercept, in the units of the short exposure.
 
     Attributes:
-        slope: counts of the short exposure per unit of the long one; its inverse estimates the exposure ratio where
-            both come from one detector setting.
+        slope: counts of the short exposure per unit of the long one; its inverse estimates the exposure ratio if both were
+            recorded at one detector setting.
         intercept: counts.
         slope_error: standard error of the slope.
         intercept_error: standard error of the intercept.
-        centre: long reading at which slope and signal err independently.
-        level_error: standard error of the signal there.
+        centre: value of the long exposure at which the errors of slope and signal are independent.
+        level_error: standard error of the signal at `centre`.
     """
 
     slope: float
@@ -45,7 +45,7 @@ class Scaling:
     level_error: float = 0.0
 
     def common_offset(self) -> tuple[float, float]:
-        """Offset of both exposures, counts, and its standard error, if one detector setting took them: intercept/(1 − slope)."""
+        """Offset of both exposures, intercept/(1 − slope), and its standard error, counts; valid for one detector setting."""
         offset = self.intercept / (1 - self.slope)
         lever = (offset - self.centre) / (1 - self.slope)
         return offset, float(np.hypot(self.level_error / (1 - self.slope), lever * self.slope_error))
@@ -54,34 +54,35 @@ class Scaling:
 @described(floor="counts²", rate="counts", rate_error="counts")
 @dataclass(frozen=True)
 class VarianceLine:
-    """A variance that grows linearly with the signal, as shot noise with read noise does: floor + rate·signal,
-    counts². `rate_error` is the standard error of the rate; 0 where it was not estimated."""
+    """Variance that is linear in the signal, as for shot noise with read noise: floor + rate·signal, counts².
+
+    `rate_error` is the standard error of the rate; 0 if it was not estimated.
+    """
 
     floor: float
     rate: float
     rate_error: float = 0.0
 
     def __call__(self, signal: Image) -> Image:
-        """Variance at each signal, never negative."""
+        """Return the variance at each signal, clipped at 0."""
         return np.maximum(self.floor + self.rate * signal, 0.0)
 
 
 def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 4) -> Scaling:
-    """Scale and offset between registered exposures by instrumental variables, robust against outliers.
+    """Fit the scaling between registered exposures by instrumental variables, robust against outliers.
 
-    Least squares of the short on the long exposure would be too flat, because the long one is noisy itself. The
-    neighbours of each pixel in the short frame know its signal but neither pixel's noise, so they serve as the
-    instrument (doi:10.1257/jep.15.4.69). Levels are weighted by their inverse variance, residuals above six of its
-    roots left out.
+    Least squares would underestimate the slope, because the long exposure is noisy too. The neighbours of each pixel in the short
+    frame depend on its signal but not on the noise of either pixel, and serve as the instrument (doi:10.1257/jep.15.4.69).
+    Pixels are weighted by their inverse variance; residuals above six standard deviations are excluded.
 
     Args:
         short: (y, x) counts.
-        long: (y, x) registered on it.
+        long: (y, x) exposure registered on `short`.
         mask: (y, x) pixels to use.
-        num_iterations: rounds of weighting.
+        num_iterations: number of reweighting iterations.
 
     Raises:
-        ValueError: the two do not correlate, so that no scale exists.
+        ValueError: the exposures are not correlated.
     """
     instrument = ring_mean(short, mask, inner=0, blur=1.5)[mask]
     x, y = long[mask], short[mask]
@@ -97,9 +98,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
         weight = (np.abs(residual) < 6 * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < 5 * error:
-        raise ValueError(
-            "the two exposures do not rise and fall together once registered; check that they show the same scene"
-        )
+        raise ValueError("the registered exposures are not correlated; check that they show the same scene")
     middle, own = float(weight @ x / total), float(1 / np.sqrt(total))
     intercept_error = float(np.hypot(own, error * middle))
     return Scaling(float(slope), float(intercept), float(error), intercept_error, middle, own)
@@ -108,17 +107,17 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
 def own_variance(
     short: Image, long: Image, mask: Mask, scaling: Scaling, warp: Callable[[Image], Image]
 ) -> VarianceLine:
-    """The noise variance of the signal estimate itself, as a line in the signal, counts².
+    """Estimate the noise variance of the signal estimate, as a line in the signal, counts².
 
-    The finest band of the long frame, before any interpolation, holds its noise and what detail the scene has there.
-    That detail is common to both exposures, so their covariance in this band takes it out.
+    The finest band of the long frame, before any interpolation, contains its noise and the finest detail of the scene. The detail
+    is common to both exposures and is removed by subtracting their covariance in this band.
 
     Args:
         short: (y, x) counts.
-        long: (y, x) as recorded.
+        long: (y, x) frame as recorded.
         mask: (y, x) pixels of the short frame to use.
-        scaling: of the long exposure.
-        warp: brings the long frame onto the short one.
+        scaling: scaling of the long exposure.
+        warp: function that warps a long frame onto the short one.
     """
     signal = scaling.slope * warp(long) + scaling.intercept
     squares = scaling.slope**2 * warp(finest_band(long) ** 2) - finest_band(short) * finest_band(signal)
@@ -127,15 +126,17 @@ def own_variance(
     chosen = signal[whole]
     weight = _inverse_square(
         fit_line(chosen, ((short - signal) ** 2)[whole]), chosen
-    )  # better known than the own noise
+    )  # the total variance is better known than that of the long exposure
     line = _weighted_line(chosen, squares[whole], weight)
     error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
-    kept = float(np.var(warp(np.random.default_rng(0).standard_normal(long.shape))[whole]))  # by the interpolation
+    kept = float(
+        np.var(warp(np.random.default_rng(0).standard_normal(long.shape))[whole])
+    )  # the fraction that interpolation preserves
     return VarianceLine(kept * line.floor, kept * line.rate, kept * error)
 
 
 def _rate_error(signal: Image, departure: Image, weight: Image, mask: Mask) -> float:
-    """Standard error of a line's rate, from the scatter between blocks of `BLOCK`² pixels."""
+    """Standard error of the rate of a line, from the scatter between blocks of `BLOCK`² pixels."""
     row, column = np.indices(mask.shape) // BLOCK
     block = (row * (column.max() + 1) + column)[mask]
     lever = signal - np.average(signal, weights=weight)
@@ -144,14 +145,13 @@ def _rate_error(signal: Image, departure: Image, weight: Image, mask: Mask) -> f
 
 
 def finest_band(image: Image) -> Image:
-    """The mixed second difference: blind to slopes and curvature along the axes, of unit gain for white noise."""
+    """Mixed second difference: removes slopes and curvature along the axes; unit gain for white noise."""
     kernel = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
     return np.asarray(ndimage.convolve1d(ndimage.convolve1d(image, kernel, axis=0), kernel, axis=1))
 
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
-    """Least-squares line through squared residuals, weighted by their expected spread (that of a variance is the
-    variance)."""
+    """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
     weight = np.ones_like(signal)
     for _ in range(3):
         line = _weighted_line(signal, squares, weight)
@@ -167,14 +167,13 @@ def _weighted_line(signal: Image, squares: Image, weight: Image) -> VarianceLine
 
 
 def _inverse_square(line: VarianceLine, signal: Image) -> Image:
-    """Weights of squares whose expectation is the line, but for its lowest tenth."""
+    """Inverse square of the line, whose value is bounded below by a tenth of its mean."""
     level = np.maximum(line.floor + line.rate * signal, 0.1 * abs(line.floor + line.rate * signal.mean()))
     return np.asarray(1 / np.maximum(level, np.finfo(float).tiny) ** 2)
 
 
 def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
-    """Gaussian mean of each pixel's neighbours in the mask, leaving out those within `inner` rows and columns of
-    itself."""
+    """Gaussian-weighted mean of each pixel's neighbours in the mask, without those within `inner` rows and columns."""
     weight = _ring_sum(mask.astype(float), inner, blur)
     total = _ring_sum(np.where(mask, image, 0.0), inner, blur)
     result: Image = np.divide(total, weight, out=image.astype(float), where=weight > 1e-6)
@@ -192,17 +191,17 @@ def _ring_sum(image: Image, inner: int, blur: float) -> Image:
 
 
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> Image:
-    """Standard deviation of the residual at each pixel's level, interpolated between equally filled levels.
+    """Standard deviation of the residual at each pixel's level, interpolated between levels of equal pixel count.
 
-    Residuals are cut at `CUT` standard deviations, so that outliers count little. Percentiles would move in whole rounding
-    steps where the noise has few.
+    Residuals are clipped at `CUT` standard deviations to limit the effect of outliers. Percentiles are not used for the result,
+    because they change in whole rounding steps where the noise spans few of them.
     """
     number = max(1, min(num_levels, len(level) // 50))
     groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)
     centres, values = level[groups].mean(1), residual[groups]
     low, middle, high = np.percentile(values, (15.87, 50, 84.13), axis=1, keepdims=True)
     spread = np.where(high > low, (high - low) / 2, values.std(axis=1, keepdims=True))
-    for _ in range(2):  # the first still has the percentiles' steps in its cut
+    for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
         spread = np.clip(values, middle - CUT * spread, middle + CUT * spread).std(axis=1, keepdims=True)
     spreads = spread[:, 0]
     return np.asarray(np.maximum(np.interp(level, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))

@@ -1,1 +1,1 @@
-"""Where each pixel of one exposure lies in another."""
+"""Registration of exposures."""

@@ -1,6 +1,6 @@
-"""Registration: where each pixel of a short exposure lies in the long one, and the long one warped onto it.
+"""Registration of a long exposure to a short one, and warping of the long exposure.
 
-Only the long exposure is ever interpolated: that of the short one would correlate and shrink the noise to be learned.
+Only the long exposure is interpolated. Interpolating the short one would correlate and reduce the noise to be measured.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from noiseflow.io import as_array
 Motion = Literal["translation", "euclidean", "affine"]
 
 MOTIONS: dict[Motion, int] = {"translation": 2, "euclidean": 3, "affine": 6}
-"""The motions tried, and their numbers of parameters."""
+"""Motion models and their numbers of parameters."""
 
 MINIMUM_OVERLAP = 0.25
-"""Fraction of the short frame that the long one must cover."""
+"""Smallest fraction of the short frame that the long one must cover."""
 
 CLEAR_PEAK = 8.0
-"""Standard deviations by which the correlation of registered frames must stand out from that of unrelated ones, which
-reach 5.5 once the search over shifts, rotations and motions has picked their best."""
+"""Correlation of registered frames, in standard deviations of the correlation of unrelated frames, above which a registration is
+accepted. The best of all shifts, rotations and motions between unrelated frames reaches 5.5."""
 
 SAME_SCENE = 0.9
-"""Correlation from which on small frames and crystal lattices, which have too few independent details for `CLEAR_PEAK`, show one
-scene: unrelated frames that overlap by half, neither turned nor magnified, reach 0.75."""
+"""Correlation above which small frames and crystal lattices, which have too few independent details for `CLEAR_PEAK`, show one
+scene. Unrelated frames that overlap by half, without rotation or magnification, reach 0.75."""
 
 LATTICE = 0.7
-"""Height of another peak of the correlation, over the one at the registered place, from which on a scene repeats itself; the
-integer shift next to the top of a period of 5 pixels has 0.8."""
+"""Height of a secondary correlation peak, relative to the peak at the registered position, above which a scene counts as
+periodic. The integer shift next to the maximum of a period of 5 pixels has 0.8."""
 
 LARGEST_TURN = 0.05
-"""Turn or magnification (3° or 5 %) by which a crystal lattice may fit another, and by which its refinement may
-change a guess, whose pixels near the edge are a few off at most."""
+"""Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
+by its refinement. At larger values a crystal lattice may fit another one."""
 
 CONCLUSIVE_INLIERS = 30
-"""Matches that agree with the refined transform, and outnumber the others, from which on they prove it alone: a false match
-agrees within `INLIER_DISTANCE` about once in 5000, while the correlation fades with the overlap."""
+"""Matches that suffice to accept a transform if they agree with it and outnumber the others. A false match agrees within
+`INLIER_DISTANCE` about once in 5000, while the correlation decreases with the overlap."""
 
 LARGEST_ERROR = 0.5
 """Standard error, in pixels, above which a transform is too uncertain to use."""
@@ -64,18 +64,18 @@ LARGEST_ERROR = 0.5
 @described(rms_px="px", error_px="px")
 @dataclass(frozen=True)
 class Registration:
-    """Where the short frame's pixels lie in the long one.
+    """Transform from the pixels of the short frame to those of the long one.
 
     Attributes:
-        matrix: (2, 3): (x, y, 1) of the short frame -> (x, y) of the long one, pixels.
-        motion: the simplest motion that the data support.
-        method: what gave the first guess, refined by maximising the enhanced correlation coefficient.
-        inliers: matches that agree with it (0 for phase correlation).
-        matches: matches before the consensus.
-        rms_px: root mean square distance of the inlier matches from the transform; for phase correlation `error_px`.
-        error_px: standard error of the transform, rms over the frame, from the noise of the short exposure.
-        peak: correlation over its standard deviation between unrelated frames of the same spectra.
-        inverted: the two frames have opposite contrast.
+        matrix: (2, 3) matrix: (x, y, 1) in the short frame -> (x, y) in the long one, pixels.
+        motion: the simplest motion model that the data support.
+        method: source of the initial guess, which is refined by maximising the enhanced correlation coefficient.
+        inliers: number of matches that agree with the transform (0 for phase correlation).
+        matches: number of matches before RANSAC.
+        rms_px: root mean square distance of the inlier matches from the transform, pixels; for phase correlation `error_px`.
+        error_px: standard error of the transform due to the noise of the short exposure, rms over the frame, pixels.
+        peak: correlation, in standard deviations of the correlation of unrelated frames with the same spectra.
+        inverted: whether the frames have opposite contrast.
 
     Example:
         >>> import calibration, numpy as np
@@ -105,20 +105,23 @@ class Registration:
 
     @property
     def scale(self) -> float:
-        """Magnification, the square root of the area's."""
+        """Linear magnification (square root of the magnification of areas)."""
         return float(np.sqrt(np.linalg.det(self.matrix[:, :2])))
 
     def shift(self, shape: tuple[int, ...]) -> tuple[float, float]:
-        """Displacement (x, y) of the middle of a frame of `shape`, pixels."""
+        """Displacement (x, y) of the centre of a frame with `shape` (y, x), pixels."""
         centre = (np.array(shape[::-1]) - 1) / 2
         x, y = self.matrix[:, :2] @ centre + self.matrix[:, 2] - centre
         return float(x), float(y)
 
     def warp(self, long: Image) -> tuple[Image, NDArray[np.bool_]]:
-        """The long frame on the short one's pixels, and which of them it covers (a pixel off its border).
+        """Warp the long frame onto the pixels of the short one.
 
-        A shift below a hundredth of a pixel is not worth the smoothing of an interpolation: the frame is then
-            returned as it is."""
+        A shift below 0.01 pixels is ignored, because interpolation would only smooth the frame.
+
+        Returns:
+            (y, x) warped frame, and (y, x) mask of the pixels that it covers.
+        """
         import cv2
 
         size = long.shape[::-1]
@@ -131,7 +134,7 @@ class Registration:
 
 
 def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:
-    """Which pixels of the short frame fall inside the long one, `border` pixels off its edge."""
+    """Return the (y, x) mask of the short frame's pixels that lie inside the long one, at least `border` pixels from its edge."""
     row, column = np.indices(shape)
     x, y = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([column, row])) + matrix[:, 2][:, None, None]
     inside: NDArray[np.bool_] = (
@@ -143,19 +146,21 @@ def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> ND
 def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short", "the long exposure")) -> Registration:
     """Find the transform from the short frame to the long one.
 
-    SIFT matches, Lowe's ratio test and RANSAC give a first guess, or the peak of the cross-correlation where the scene
-    has too few features; maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
-    sub-pixel accuracy, as translation, Euclidean or affine motion, whichever the Bayesian information criterion
-    prefers. A guess counts only if the registered frames then correlate more clearly than unrelated ones could
-    (`CLEAR_PEAK`), or almost fully and with hardly a turn (`SAME_SCENE`: small frames, crystal lattices), or if
-    `CONCLUSIVE_INLIERS` matches and most of all agree with it. Unless matches prove it, the correlation's guess is
-    asked too, and the likelier of the two counts. A crystal lattice fits itself at many shifts: the likeliest counts, which is
-    the smallest one where the crystal lattice is perfect; the residuals are then the same at all of them.
+    The initial guess comes from SIFT matches, Lowe's ratio test and RANSAC, or from the peak of the cross-correlation if the
+    scene has too few features. Maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
+    sub-pixel accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
+
+    A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CLEAR_PEAK`); they correlate
+    almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
+    `CONCLUSIVE_INLIERS` matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
+    cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
+    the most likely one is returned, which is the smallest for a perfect crystal lattice, whose residuals are equal at all of
+    them.
 
     Args:
         short: (y, x) detector units.
         long: (y, x) of the same size, any linear scale.
-        names: how messages call the two.
+        names: names of the two frames in messages.
 
     Raises:
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
@@ -180,26 +185,26 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         return functools.reduce(lambda *two: _better(short, long, *two), others, best)
     overlap, most_matches = tried.overlap, tried.most_matches
     reason = (
-        f"they overlap by {overlap:.0%} only"
+        f"they overlap by only {overlap:.0%}"
         if overlap < MINIMUM_OVERLAP
         else f"SIFT found {most_matches} consistent matches and their correlation has no clear peak"
     )
     raise ValueError(
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
-        "at the same magnification, or give a longer short exposure"
+        "at the same magnification, or use a longer short exposure"
     )
 
 
 @dataclass
 class _Tried:
-    """What the last guesses came to, for the message where all fail."""
+    """Results of the rejected guesses, for the error message."""
 
     overlap: float = 1.0
     most_matches: int = 0
 
 
 def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Iterator[Registration]:
-    """The guesses that stand, refined."""
+    """Yield the refined registrations of the guesses that are accepted."""
     for guess in guesses:
         tried.most_matches = max(tried.most_matches, len(guess.points))
         if not _plausible(guess.matrix):
@@ -213,13 +218,13 @@ def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried
 
 
 def _beyond_doubt(found: Registration) -> bool:
-    """Proven by its matches, and without the turn or inversion by which a crystal lattice fits itself."""
+    """Whether the matches are conclusive, without a rotation or inversion under which a crystal lattice fits itself."""
     return _conclusive(found.inliers, found.matches) and not found.inverted and _turn(found.matrix) <= LARGEST_TURN
 
 
 def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
-    """The transform moved by shifts at which a crystal lattice fits about as well: the eight after which the frame's middle has
-    moved least; none in other scenes."""
+    """Shift the transform to the other correlation peaks of a crystal lattice: the eight with the smallest displacement of the
+    frame's centre; none for other scenes."""
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
@@ -236,17 +241,21 @@ def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
 
 
 def _better(short: Image, long: Image, first: Registration, second: Registration) -> Registration:
-    """The one that keeps the contrast, since a crystal lattice moved by half a period may be its own negative; else the
-    likelier one where both cover the short frame; else, within the likelihood's scatter, the one that covers more."""
+    """Select one of two registrations.
+
+    If only one preserves the contrast, it is selected: shifted by half a period, a crystal lattice may equal its negative.
+    Otherwise the one with the higher likelihood on the common area is selected; within the statistical error of the likelihood,
+    the one that covers more.
+    """
     if first.inverted != second.inverted:
         return second if first.inverted else first
     masks = [covered(one.matrix, short.shape) for one in (first, second)]
     both = masks[0] & masks[1]
     if not both.any():
         return max(first, second, key=lambda one: one.peak)
-    # both are smoothed: a crystal lattice of less contrast than its shading would fit better in a brighter place
+    # smooth both, or a crystal lattice with less contrast than its shading would fit better in a brighter region
     short, long = (ndimage.gaussian_filter(image, 1.0) for image in (short, long))
-    independent = float(both.sum()) / (4 * np.pi)  # pixels, as many as that filter leaves
+    independent = float(both.sum()) / (4 * np.pi)  # number of independent pixels after the filter
     gain = (_information(short, long, second.matrix, both) - _information(short, long, first.matrix, both)) / (
         4 * np.pi
     )
@@ -256,13 +265,13 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
 
 
 def _plausible(matrix: Image) -> bool:
-    """No mirror, and no magnification or shear beyond what drift, or two camera settings, explain."""
+    """Whether a transform has no reflection, and no magnification or shear beyond that of drift or two camera settings."""
     singular = np.linalg.svd(matrix[:, :2], compute_uv=False)
     return bool(np.linalg.det(matrix[:, :2]) > 0 and singular[0] < 1.3 and singular[1] > 0.75)
 
 
 def _turn(matrix: Image, reference: Image | None = None) -> float:
-    """Largest relative displacement between two transforms, other than a shift; the reference is no transform by default."""
+    """Largest relative displacement between two transforms apart from a shift; the default reference is the identity."""
     reference = np.eye(2, 3) if reference is None else reference
     return float(np.linalg.norm(matrix[:, :2] - reference[:, :2], 2))
 
@@ -272,11 +281,10 @@ def _conclusive(inliers: int, matches: int) -> bool:
 
 
 def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
-    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation between
-    unrelated frames.
+    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation for unrelated frames.
 
-    The latter is Bartlett's: the root of the sum, over all shifts, of the product of the two frames' autocorrelations,
-    over the number of pixels. By Parseval's theorem that sum is the one of the squared cross-correlation.
+    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
+    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation.
     """
     mask = covered(matrix, short.shape)
     bands = (band_pass(image, blur) for image in (short, _interpolated(long, matrix)))
@@ -287,7 +295,7 @@ def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> 
 
 
 def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
-    """Refine a guess with each motion, keep the best by the information criterion, and check it; None if it fails."""
+    """Refine a guess with each motion, select one by the Bayesian information criterion, and check it; None if rejected."""
     sign = 1.0 if correlation_at(short, long, guess.matrix, blur=2.0)[0] >= 0 else -1.0
     found: dict[Motion, Image] = {}
     for motion in MOTIONS:
@@ -297,7 +305,9 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not found:
         return None
     mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
-    smooth = ndimage.gaussian_filter(long, 1.0)  # or the motion whose interpolation smooths more would win
+    smooth = ndimage.gaussian_filter(
+        long, 1.0
+    )  # otherwise the motion whose interpolation smooths more would be preferred
     motion = max(
         found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
@@ -312,7 +322,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not proven or error > LARGEST_ERROR or _turn(matrix, guess.matrix) > LARGEST_TURN:
         return None
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
-        return None  # turned or magnified, any crystal lattice fits another
+        return None  # with rotation or magnification, any crystal lattice fits another
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
     return Registration(
         matrix,
@@ -328,7 +338,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
 
 
 def _restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
-    """The transform of this motion that moves the frame's middle as `matrix` does."""
+    """Return the transform of this motion that displaces the frame's centre as `matrix` does."""
     centre = (np.array(shape[::-1]) - 1) / 2
     target = matrix[:, :2] @ centre + matrix[:, 2]
     left, _, right = np.linalg.svd(matrix[:, :2])
@@ -337,7 +347,7 @@ def _restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
 
 
 def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motion) -> Image | None:
-    """Refine a transform by the enhanced correlation coefficient, coarse then fine; None where it diverges."""
+    """Refine a transform by the enhanced correlation coefficient, coarse then fine; None if it diverges."""
     import cv2
 
     kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
@@ -345,29 +355,28 @@ def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motio
     ]
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
-    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # what a guess may be off by
+    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels
     for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
         try:
             _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type: ignore[call-overload]
-        except cv2.error:  # its way of saying that the iteration does not converge
+        except cv2.error:  # raised if the iteration does not converge
             moved = np.full_like(matrix, np.inf)
         if np.linalg.norm((moved - start) @ centre) <= reach:
             matrix = np.asarray(moved, float)
-        elif blur == 5:  # the coarse step may miss, as it cannot see a fine crystal lattice; this one may not
+        elif blur == 5:  # the coarse step may fail, because it blurs a fine crystal lattice away
             return None
     return matrix
 
 
 def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool_]) -> float:
-    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one,
-    nats."""
+    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one, nats."""
     coefficient = np.corrcoef(short[mask], _interpolated(long, matrix)[mask])[0, 1]
     return float(-mask.sum() * np.log1p(-(coefficient**2)))
 
 
 def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) -> float:
-    """Rms displacement error over the frame, pixels, by the Cramer-Rao bound at the observed residual variance."""
+    """Rms displacement error over the frame, pixels, from the Cramér–Rao bound at the observed residual variance."""
     mask = covered(matrix, short.shape)
     smooth = ndimage.gaussian_filter(_interpolated(long, matrix), 1.0)
     slope, offset = np.polyfit(smooth[mask], short[mask], 1)

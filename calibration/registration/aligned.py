@@ -1,4 +1,4 @@
-"""Observation and signal, pixel by pixel: what an exposure pair or a burst becomes before anything is fitted."""
+"""Aligned pairs: observation and signal of each pixel, from an exposure pair or a burst."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from calibration.registration.align import Registration, register
 from noiseflow.described import described
 
 LARGEST_SHARE = 0.5
-"""Share of the residual's variance above which the 'long' exposure is the noisier of the two."""
+"""Largest share of the residual variance due to the noise of the long exposure; above it, the exposures are probably swapped."""
 
 LARGEST_RATIO_ERROR = 0.25
-"""Departure, in the logarithm, of the exposures' scale from their ratio that a change of dose may explain."""
+"""Largest difference in the logarithm between the fitted and the given exposure ratio that a change of dose can explain."""
 
 MINIMUM_PIXELS = 500
-"""Pixels below which a noise model cannot be distinguished from another."""
+"""Fewest pixels with which noise models can be distinguished."""
 
 
 @described(short="counts", long="as recorded", signal="counts")
 @dataclass(frozen=True)
 class AlignedPair:
-    """A short exposure, untouched, and the signal of each of its pixels, from the registered long one.
+    """An unmodified short exposure and the signal of each of its pixels, estimated from the registered long exposure.
 
     Attributes:
         short: (y, x) counts.
         long: (y, x) as recorded.
-        signal: (y, x) the long exposure warped and scaled onto it, counts.
-        mask: (y, x) pixels to trust.
-        registration: how the long exposure was warped.
-        scaling: how it was scaled.
-        total_variance: of short − signal, as a line in the signal.
-        signal_variance: the part of it that is the signal's own noise.
-        counts: the pixels left out.
-        exposure_ratio: as given; None if unknown.
-        frames: of the burst whose mean is the signal; 1 for an exposure pair.
+        signal: (y, x) long exposure, warped and scaled to the short one, counts.
+        mask: (y, x) valid pixels.
+        registration: transform of the long exposure.
+        scaling: scaling of the long exposure.
+        total_variance: variance of short − signal, as a line in the signal.
+        signal_variance: the part of it due to the noise of the signal estimate.
+        counts: numbers of excluded pixels.
+        exposure_ratio: given exposure ratio; None if unknown.
+        frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -66,34 +66,34 @@ class AlignedPair:
 
     @property
     def observation(self) -> Image:
-        """(y, x) the short exposure with its scatter about the signal shrunk to the short exposure's own."""
+        """(y, x) short exposure, with its deviation from the signal scaled to the noise of the short exposure alone."""
         return self.signal + np.sqrt(1 - self.share) * (self.short - self.signal)
 
     @property
     def one_setting(self) -> bool:
-        """Whether one detector setting took both exposures: a ratio was given, and their scale agrees with it."""
+        """Whether both exposures were recorded at one detector setting: the fitted ratio agrees with the given one."""
         if self.exposure_ratio is None or self.scaling.slope <= 0:
             return False
         return bool(abs(np.log(self.scaling.slope * self.exposure_ratio)) < LARGEST_RATIO_ERROR)
 
     @property
     def share(self) -> Image:
-        """(y, x) fraction of the residual's variance that is the signal's own noise."""
+        """(y, x) fraction of the residual variance due to the noise of the signal estimate."""
         return share_of(self.signal_variance, self.total_variance, self.signal)
 
 
 def share_of(part: VarianceLine, total: VarianceLine, signal: Image) -> Image:
-    """Ratio of two variance lines at each signal, within [0, 0.9]; 0.9 where the part is all there is, 0 where there is none."""
+    """Ratio of two variance lines at each signal, limited to [0, 0.9]."""
     own, whole = np.maximum(part(signal), 0.0), total(signal)
     return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
 
 
 def align_pair(pair: ExposurePair) -> AlignedPair:
-    """Register a pair, warp the long exposure onto the short one, and bring both to one scale.
+    """Register a pair, and warp and scale the long exposure to the short one.
 
     Raises:
-        ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier
-            one, or it is a copy of the short one.
+        ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier one, or it
+            is a copy of the short one.
 
     Example:
         >>> import calibration, noiseflow, pathlib
@@ -108,13 +108,13 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
 
 
 def _saturated_alike(short: Image, long: Image) -> Image:
-    """The short exposure cut off at the brightness at which the long one saturates: edges that only one shows would mislead."""
+    """Clip the short exposure where the long one saturates; edges visible in only one frame would bias the registration."""
     share = float(np.mean(saturated(long)))
     return np.minimum(short, np.quantile(short, 1 - share)) if share else short
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
-    """Warp and scale a pair whose transform is known already. Raises as `align_pair`.
+    """Warp and scale a pair whose transform is known; raises the errors of `align_pair`.
 
     Example:
         >>> import calibration, numpy as np
@@ -129,7 +129,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = (hot | dead | saturated(pair.long)).astype(float)
-    reached, _ = registration.warp(bad)  # a bad pixel spoils all that its interpolation reaches
+    reached, _ = registration.warp(bad)  # a bad pixel affects all pixels within reach of the interpolation
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted, inner=0, blur=1.5)
@@ -157,16 +157,16 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
 def block_split(
     shape: tuple[int, ...], generator: np.random.Generator, *, block: int = 8, fraction: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Choose whole blocks of pixels to judge a model by, so that neighbours do not leak from fit to judgement.
+    """Hold out whole blocks of pixels, so that correlated neighbours do not leak from the fit to the evaluation.
 
     Args:
         shape: (y, x) of the frame.
-        generator: source of the choice.
+        generator: random generator.
         block: side of a block, pixels.
-        fraction: of the blocks to keep apart.
+        fraction: fraction of the blocks to hold out.
 
     Returns:
-        (y, x) mask of the pixels kept apart.
+        (y, x) mask of the held-out pixels.
     """
     rows, columns = (-(-n // block) for n in shape)
     number = rows * columns
@@ -179,13 +179,13 @@ def block_split(
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
     if mask.sum() < MINIMUM_PIXELS:
         raise ValueError(
-            f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the rest are saturated, defective "
-            f"or not in {pair.long_name}: give exposures that overlap more, or that are not saturated"
+            f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the others are saturated, defective "
+            f"or outside {pair.long_name}: use exposures with more overlap, or without saturation"
         )
 
 
 def _require_separate(pair: ExposurePair, long: Image, trusted: Mask) -> None:
-    """Frames that differ by a scale and an offset alone have no noise between them."""
+    """Reject exposures that differ only by a scale and an offset: there is no noise between them."""
     correlation = float(np.corrcoef(pair.short[trusted], long[trusted])[0, 1])
     if 1 - correlation**2 < 1e-9:
         raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")

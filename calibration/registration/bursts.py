@@ -1,4 +1,4 @@
-"""Bursts of equal exposures: drift and dose found, and every frame set beside the mean of the others."""
+"""Bursts of equal exposures: measure drift and dose, and compare every frame with the mean of the others."""
 
 from __future__ import annotations
 
@@ -16,28 +16,27 @@ from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
 LEAST_DRIFT = 0.1
-"""Pixels below which a burst counts as still: warping would cost more than it mends."""
+"""Drift below which a burst is not warped, pixels: interpolation would do more harm than good."""
 
 LARGEST_CHANGE = 0.05
-"""Share of the pixels that may lie in places which change."""
+"""Largest share of pixels in regions that change between frames."""
 
 LEAST_DOSE_CHANGE = 0.005
-"""Relative dose change below which a burst counts as steady."""
+"""Relative dose change below which the dose counts as constant."""
 
 
 @described(shift="px", drift="px", dose="of the mean", dose_error="of the mean")
 @dataclass(frozen=True)
 class BurstReport:
-    """What moved or faded along a burst.
+    """Drift and dose along a burst.
 
     Attributes:
-        shift: (frame, 2) displacement (x, y) of each frame from the mean, pixels; NaN where the scene has too few
-            features to tell.
-        drift: largest distance between two frames, pixels; NaN if unknown.
+        shift: (frame, 2) displacement (x, y) of each frame from the mean, pixels; NaN if the scene has too few features.
+        drift: largest displacement between two frames, pixels; NaN if unknown.
         dose: (frame,) dose of each frame relative to the mean.
-        dose_error: (frame,) standard errors.
-        drifting: the frames were registered before they were compared.
-        fading: the dose changes by more than its errors and `LEAST_DOSE_CHANGE`.
+        dose_error: (frame,) standard errors of `dose`.
+        drifting: whether the frames were registered before they were compared.
+        fading: whether the dose changes by more than its errors and `LEAST_DOSE_CHANGE`.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -58,19 +57,19 @@ class BurstReport:
 
 
 def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
-    """Set every frame beside the mean of the others, which are warped onto it if the burst drifts.
+    """Pair every frame with the mean of the others, which are warped onto it if the burst drifts.
 
-    The mean of n − 1 frames is noisy itself, so that the difference scatters n/(n − 1) times as much as the frame.
-    Each pair's `observation` is shrunk by that factor.
+    The mean of n − 1 frames is noisy too, so the variance of the difference is n/(n − 1) times that of the frame. The
+    `observation` of each pair is corrected for this factor.
 
     Args:
-        burst: two equal exposures or more.
+        burst: at least two equal exposures.
 
     Returns:
-        One pair per frame, and what moved or faded.
+        One pair per frame, and the drift and dose of the burst.
 
     Raises:
-        ValueError: too few pixels can be trusted.
+        ValueError: too few pixels are valid, or the scene changes between frames.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -84,13 +83,12 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     frames = burst.frames
     hot, dead = defects(frames)
     trusted = ~(hot | dead | np.any([saturated(frame) for frame in frames], axis=0))
-    if (
-        trusted.any()
-    ):  # a choice by single readings would cut their noise; their mean tells nothing of their differences
+    # select by the mean: a selection by single pixel values would truncate their noise
+    if trusted.any():
         trusted &= clear_of_rails(frames[0], frames.mean(0), trusted, upper_only=True)
     if trusted.sum() < MINIMUM_PIXELS:
         raise ValueError(
-            f"only {int(trusted.sum())} pixels of {burst.name} can be used; give frames that are not saturated"
+            f"only {int(trusted.sum())} pixels of {burst.name} can be used; use frames that are not saturated"
         )
     registrations = _registrations(frames)
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
@@ -98,7 +96,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     references, moving = _compared(frames, np.zeros_like(shift), trusted)
     if drifting:
         moved, moving_then = _compared(frames, shift, trusted)
-        drifting = bool(moving_then.sum() <= moving.sum())  # else what changes in the scene looked like a drift
+        drifting = bool(moving_then.sum() <= moving.sum())  # otherwise a change of the scene was mistaken for drift
         references, moving = (moved, moving_then) if drifting else (references, moving)
     _require_still(moving, trusted, burst.name)
     pairs = []
@@ -114,8 +112,8 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
 
 
 def _registrations(frames: Image) -> list[Registration | None]:
-    """Where each frame lies in the mean of the others; all None where the first, the middle and the last one find nothing to
-    register by, as flats and faint scenes."""
+    """Register each frame to the mean of the others; all None if the first, middle and last frames cannot be registered, as for
+    flats and faint scenes."""
     probes = {index: _registered(frames, index) for index in (0, len(frames) // 2, len(frames) - 1)}
     if not any(probes.values()):
         return [None] * len(frames)
@@ -123,7 +121,7 @@ def _registrations(frames: Image) -> list[Registration | None]:
 
 
 def _registered(frames: Image, index: int) -> Registration | None:
-    """Where a frame lies in the mean of the others; None where the scene has nothing to register by."""
+    """Register a frame to the mean of the others; None if the scene has too few features."""
     others = (frames.sum(0) - frames[index]) / (len(frames) - 1)
     try:
         return register(frames[index], others)
@@ -142,7 +140,7 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
 
 
 def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Image, Mask]], Mask]:
-    """The mean of the others, moved onto each frame, with what it covers; and where the scene changes between frames."""
+    """Return the mean of the others warped onto each frame with the mask it covers, and the mask of regions that change."""
     references = [_others_on(frames, shift, index) for index in range(len(frames))]
     covered = np.logical_and.reduce([mask for _, mask in references]) & trusted
     residual = np.stack(
@@ -152,7 +150,7 @@ def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Im
 
 
 def _residual(frame: Image, others: Image, mask: Mask) -> Image:
-    """A frame less the mean of the others at the frame's own dose."""
+    """Subtract the mean of the others, scaled to the frame's dose, from a frame."""
     first, second = (ndimage.gaussian_filter(image, 2.0)[mask] for image in (frame, others))
     slope = np.cov(first, second)[0, 1] / max(np.var(second), np.finfo(float).tiny)
     if np.std(second) < 0.1 * np.std((frame - others)[mask]):  # a flat scene has no slope
@@ -165,15 +163,15 @@ def _require_still(moving: Mask, trusted: Mask, name: str) -> None:
     if share > LARGEST_CHANGE:
         raise ValueError(
             f"{name}: the scene changes between frames at {share:.0%} of its pixels (blinking, moving or bleaching objects), "
-            "so that its change passes for noise; give frames of a scene that stands still, or crop to a part that does"
+            "and the change would be counted as noise; use frames of a static scene, or crop to a static part"
         )
 
 
 def _others_on(frames: Image, shift: Image, index: int) -> tuple[Image, Mask]:
-    """Mean of the other frames, each moved onto frame `index`, and the pixels that all of them cover.
+    """Mean of the other frames, each shifted onto frame `index`, and the mask of pixels that all of them cover.
 
-    The mean of the others lies at minus 1/(n − 1) of the frame's own displacement, so that the shift found against it is
-    n/(n − 1) times the displacement from the mean of all.
+    The mean of the others is displaced by −1/(n − 1) times the frame's own displacement, so the shift measured against it is
+    n/(n − 1) times the displacement from the mean of all frames.
     """
     if not shift.any():
         return (frames.sum(0) - frames[index]) / (len(frames) - 1), np.ones(frames[0].shape, bool)

@@ -1,4 +1,4 @@
-"""First guesses of the transform between two frames: matched features, and correlation where there are none."""
+"""Initial guesses of the transform between two frames, from matched features or from cross-correlation."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from calibration.exposures.frames import Image
 Method = Literal["sift", "phase correlation"]
 
 RATIO = 0.8
-"""Lowe's ratio test: a match must be this much nearer than the next best (doi:10.1023/B:VISI.0000029664.99615.94)."""
+"""Largest ratio of the distances to the best and the second-best match (Lowe, doi:10.1023/B:VISI.0000029664.99615.94)."""
 
 INLIER_DISTANCE = 2.0
-"""Pixels within which a match agrees with a transform."""
+"""Largest distance between a match and the transform it agrees with, pixels."""
 
 INVERTED = 0.8
-"""Weight of negative correlation: a crystal lattice moved by half a period resembles its negative, which is rarer than a move."""
+"""Weight of a negative correlation: a crystal lattice shifted by half a period resembles its negative; a shift is likelier."""
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A transform to refine: (x, y) of the short frame -> (x, y) of the long one.
+    """An initial transform: (x, y) in the short frame -> (x, y) in the long one.
 
     Attributes:
-        matrix: (2, 3) in pixels.
-        method: where it came from.
-        points: (inlier, 2, 2): [:, 0] in the short, [:, 1] in the long frame; none without features.
-        matches: number of matches before the consensus.
+        matrix: (2, 3) matrix, pixels.
+        method: method that produced it.
+        points: (inlier, 2, 2) matched points (x, y): [:, 0] in the short, [:, 1] in the long frame; empty without features.
+        matches: number of matches before RANSAC.
     """
 
     matrix: Image
@@ -42,22 +42,21 @@ class Guess:
 
 
 def feature_guesses(short: Image, long: Image) -> Iterator[Guess]:
-    """Guesses from SIFT and RANSAC, from the least smoothing that may do to the most, the most likely ones first.
+    """Yield guesses from SIFT and RANSAC at increasing smoothing.
 
-    The smoothed, stretched 8-bit copies serve the matching only.
+    The smoothed 8-bit copies of the frames are used only for matching.
     """
     for blur in (1.0, 2.0, 4.0):
         yield from _guesses_at(short, long, blur)
 
 
 def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0) -> Iterator[Guess]:
-    """Guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without
-    features.
+    """Yield guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without features.
 
     Args:
         short: (y, x).
         long: (y, x).
-        largest_angle: degrees searched either way, in steps that move the frame's edge by about a pixel and a half.
+        largest_angle: search range ± degrees, in steps that move the frame's edge by about 1.5 pixels.
 
     Yields:
         The best guess for the finest and for a coarser band.
@@ -72,8 +71,11 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
 
 
 def band_pass(image: Image, blur: float) -> Image:
-    """Remove noise finer than `blur` pixels and shading coarser than eight times that, or than a tenth of the frame; mean 0,
-    standard deviation 1."""
+    """Band-pass an image and standardise it to mean 0 and standard deviation 1.
+
+    The filter removes noise finer than `blur` pixels, and shading coarser than eight times `blur` or `blur` plus a tenth of the
+    frame, whichever is smaller.
+    """
     shading = min(8 * blur, blur + 0.1 * min(image.shape))
     band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, shading)
     band = np.clip(band, *np.percentile(band, (0.05, 99.95)))
@@ -81,17 +83,17 @@ def band_pass(image: Image, blur: float) -> Image:
 
 
 def correlation_surface(first: Image, second: Image) -> Image:
-    """Correlation of two frames at every shift, times the root of their overlap.
+    """Correlation of two frames at every shift, times the square root of their overlap.
 
-    The root makes unrelated frames scatter alike at all shifts, and of the equal peaks of a crystal lattice it favours the
-    smallest shift. Shifts that leave less than a quarter of the frame are set to 0.
+    With this factor the values of unrelated frames have equal variance at all shifts, and the smallest shift is favoured among
+    the equal peaks of a crystal lattice. Shifts with an overlap of less than a quarter of the frame are set to 0.
 
     Args:
         first: (y, x) of mean 0 and standard deviation 1.
         second: (y, x) of mean 0 and standard deviation 1.
 
     Returns:
-        (2y, 2x) or somewhat larger: value d is that of first(p)·second(p + d), with d = 0 at [0, 0].
+        (2y, 2x) or somewhat larger: the value at shift d is that of first(p)·second(p + d), with d = 0 at [0, 0].
     """
     overlap = cross_correlation(np.ones(first.shape), np.ones(first.shape))
     enough = overlap > 0.25 * first.size
@@ -99,14 +101,14 @@ def correlation_surface(first: Image, second: Image) -> Image:
 
 
 def cross_correlation(first: Image, second: Image) -> Image:
-    """Sums of products at every shift, without wrapping round; shapes as `correlation_surface`."""
+    """Linear (not circular) cross-correlation: sums of products at every shift; shapes as in `correlation_surface`."""
     shape = [fft.next_fast_len(2 * n, real=True) for n in first.shape]
     product = np.conj(fft.rfft2(first, shape)) * fft.rfft2(second, shape)
     return np.asarray(fft.irfft2(product, shape))
 
 
 def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
-    """The (2, 3) matrix that turns (x, y) by `angle` degrees about the middle of a frame."""
+    """Return the (2, 3) matrix that rotates (x, y) by `angle` degrees about the centre of a frame."""
     theta = np.radians(angle)
     rotation = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     centre = (np.array(shape[::-1]) - 1) / 2
@@ -131,7 +133,7 @@ def _guesses_at(short: Image, long: Image, blur: float) -> Iterator[Guess]:
 
 
 def _consensus(points: Image) -> Guess | None:
-    """RANSAC for the transform most matches agree with; None where too few do."""
+    """Fit a similarity transform to the matches by RANSAC; None if too few agree."""
     import cv2
 
     if len(points) < 4:
@@ -153,7 +155,7 @@ def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
 
 
 def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image]:
-    """Height of the correlation's highest peak when `second` is turned back by `angle`, and its matrix."""
+    """Height of the highest correlation peak after rotating `second` back by `angle` degrees, and its (2, 3) matrix."""
     import cv2
 
     turn = about_centre(angle, first.shape)
@@ -177,7 +179,7 @@ def _binned(image: Image, factor: int) -> Image:
 
 
 def _scaled(matrix: Image, factor: int) -> Image:
-    """The same transform in pixels `factor` times smaller (pixel centres at whole numbers in both)."""
+    """Convert a transform to pixels `factor` times smaller (pixel centres at integers in both)."""
     middle = (factor - 1) / 2
     linear = matrix[:, :2]
     return np.column_stack([linear, factor * matrix[:, 2] + middle - linear @ np.array([middle, middle])])

@@ -1,4 +1,4 @@
-from .page import LABELS as LABELS
+from .figures import LABELS as LABELS
 from .page import LARGEST_MISALIGNMENT as LARGEST_MISALIGNMENT
 from .page import LEAST_DIVERGENCE as LEAST_DIVERGENCE
 from .page import TABLE_HEADER as TABLE_HEADER

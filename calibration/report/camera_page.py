@@ -1,4 +1,4 @@
-"""The report of a camera calibrated from flats and darks."""
+"""HTML report of a camera calibrated from flats and darks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.camera import Camera, rows_of
-from calibration.report.figures import correlation_figure
+from calibration.report.figures import correlation_figure, plain_log_ticks
 from noiseflow.io import output_folder
 from noiseflow.report import Report, new_figure, provenance, show_image
 
@@ -17,28 +17,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_LISTED = 50
-"""Defective pixels that the report lists."""
+"""Largest number of defective pixels listed in the report."""
 
 
 def describe_camera_verdict(camera: Camera) -> list[str]:
-    """The grade and its reasons, a sentence each."""
+    """Return the grade and its reasons, one string each."""
     grade = camera.verdict.grade
     if grade == "good":
-        return ["Verdict: good. You can trust the figures within their intervals; every assumption passed its test."]
-    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Read the figures with these reservations:"
+        return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
+    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
     return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.reasons)]
 
 
 def write_camera_report(
     folder: str | Path, camera: Camera, *, inputs: Sequence[str | Path] = (), seed: int | None = None
 ) -> Path:
-    """Write ``report.html`` into a folder, which is made if need be; returns its path.
+    """Write ``report.html`` to a folder, which is created if necessary, and return its path.
 
     Args:
-        folder: where to write.
-        camera: what to report.
-        inputs: files that were read, for their checksums.
-        seed: of the random choices.
+        folder: output folder.
+        camera: the calibrated camera.
+        inputs: input files; the report lists their checksums.
+        seed: random seed to report.
     """
     page = Report("Camera calibration (EMVA 1288)")
     page.facts(
@@ -50,13 +50,15 @@ def write_camera_report(
     page.heading("Figures")
     page.table(("figure", "value"), rows_of(camera), prose=True)
     page.figure(
-        transfer_figure(camera), caption="Photon transfer with its residual, and the signal-to-noise ratio of a pixel."
+        transfer_figure(camera),
+        caption="Photon transfer: variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
     )
     page.figure(
-        correlation_figure(camera.figures.correlation), caption="Correlation of neighbouring pixels' temporal noise."
+        correlation_figure(camera.figures.correlation),
+        caption="Correlation of the temporal noise between pixels; independent pixels have zero correlation.",
     )
-    page.heading("Pixels")
-    page.figure(map_figure(camera), caption="Maps of the pixels, between their 0.5th and 99.5th percentiles.")
+    page.heading("Per-pixel maps")
+    page.figure(map_figure(camera), caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
         caption = f"The first {min(len(defects), MOST_LISTED)} of {len(defects)} defective pixels."
@@ -66,13 +68,13 @@ def write_camera_report(
         ]
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance")
-    page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
+    page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")
 
 
 def transfer_figure(camera: Camera) -> Figure:
-    """Variance against mean with the line, its residual, and signal-to-noise ratio against electrons."""
+    """Draw variance against mean with the fitted line, its residual, and signal-to-noise ratio against electrons."""
     figures = camera.figures
     points = [*([figures.dark] if figures.dark else []), *figures.levels]
     mean, variance, error = (
@@ -85,10 +87,10 @@ def transfer_figure(camera: Camera) -> Figure:
     style = {"fmt": "o", "markersize": 3, "linewidth": 1, "color": "0.3"}
     axes[0, 0].errorbar(mean, variance, error, **style)
     axes[0, 0].plot(mean, expected, linewidth=1)
-    axes[0, 0].set_ylabel("variance over time, counts²")
+    axes[0, 0].set_ylabel("temporal variance, counts²")
     axes[0, 1].errorbar(mean, 100 * (variance / expected - 1), 100 * error / expected, **style)
     axes[0, 1].axhline(0, color="0.5", linewidth=0.8)
-    axes[0, 1].set_ylabel("departure from the line, %")
+    axes[0, 1].set_ylabel("deviation from the line, %")
     for axis in axes[0, :2]:
         axis.set_xlabel("mean, counts")
     electrons = np.maximum(mean - (figures.offset or 0.0), 1e-9) / slope
@@ -96,13 +98,14 @@ def transfer_figure(camera: Camera) -> Figure:
     axes[0, 2].loglog(
         electrons[used], (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used], "o-", markersize=3
     )
+    plain_log_ticks(axes[0, 2])
     axes[0, 2].set_xlabel("electrons per pixel")
     axes[0, 2].set_ylabel("signal-to-noise ratio")
     return figure
 
 
 def map_figure(camera: Camera) -> Figure:
-    """Offset, variance and response of every pixel."""
+    """Draw the maps of offset, dark variance and response."""
     names = [name for name in ("offset", "variance", "response") if name in camera.maps]
     figure, axes = new_figure(len(names), width=4.2 * len(names), height=3.8)
     units = {"offset": "offset, counts", "variance": "dark variance, counts²", "response": "relative response"}

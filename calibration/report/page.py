@@ -1,4 +1,4 @@
-"""The calibration's page: was the pair registered, which noise model fits, and a verdict in words."""
+"""HTML report of a calibration: verdict, detector, noise models and registration."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
 from calibration.report.figures import (
+    LABELS,
     corner_figure,
     correlation_figure,
     histogram_figure,
@@ -28,35 +29,21 @@ from noiseflow.io import output_folder
 from noiseflow.report import Report, provenance
 
 LARGEST_MISALIGNMENT = 0.1
-"""Pixels of registration error that leave no trace in the residuals."""
+"""Largest registration error without visible residuals, pixels."""
 
-UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; dark frames would fix it."
+UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
 
 LEAST_DIVERGENCE = 5e-4
-"""Jensen-Shannon divergence, nats, that no eye sees; many pixels make it exceed its floor all the same."""
-
-LABELS = {
-    "gaussian": "Gaussian, one width",
-    "poisson": "Poisson",
-    "poisson-gaussian": "Poisson-Gaussian",
-    "counting": "counter with dead time",
-    "excess-noise": "Poisson-Gaussian with excess noise",
-    "signal-gaussian": "Gaussian, width by signal",
-    "mixture": "mixture of Gaussians",
-    "flow": "radial flow",
-    "spline": "spline flow",
-    "physics-flow": "Poisson-Gaussian corrected by a flow",
-}
-"""How the report calls the models."""
+"""Negligible Jensen-Shannon divergence, nats; with many pixels it may still exceed its floor."""
 
 TABLE_HEADER = (
     *("model", "held-out NLL", "± s.e.", "above best", "± s.e."),
-    *("JSD", "floor", "1 − BC", "floor", "distance", "floor", "JSD by signal", "floor"),
+    *("JSD", "floor", "1 − BC", "floor", "BD", "floor", "JSD by signal", "floor"),
 )
 
 
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
-    """The figures of each model as text; divergences in units of 10⁻⁴."""
+    """Return the scores of each model as text; divergences in units of 10⁻⁴."""
     return [_row(score) for score in scores]
 
 
@@ -71,7 +58,7 @@ def _row(score: ModelScore) -> list[str]:
 
 
 def verdict(scores: Sequence[ModelScore]) -> str:
-    """One or two sentences: which model suffices, and by how much the others fail."""
+    """Describe which model suffices, and how much worse the next simpler one is."""
     chosen = simplest_sufficient(scores)
     simpler = [score for score in scores[: list(scores).index(chosen)] if np.isfinite(score.excess)]
     text = (
@@ -81,25 +68,25 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     if simpler:
         nearest = min(simpler, key=lambda score: score.excess)
         text += (
-            f" The nearest simpler one, {LABELS[nearest.name]}, loses {nearest.excess:.4f} ± "
+            f" The best simpler model, {LABELS[nearest.name]}, is worse by {nearest.excess:.4f} ± "
             f"{nearest.excess_error:.4f} nats per pixel."
         )
     overall = chosen.evaluation.overall
     if overall.jsd > max(3 * overall.jsd_floor, LEAST_DIVERGENCE):
         text += (
             f" However, its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
-            "finite-sample floor: look at the histograms before you use it."
+            "finite-sample floor: check the histograms before you use it."
         )
     return text
 
 
 def describe_figures(figures: Figures) -> str:
-    """Gain, offset and read noise with their 90 % intervals, and what they rest on."""
+    """Describe gain, offset and read noise with their 90 % intervals, and the method that gave them."""
     parts = [f"{name} {_interval(value, unit)}" for name, unit, value in _named(figures)]
-    source = "the posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
-    corrected = f", variance times {figures.factor:.3g} for the correlation of pixels" if figures.factor != 1 else ""
+    source = "posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
+    corrected = f"; variance multiplied by {figures.factor:.3g} for pixel correlation" if figures.factor != 1 else ""
     per_count = f"1 count = {1 / figures.gain.median:.4g} e⁻"
-    return f"{', '.join(parts)} ({per_count}). By {source}{corrected}."
+    return f"{', '.join(parts)} ({per_count}). Method: {source}{corrected}."
 
 
 def _named(figures: Figures) -> list[tuple[str, str, Interval | None]]:
@@ -117,7 +104,7 @@ def _interval(value: Interval | None, unit: str) -> str:
 
 
 def describe_detector(findings: Findings) -> str:
-    """The figures, what limits them, and how they were sampled."""
+    """Describe the results, their limits and the sampling of the posterior."""
     detector, figures = findings.detector, findings.figures
     if detector is None or figures is None:
         return f"not measured: {findings.no_detector}"
@@ -130,36 +117,36 @@ def describe_detector(findings: Findings) -> str:
 
 
 def describe_burst(burst: BurstReport) -> str:
-    """What moved or faded along a burst, in words."""
+    """Describe drift and dose along a burst."""
     if not np.isfinite(burst.drift):
-        drift = "The scene has too few features to measure a drift."
+        drift = "The scene has too few features to measure drift."
     else:
         drift = f"Largest drift between frames {burst.drift:.2f} px; " + (
-            "the other frames were moved onto each before they were compared."
+            "the other frames were warped onto each frame before the comparison."
             if burst.drifting
-            else "the frames were compared as they are."
+            else "the frames were compared without registration."
         )
     dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
     return drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
 
 
 def describe_registration(pair: AlignedPair) -> str:
-    """The registration's figures in a sentence."""
+    """Describe the registration of a pair."""
     found = pair.registration
     x, y = found.shift(pair.short.shape)
     method = f"SIFT, {found.inliers} of {found.matches} matches" if found.method == "sift" else "phase correlation"
     counts = pair.counts
-    ratio = f"long over short {1 / pair.scaling.slope:.4g} by their scale"
+    ratio = f"fitted exposure ratio {1 / pair.scaling.slope:.4g}"
     if pair.exposure_ratio is not None and not pair.one_setting:
         ratio += (
-            f", not {pair.exposure_ratio:.4g} as given: the two exposures are not unprocessed frames of one detector "
-            "setting, so that their scale does not determine the offset"
+            f", not {pair.exposure_ratio:.4g} as given: the exposures are not unprocessed frames of one detector setting, "
+            "so their ratio does not determine the offset"
         )
     return (
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
-        f"{found.scale:.5f}, standard error {found.error_px:.3f} px, matches' rms {found.rms_px:.2f} px; {ratio}. Left out: "
-        f"{counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
-        f"{counts.dead} dead" + (f", {counts.restless} in places that change." if counts.restless else ".")
+        f"{found.scale:.5f}, standard error {found.error_px:.3f} px, rms of the matches {found.rms_px:.2f} px; {ratio}. "
+        f"Excluded: {counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
+        f"{counts.dead} dead" + (f", {counts.restless} in changing regions." if counts.restless else ".")
     )
 
 
@@ -171,14 +158,14 @@ def write_report(
     inputs: Sequence[str | Path] = (),
     seed: int | None = None,
 ) -> Path:
-    """Write ``report.html`` into a folder, which is made if need be; returns its path.
+    """Write ``report.html`` to a folder, which is created if necessary, and return its path.
 
     Args:
-        folder: where to write.
-        findings: what to tell.
-        title: of the page.
-        inputs: files that were read, for their checksums.
-        seed: of the random choices.
+        folder: output folder.
+        findings: results of the calibration.
+        title: title of the page.
+        inputs: input files; the report lists their checksums.
+        seed: random seed to report.
 
     Example:
         >>> import calibration, noiseflow, pathlib, tempfile, torch
@@ -200,7 +187,7 @@ def write_report(
     _add_models(page, findings)
     _add_registration(page, findings)
     page.heading("Provenance")
-    page.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
+    page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")
 
@@ -210,39 +197,39 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
     if findings.figures is not None:
         for name, unit, value in _named(findings.figures):
             shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
-            facts.append((f"{name[0].upper()}{name[1:]}, {unit}", shown))
+            facts.append((f"{name[0].upper()}{name[1:]}, {unit} (90 % interval)", shown))
     if findings.scores:
         facts.append(("Noise model", LABELS[simplest_sufficient(findings.scores).name]))
     return facts
 
 
 def describe_verdict(findings: Findings) -> list[str]:
-    """The grade and its reasons, a sentence each."""
+    """Return the grade and its reasons, one string each."""
     grade = findings.verdict.grade
     if grade == "good":
         return [
-            "Verdict: good. You can trust gain, offset and read noise within their intervals; every assumption passed its test."
+            "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
         ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
     return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:
-    """What to believe, in words: the detector's parameters, the noise model, the registration."""
+    """Describe the reliability of the detector's parameters, the noise model and the registration."""
     found = describe_verdict(findings)
     if findings.scores:
         found.append(verdict(findings.scores))
     if findings.burst is None and findings.pairs:
         worst = max(pair.registration.error_px for pair in findings.pairs)
         found.append(
-            f"The exposures are registered to {worst:.3f} px"
-            + (", which is too coarse for fine detail: look at the residuals." if worst > LARGEST_MISALIGNMENT else ".")
+            f"The exposures are registered to within {worst:.3f} px"
+            + (", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
     return found
 
 
 def unknown_read_noise(figures: Figures) -> bool:
-    """Whether the exposures leave the read noise open by more than a factor of three."""
+    """Whether the exposures determine the read noise to no better than a factor of three."""
     interval = figures.read_noise
     return interval is None or interval.q95 > 3 * interval.q05
 
@@ -256,26 +243,30 @@ def _add_detector(page: Report, findings: Findings) -> None:
     page.text(words[0].upper() + words[1:])
     page.figure(
         photon_transfer_figure(findings.detector),
-        caption="Photon transfer: variance against signal, and its residual from the line; band: 90 % of the posterior.",
+        caption="Photon transfer: variance against signal (band: 90 % posterior interval), and deviation from the fitted line.",
     )
     if findings.correlation is not None:
         page.figure(
             correlation_figure(findings.correlation),
-            caption="Correlation of the residuals of neighbouring pixels; zero for independent noise.",
+            caption="Correlation of the residuals between pixels; independent noise has zero correlation.",
         )
     if findings.figures is not None and findings.figures.read_noise is not None and findings.figures.offset is not None:
         page.figure(
             snr_figure(findings.figures, float(findings.detector.line.signal.max())),
             caption="Signal-to-noise ratio of one pixel against its number of electrons, with the shot-noise limit.",
         )
-    page.figure(corner_figure(findings.detector), caption="Posterior of gain, offset and read noise.")
+    page.figure(
+        corner_figure(findings.detector),
+        caption="Posterior of gain, offset and read noise: each parameter (diagonal) and each pair.",
+    )
 
 
 def _add_models(page: Report, findings: Findings) -> None:
     page.heading("Noise models")
     caption = (
         "NLL: negative log-likelihood of held-out pixels, nats per pixel; lower is better. JSD (nats), "
-        "1 − BC and Bhattacharyya distance in units of 10⁻⁴; floor: the value that samples of the model itself would reach."
+        "1 − BC (Bhattacharyya coefficient) and BD (Bhattacharyya distance, nats) in units of 10⁻⁴; floor: expected value for "
+        "samples drawn from the model itself."
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
     if findings.pixels is None:
@@ -283,11 +274,11 @@ def _add_models(page: Report, findings: Findings) -> None:
     histograms = histogram_figure(findings.pixels, findings.scores)
     page.figure(
         histograms,
-        caption="Residuals of the held-out pixels at each signal level (grey), with every model on top.",
+        caption="Residuals of the held-out pixels at each signal level (grey), with the density of every model.",
     )
     page.figure(
         pit_figure(findings.scores),
-        caption="Each model on the held-out pixels: histogram of its probability integral transform (PIT), and QQ plot.",
+        caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
     )
 
 
@@ -299,10 +290,11 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(f"Pair {number}: {describe_registration(pair)}")
         page.figure(
             registration_figure(pair),
-            caption="Overlay before and after registration. Magenta: short, green: long; grey where they agree.",
+            caption="Overlay before and after registration: short exposure in magenta, long in green; grey where they agree.",
         )
         page.figure(
-            residual_figure(pair), caption="Residual: map, and row and column profiles. It should have no structure."
+            residual_figure(pair),
+            caption="Residual of the short exposure: map, and row and column means. It should have no structure.",
         )
     if len(findings.pairs) > most:
-        page.text(f"{len(findings.pairs) - most} more pairs are not drawn.")
+        page.text(f"{len(findings.pairs) - most} more pairs are not shown.")

@@ -19,7 +19,7 @@ from .conftest import textured_scene
 
 PARTS = (
     *("Photon transfer", "Posterior of gain", "Residuals of the held-out pixels", "QQ", "PIT", "row and column"),
-    *("before and after registration", "Verdict", "suffices", "are registered to", "excess noise"),
+    *("before and after registration", "Verdict", "suffices", "registered to within", "excess noise"),
 )
 """What a reader of the report must find."""
 
@@ -70,7 +70,7 @@ def run(*arguments: str) -> int:
         ("missing", "long", "does not exist"),
         ("empty", "long", "empty"),
         ("truncated", "long", "damaged or truncated"),
-        ("short", "narrow", "one size"),
+        ("short", "narrow", "sizes must be equal"),
         ("nan", "long", "NaN"),
         ("flat", "long", "flat"),
         ("saturated", "long", "saturated"),
@@ -81,8 +81,8 @@ def run(*arguments: str) -> int:
         ("copy", "short", "identical pixels"),
         ("short", "scaled", "copy"),
         ("short", "elsewhere", "cannot be registered"),
-        ("stack3", "long", "one 2D frame"),
-        ("short", "short", "short and as long"),
+        ("stack3", "long", "single 2D frame"),
+        ("short", "short", "both short and long"),
         ("long", "short", "swap"),
         ("noise", "long", "cannot be registered"),
     ],
@@ -172,7 +172,7 @@ def test_burst_with_dark_frames(folder, capsys, monkeypatch, exposures):
 
 def test_one_frame_alone_is_refused(folder, capsys):
     assert run("--short", f"{folder}/short.tif", "-o", f"{folder}/out/m.safetensors") == 1
-    assert "one frame only" in capsys.readouterr().err
+    assert "only one frame" in capsys.readouterr().err
     assert list((folder / "out").iterdir()) == []
 
 

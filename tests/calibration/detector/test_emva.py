@@ -176,7 +176,7 @@ def test_levels_are_stacks_or_runs_of_equal_single_frames(tmp_path):
         paths.append(tmp_path / f"{number}.tif")
         write(paths[-1], generator.poisson(level, SHAPE).astype(np.uint16))
     assert [len(level.frames) for level in read_levels(paths)] == [2, 2]
-    with pytest.raises(ValueError, match="one frame only"):
+    with pytest.raises(ValueError, match="only one frame"):
         read_levels(paths[:3])
 
 

@@ -20,14 +20,14 @@ def broken(**change):
 @pytest.mark.parametrize(
     ("short", "long", "message"),
     [
-        (GOOD, np.zeros((40, 41)) + np.arange(41), "one size"),
+        (GOOD, np.zeros((40, 41)) + np.arange(41), "sizes must be equal"),
         (broken(nan=True), OTHER, "NaN"),
         (np.full((40, 40), 7.0), OTHER, "flat"),
         (np.full((40, 40), 65535, np.uint16), OTHER, "saturated"),
         (np.where(RANDOM.random((40, 40)) < 0.7, 4095, GOOD), OTHER, "saturated"),
         (np.stack([GOOD] * 3, -1), OTHER, "colour"),
         (np.stack([GOOD] * 3), OTHER, "colour"),
-        (np.stack([GOOD] * 7), OTHER, "one 2D frame"),
+        (np.stack([GOOD] * 7), OTHER, "single 2D frame"),
         (GOOD[:16, :16], OTHER[:16, :16], "at least 32"),
         (GOOD, GOOD, "identical"),
     ],
@@ -51,7 +51,7 @@ def test_saturation_level_is_the_rail_only_where_one_shows():
 
 
 def test_burst_needs_two_different_frames():
-    with pytest.raises(ValueError, match="one frame only"):
+    with pytest.raises(ValueError, match="only one frame"):
         Burst(GOOD[None])
     with pytest.raises(ValueError, match="frames 0 and 1"):
         Burst(np.stack([GOOD, GOOD]))
@@ -67,7 +67,7 @@ def test_pairs_are_read_in_the_order_given(tmp_path):
     assert pairs[0].exposure_ratio == 2
     with pytest.raises(ValueError, match="1 short and 2 long"):
         read_pairs([tmp_path / "a.tif"], [tmp_path / "b.tif", tmp_path / "long.mrc"])
-    with pytest.raises(ValueError, match="short and as long"):
+    with pytest.raises(ValueError, match="both short and long"):
         read_pairs([tmp_path / "a.tif"], [tmp_path / "a.tif"])
 
 
@@ -77,7 +77,7 @@ def test_burst_is_read_from_a_stack_or_from_files(tmp_path):
     write(tmp_path / "b.npy", OTHER)
     stack, files = read_burst([tmp_path / "stack.tif"]), read_burst([tmp_path / "a.npy", tmp_path / "b.npy"])
     np.testing.assert_array_equal(stack.frames, files.frames)
-    with pytest.raises(ValueError, match=r"a\.npy holds one frame only"):
+    with pytest.raises(ValueError, match=r"a\.npy contains only one frame"):
         read_burst([tmp_path / "a.npy"])
-    with pytest.raises(ValueError, match="the dark frames hold one frame only"):
+    with pytest.raises(ValueError, match="the dark frames contain only one frame"):
         read_burst([tmp_path / "a.npy"], name="the dark frames", calibration=True)
