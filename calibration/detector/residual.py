@@ -20,7 +20,7 @@ _LITTLE_NOISE = 0.1
 """Share of the residual's variance that is the signal's own, below which a signal hardly tells its own errors."""
 _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
 """Pixels over which the signal is averaged before it sorts the residuals: as few as its noise allows, for at the same average a
-crest in the dark part of a crystal lattice is noisier than a trough in the bright part."""
+crest in the dark part of a crystal lattice is noisier than a valley in the bright part."""
 CUT = 5.0
 """Standard deviations at which residuals are cut, so that a few defects do not speak for all pixels."""
 
