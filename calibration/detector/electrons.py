@@ -18,7 +18,7 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
 
     Args:
         levels: those of residuals are ignored: the noise of their signals blurs the peaks.
-        gain: counts per electron. Below two rounding steps the peaks cannot be told from the codes.
+        gain: counts per electron. Below two rounding steps the peaks cannot be distinguished from the codes.
     """
     total, count = 0j, 0.0
     for one in levels:

@@ -86,7 +86,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     trusted = ~(hot | dead | np.any([saturated(frame) for frame in frames], axis=0))
     if (
         trusted.any()
-    ):  # a choice by single readings would cut their noise; their mean tells nothing of their differences
+    ):  # a choice by single pixel values would cut their noise; their mean tells nothing of their differences
         trusted &= clear_of_rails(frames[0], frames.mean(0), trusted, upper_only=True)
     if trusted.sum() < MINIMUM_PIXELS:
         raise ValueError(
