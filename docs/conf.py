@@ -24,7 +24,12 @@ extensions = [
 exclude_patterns = ["_build", "examples", "gallery/GALLERY_HEADER.rst", "gallery/generated/index.rst"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.xref_missing", "myst.header", "sphinx_gallery.config"]  # the last: no back references
+suppress_warnings = [
+    "myst.xref_missing",
+    "myst.header",
+    "sphinx_gallery.config",  # no back references
+    "sphinx_gallery.duplicate_filename",  # the programs that an earlier build copied to gallery/generated
+]
 
 autosummary_generate = True
 autodoc_typehints = "description"

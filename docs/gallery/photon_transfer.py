@@ -7,7 +7,7 @@ The photon-transfer curve of a real sCMOS camera: variance against signal. Its s
 .. image:: /images/gallery/photon_transfer.png
    :alt: Variance against signal of a real camera, with a straight line
 
-The gain is about 15 % above that of the maps published with these frames; see :doc:`/guide/limits`.
+The gain is about 15 % above that of the maps published with these frames; see the page *Limits* of the guide.
 """
 
 # sphinx_gallery_thumbnail_path = "images/gallery/photon_transfer.png"

@@ -4,7 +4,7 @@ Which detail is real?
 
 The third picture keeps only the voxels whose 90 % interval does not contain zero. Several true particles keep only their
 core, and faint streaks disappear. Detail that the missing wedge hides also has intervals, but these depend on the
-regulariser alone: :doc:`/benchmarks/uncertainty` shows how often they contain the truth.
+regulariser alone. The benchmark *Error bars: do they contain the truth?* counts how often they do.
 
 .. image:: /images/gallery/which_detail.png
    :alt: A slice, its error bars, the voxels beyond their interval, and the truth

@@ -27,7 +27,8 @@ class Sprites:
         shape: (section, y, x) as stored.
         original: (section, y, x) before downsampling.
         columns, per_sheet: layout of the tiles.
-        low, high: values of the grey levels 0 and 255, detector or volume units.
+        low: value of the grey level 0, detector or volume units.
+        high: value of the grey level 255, detector or volume units.
         lossless: whether the sheets store the 8-bit values exactly.
     """
 
