@@ -83,18 +83,18 @@ calibrate --short {bad}/missing.tif --long {good}/long.tif -o {out}/m.safetensor
 calibrate --short {good}/050ms.tif --long {bad}/cut.tif -o {out}/m.safetensors | cannot be read
 calibrate --short {good}/050ms.tif --long {good}/050ms.tif -o {out}/m.safetensors | two separate exposures
 calibrate --short {good}/050ms.tif --long {good}/clean.mrc -o {out}/m.safetensors | pixels
-calibrate --short {good}/small.mrc --long {good}/small.mrc -o {out}/m.safetensors | short and as long
+calibrate --short {good}/small.mrc --long {good}/small.mrc -o {out}/m.safetensors | as both short and long exposure
 calibrate --short {bad}/saturated.tif --long {good}/long.tif -o {out}/m.safetensors | saturated
 calibrate --short {bad}/colour.tif --long {good}/long.tif -o {out}/m.safetensors | colour
 calibrate --short {bad}/flat2d.npy --long {good}/long.tif -o {out}/m.safetensors | flat
 calibrate --short {bad}/nan2d.npy --long {good}/long.tif -o {out}/m.safetensors | pixels
-calibrate --short {good}/050ms.tif -o {out}/m.safetensors | one frame only
-calibrate --short {good}/050ms.tif --exposure-ratio 3 -o {out}/m.safetensors | without --long
+calibrate --short {good}/050ms.tif -o {out}/m.safetensors | only one frame
+calibrate --short {good}/050ms.tif --exposure-ratio 3 -o {out}/m.safetensors | requires --long
 calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio 0 -o {out}/m.safetensors | above 1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio nan -o {out}/m.safetensors | above 1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --kind magic -o {out}/m.safetensors | magic
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.pt | name the output
-calibrate --short {good}/050ms.tif --long {good}/long.tif --dark {good}/050ms.tif -o {out}/m.safetensors | one frame only
+calibrate --short {good}/050ms.tif --long {good}/long.tif --dark {good}/050ms.tif -o {out}/m.safetensors | only one frame
 calibrate --short {good}/050ms.tif --long {good}/long.tif --report {bad}/empty.mrc -o {out}/m.safetensors | is a file
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.safetensors --device cuda | --device cpu
 simulate {out}/s --size 0 | size

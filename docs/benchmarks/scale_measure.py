@@ -26,7 +26,8 @@ def run(*words: str | Path | int, threads: int) -> tuple[dict[str, Any], dict[st
     """Run a command of noiseflow.
 
     Returns:
-        Seconds, processor seconds and peak memory (GiB) of the process, and what it said.
+        Seconds, processor seconds and peak memory (GiB) of the process, and what it said. The system counts the peak of this
+        process as one of its child's, so that it has to be small.
 
     Raises:
         RuntimeError: it failed; the message is the last line that it wrote.

@@ -136,5 +136,5 @@ def test_command_line_takes_a_preset_or_a_method():
     assert method_of("tv", None) == "tv"
     with pytest.raises(ValueError, match="choose kniesel2022 or kniesel2022-as-published"):
         method_of("auto", "nerf")
-    with pytest.raises(ValueError, match="leave --method tv out"):
+    with pytest.raises(ValueError, match="remove --method tv"):
         method_of("tv", "kniesel2022")
