@@ -288,3 +288,18 @@ def test_a_given_ratio_that_the_exposures_contradict_is_flagged():
     assert "exposure ratio" not in [one.name for one in right.verdict.reasons]
     assert "exposure ratio" in [one.name for one in wrong.verdict.reasons]
     assert wrong.figures.gain.median == pytest.approx(2.0, rel=0.06)
+
+
+def test_the_period_of_a_scene_is_none_of_the_noise():
+    generator = np.random.default_rng(42)
+    mosaic = sim.random_scene(generator) * np.tile([[1.0, 0.6], [0.6, 0.35]], (128, 128))  # of a colour camera
+    found = measured(sim.Case(*(sim.exposed(generator, times * mosaic) for times in (1, sim.RATIO))))
+    assert {one.name for one in found.verdict.reasons} <= {"gain uncertain"}
+
+
+def test_a_pair_of_64_pixels_is_measured_and_only_uncertain():
+    generator = np.random.default_rng(43)
+    scene = sim.random_scene(generator, 64)
+    found = measured(sim.Case(*(sim.exposed(generator, times * scene) for times in (1, sim.RATIO))))
+    assert [one.name for one in found.verdict.reasons] == ["gain uncertain"]
+    assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
