@@ -17,7 +17,7 @@ from calibration.detector.models import KINDS, ModelScore, Pixels, collect_pixel
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.codes import below_joins
-from calibration.exposures.frames import Burst, ExposurePair, Image
+from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
 """``bar(title, total)``: context manager that returns a progress callback."""
+
+WITHIN = 0.999
+"""Share of the pixels whose own clipping limit lies within the common one after a pattern is subtracted; the others are hot."""
 
 CONTRADICTED = (
     "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
@@ -136,14 +139,14 @@ def measure_exposures(
     bar: Bar = lambda title, total: nullcontext(),
 ) -> Findings:
     """Align exposures, measure the detector and test its results, without noise models; arguments as `calibrate_exposures`."""
-    pattern = None
     for frames in (dark, flat):
         if frames is not None:
             frames.require_unsaturated()
-    if dark is not None:
-        pattern = dark_pattern(exposures, dark)
-        exposures = exposures if pattern is None else without_pattern(exposures, pattern)
+    raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
+    compressed = compression(*raw)
     exposures, (join, joined) = below_joins(exposures)
+    pattern = None if dark is None else dark_pattern(exposures, dark)
+    exposures = exposures if pattern is None else without_pattern(exposures, pattern)
     burst = None
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
@@ -160,11 +163,12 @@ def measure_exposures(
         with bar("Sampling the detector's posterior", DRAWS * ROUNDS) as progress:
             detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
-        verdict = judge_calibration(pairs, detector, figures, correlation, repairs)
+        judged = judge_calibration(pairs, detector, figures, correlation, repairs)
+        verdict = verdict_of([*judged.reasons, *compressed])
     except (NotMeasurable, np.linalg.LinAlgError) as error:
         reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
         refused = Reason("not measurable", "bad", f"the detector was not measured: {reason}.")
-        verdict = verdict_of([refused, *compression(pairs)])
+        verdict = verdict_of([refused, *compressed])
     return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 
 
@@ -202,10 +206,20 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
 
 
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
-    """Subtract a fixed pattern, (y, x) counts, from the exposures."""
+    """Subtract a fixed pattern, (y, x) counts, from the exposures.
+
+    Values at a clipping limit stay equal: all are clipped where nearly all pixels (`WITHIN`) reach after the subtraction.
+    """
     if isinstance(exposures, Burst):
-        return replace(exposures, frames=exposures.frames - pattern)
-    return [_less(pair, pattern) for pair in exposures]
+        return replace(exposures, frames=np.stack([_less(frame, pattern) for frame in exposures.frames]))
+    return [replace(pair, short=_less(pair.short, pattern), long=_less(pair.long, pattern)) for pair in exposures]
+
+
+def _less(frame: Image, pattern: Image) -> Image:
+    low, high = rails(frame)
+    least, most = np.quantile(pattern, (1 - WITHIN, WITHIN))
+    less = np.clip(frame - pattern, low - least, high - most)
+    return np.asarray(np.where(frame <= low, low - least, np.where(frame >= high, high - most, less)))
 
 
 def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
@@ -215,7 +229,3 @@ def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
     import noiseflow
 
     return noiseflow.WithMaps(model, offset=findings.pattern)
-
-
-def _less(pair: ExposurePair, pattern: Image) -> ExposurePair:
-    return replace(pair, short=pair.short - pattern, long=pair.long - pattern)

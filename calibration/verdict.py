@@ -173,7 +173,6 @@ def _correlation(
         else:
             grade, text = "bad", text + ". No short filter explains it. Use raw frames, or remove the interference"
         found.append(Reason("correlated pixels", grade, text + "."))
-    found += compression(pairs)
     if correlation.period:
         text = f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled "
         if correlation.step != 1 and correctable(correlation, repairs):
@@ -209,23 +208,24 @@ def frames_correlated(lag: float) -> list[Reason]:
     return [Reason("frames correlated", grade, text + end)]
 
 
-def compression(pairs: Sequence[AlignedPair]) -> list[Reason]:
-    """Test whether the first frame or its long exposure was compressed with loss."""
-    first = pairs[0]
-    looked_at: tuple[tuple[Image, str, Grade], ...] = (
-        (first.short, "frame", "bad"),
-        (first.long, "long exposure", "doubtful"),
-    )
+def compression(short: Image, long: Image | None = None) -> list[Reason]:
+    """Test whether a frame or its long exposure was compressed with loss.
+
+    Args:
+        short: (y, x) raw frame; of a burst the first one.
+        long: (y, x) raw long exposure, if there is one.
+    """
+    looked_at: list[tuple[Image, str, Grade]] = [(short, "frame", "bad")]
+    looked_at += [] if long is None else [(long, "long exposure", "doubtful")]
     for frame, name, grade in looked_at:
-        kind = "in blocks of 8 × 8 pixels (JPEG)" if block_compressed(frame) else ""
-        kind = kind or (
-            "by wavelets (JPEG 2000), or interpolated between every second pixel," if wavelet_compressed(frame) else ""
-        )
-        if kind and (name == "frame" or first.frames == 1):
-            text = (
-                f"the {name} was compressed with loss {kind}, which removes noise and adds artefacts. Use raw frames."
-            )
-            return [Reason("compressed", grade, text)]
+        if block_compressed(frame):
+            kind = "in blocks of 8 × 8 pixels (JPEG)"
+        elif wavelet_compressed(frame):
+            kind = "by wavelets (JPEG 2000), or interpolated between every second pixel,"
+        else:
+            continue
+        text = f"the {name} was compressed with loss {kind}, which removes noise and adds artefacts. Use raw frames."
+        return [Reason("compressed", grade, text)]
     return []
 
 

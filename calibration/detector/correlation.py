@@ -177,7 +177,7 @@ def _period(residual: Residual) -> float:
     from scipy.ndimage import maximum_filter1d
 
     found = [0.0]
-    scene = np.where(residual.mask, residual.z if residual.signal is None else residual.signal, 0.0)
+    scene = np.zeros(residual.z.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
     for z, signal in ((residual.z, scene), (residual.z.T, scene.T)):
         own = maximum_filter1d(_lines(signal.mean(0)), 3)
         for profile in ((z**2).mean(0), (z[:, 1:] * z[:, :-1]).mean(0)):

@@ -303,3 +303,21 @@ def test_a_pair_of_64_pixels_is_measured_and_only_uncertain():
     found = measured(sim.Case(*(sim.exposed(generator, times * scene) for times in (1, sim.RATIO))))
     assert [one.name for one in found.verdict.reasons] == ["gain uncertain"]
     assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
+
+
+@pytest.mark.parametrize("burst", [True, False])
+def test_saturation_and_compression_are_seen_behind_the_pattern_of_dark_frames(burst):
+    generator = np.random.default_rng(44)
+    scene = sim.random_scene(generator, 128)
+    offset = 100 + 6 * generator.standard_normal(scene.shape)
+    top = np.round(100 + 2 * np.percentile(scene, 97))
+    shorts = np.stack([sim.exposed(generator, scene, offset=offset, top=top) for _ in range(5)])
+    dark = np.stack([sim.exposed(generator, 0 * scene, offset=offset) for _ in range(8)])
+    long = None if burst else sim.exposed(generator, sim.RATIO * scene, offset=offset)
+    case = sim.Case(shorts if burst else shorts[0], long, {"dark": dark})
+    found = measured(case)
+    assert {one.name for one in found.verdict.reasons} <= {"gain uncertain"}
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.05)
+    coded = np.stack([jpeg2000(one, 300) for one in shorts])
+    found = measured(replace(case, short=coded if burst else coded[0]))
+    assert "compressed" in [one.name for one in found.verdict.reasons]
