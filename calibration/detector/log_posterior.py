@@ -114,7 +114,7 @@ def maximum_likelihood(
     """
     best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
     for _ in range(NUM_RESCALINGS):
-        best = _by_whole_electrons(log_posterior, _climb(log_posterior, best))
+        best = by_whole_electrons(log_posterior, _climb(log_posterior, best))
         moved = log_posterior.rescaled(best)
         if moved is None:
             break
@@ -132,7 +132,7 @@ def _climb(log_posterior: LogPosterior, start: Image) -> Image:
     return np.asarray(found.x)
 
 
-def _by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
+def by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
     """Compare the maximum with those whose offset differs by whole electrons; with single-electron peaks, each is a maximum."""
     gain, offset, read_noise = (value.item() for value in log_posterior.parameters(best))
     if read_noise > UNRESOLVED[1]:

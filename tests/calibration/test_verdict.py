@@ -9,7 +9,9 @@ from scipy import ndimage
 
 from calibration.detector.correlation import correlation_of, correlation_of_residuals
 from calibration.detector.independence import contained_share, correlation_in_time
+from calibration.detector.log_posterior import LogPosterior, by_whole_electrons
 from calibration.detector.residual import Residual
+from calibration.detector.shape import unevenness
 from calibration.exposures.codes import coarser_above
 from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Burst, ExposurePair
@@ -18,7 +20,7 @@ from calibration.registration.aligned import align_pair
 from calibration.registration.bursts import align_burst
 
 from . import simulators as sim
-from .sabotage import CASES, corner_full, joined, jpeg2000
+from .sabotage import CASES, corner_full, counting_photons, joined, jpeg2000
 
 
 def measured(case):
@@ -332,3 +334,19 @@ def test_saturation_and_compression_are_seen_behind_the_pattern_of_dark_frames(b
     coded = np.stack([jpeg2000(one, 300) for one in shorts])
     found = measured(replace(case, short=coded if burst else coded[0]))
     assert "compressed" in [one.name for one in found.verdict.reasons]
+
+
+def test_an_offset_that_is_an_electron_off_is_moved_to_the_peak():
+    detector = measured(CASES["single electrons resolved"](45)).detector
+    log_posterior = LogPosterior(detector.levels, detector.offset)
+    gain, offset, read_noise = detector.posterior.most_likely
+    wrong = log_posterior.coordinates(gain, offset + 2 * gain, read_noise)[0]
+    found = log_posterior.parameters(by_whole_electrons(log_posterior, wrong))[1].item()
+    assert found == pytest.approx(offset, abs=0.1 * gain)
+
+
+def test_pixels_of_no_light_are_not_uneven():
+    generator = np.random.default_rng(46)
+    scene = sim.random_scene(generator, 128, mean=2.0, contrast=1.0)
+    pairs, _ = align_burst(Burst(np.stack([counting_photons(generator, 16 * scene) for _ in range(8)])))
+    assert unevenness(pairs) == 0
