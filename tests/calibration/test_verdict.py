@@ -310,9 +310,10 @@ def test_the_period_of_a_scene_is_none_of_the_noise():
     assert {one.name for one in found.verdict.reasons} <= {"gain uncertain"}
 
 
-def test_a_pair_of_64_pixels_is_measured_and_only_uncertain():
-    generator = np.random.default_rng(43)
-    scene = sim.random_scene(generator, 64)
+@pytest.mark.parametrize(("size", "seed"), [(64, 43), (40, 7)])
+def test_a_small_pair_is_measured_and_only_uncertain(size, seed):
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator, size)
     found = measured(sim.Case(*(sim.exposed(generator, times * scene) for times in (1, sim.RATIO))))
     assert [one.name for one in found.verdict.reasons] == ["gain uncertain"]
     assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
