@@ -221,7 +221,7 @@ def compression(short: Image, long: Image | None = None) -> list[Reason]:
         if block_compressed(frame):
             kind = "in blocks of 8 × 8 pixels (JPEG)"
         elif wavelet_compressed(frame):
-            kind = "by wavelets (JPEG 2000), or interpolated between every second pixel,"
+            kind = "by wavelets (JPEG 2000), or every second pixel was interpolated"
         else:
             continue
         text = f"the {name} was compressed with loss {kind}, which removes noise and adds artefacts. Use raw frames."

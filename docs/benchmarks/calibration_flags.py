@@ -131,7 +131,9 @@ def draw(rows: list[Row]) -> None:
     errors: dict[str, dict[str, float]] = {"no flag": {}, "flagged": {}}
     for row in sorted((row for row in rows if row["gain"] is not None), key=lambda row: abs(error_of(row))):
         errors["no flag" if row["verdict"] == "good" else "flagged"][row["case"]] = 100 * error_of(row)
-    dots.save(PICTURE, [("Gain reported against the truth", "error (%)", errors)], columns=1, straight=100 * GOAL)
+    dots.save(
+        PICTURE, [("Gain reported against the truth", "error (%)", errors)], columns=1, width=8.0, straight=100 * GOAL
+    )
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ def save(
     panels: Sequence[Panel],
     *,
     columns: int,
+    width: float = 5.5,
     straight: float | None = None,
     logarithmic: bool = False,
     line: float | None = None,
@@ -29,6 +30,7 @@ def save(
     Args:
         panels: title, label of the x axis with its unit, and {series: {method: value}}, methods best first.
         columns: panels side by side.
+        width: of a panel with its labels, inches.
         straight: values beyond ± this one stand on a logarithmic axis; None: none do.
         logarithmic: the axis of values, all of them above 0.
         line: value at which to draw a line across the rows.
@@ -36,11 +38,15 @@ def save(
     """
     methods = max(len(_names(series)) for _, _, series in panels)
     rows = -(-len(panels) // columns)
-    figure, axes = new_figure(columns, rows, width=5.5 * columns, height=0.8 + 0.26 * methods)
+    figure, axes = new_figure(columns, rows, width=width * columns, height=0.8 + 0.26 * methods)
     for number, (axis, panel) in enumerate(zip(axes.flat, panels, strict=True)):
         _draw(axis, *panel, with_legend=number == 0 or not one_legend)
         if straight is not None:
             axis.set_xscale("symlog", linthresh=straight)
+            low, high = axis.get_xlim()
+            powers = [sign * 10.0**power for power in range(-9, 10) for sign in (-1, 1) if 10.0**power >= straight]
+            axis.set_xticks([0, *(power for power in powers if low < power < high)])
+            axis.xaxis.set_major_formatter("{x:g}")
         if logarithmic:
             axis.set_xscale("log")
         if line is not None:
