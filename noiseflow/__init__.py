@@ -13,9 +13,9 @@ _load, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        from importlib.metadata import version
+        from noiseflow.installation import library_version
 
-        return version("noiseflow")
+        return library_version()
     if name in _MOVED and name not in __all__:
         from importlib import import_module
 
