@@ -15,8 +15,8 @@ from noiseflow.distributions.base import (
     normal_hazard,
 )
 from noiseflow.distributions.electrons import log_density, log_tail
-from noiseflow.distributions.normal import hazard_of
-from noiseflow.distributions.pixelwise import pixelwise
+from noiseflow.distributions.normal import hazard_of, normal_cdf
+from noiseflow.distributions.pixelwise import compilable, pixelwise
 from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
 from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
@@ -99,8 +99,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return self._log_prob(value)
 
     def cdf(self, value: Tensor) -> Tensor:
-        probability: Tensor = torch.special.ndtr(self._mapped_bound(self._detector_latent(value)))
-        return probability.to(value.dtype)
+        return normal_cdf(self._mapped_bound(self._detector_latent(value))).to(value.dtype)
 
     def _mapped_bound(self, latent: Tensor) -> Tensor:
         finite = torch.isfinite(latent)
@@ -150,7 +149,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         for part in torch.split(signal, _SIGNALS_AT_ONCE):
             distribution = self._model(part[:, None])
             residual, latent = latent_nodes(distribution.base)
-            below = torch.special.ndtr(distribution.correct(latent)[0])
+            below = normal_cdf(distribution.correct(latent)[0])
             mean = residual[:, -1] - torch.trapezoid(below, residual)
             about = residual - mean[:, None]
             parts.append((mean, about[:, -1] ** 2 - 2 * torch.trapezoid(about * below, residual)))
@@ -160,6 +159,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
 
 
+@compilable
 def _latent(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:

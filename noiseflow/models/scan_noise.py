@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, normal_quadrature
 from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.around import ModelAround, as_noise_model
@@ -46,8 +47,7 @@ class ScanNoise(ModelAround):
 
     def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
         super().__init__(model)
-        if not scale > 0:
-            raise ValueError(f"scale is {scale}; the standard deviation of the offsets must be positive")
+        check(scale=scale)
         if along not in ("row", "column"):
             raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
         if self.model.shared_axis is not None:
