@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from noiseflow.installation import install_command
 from noiseflow.threads import PASSIVE, waiting
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -48,7 +49,7 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         import dask.distributed
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "--workers and --scheduler need dask.distributed; install it with: pip install 'noiseflow[distributed]'"
+            f"--workers and --scheduler need dask.distributed; install it with: {install_command('distributed')}"
         ) from error
     library: Any = dask.distributed  # it has no types
     if scheduler is not None:
