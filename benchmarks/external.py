@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 
 def missing(package: str) -> bool:
-    """Whether the package of another method is missing; ``pip install 'noiseflow[benchmark]'`` installs all."""
+    """Whether the package of another method is missing; the extra ``benchmark`` installs all."""
     return find_spec(package) is None
 
 

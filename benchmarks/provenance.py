@@ -14,6 +14,8 @@ from typing import Any
 
 import torch
 
+from noiseflow.installation import DISTRIBUTION
+
 
 @cache
 def origin() -> dict[str, str]:
@@ -67,7 +69,7 @@ def machine() -> dict[str, Any]:
     from importlib.metadata import PackageNotFoundError, version
 
     versions = {}
-    for package in ("noiseflow", "torch", "numpy", "scipy", "scikit-image", "astra-toolbox", "quantem", "bm3d"):
+    for package in (DISTRIBUTION, "torch", "numpy", "scipy", "scikit-image", "astra-toolbox", "quantem", "bm3d"):
         try:
             versions[package] = version(package)
         except PackageNotFoundError:

@@ -10,7 +10,7 @@
 
 Each row is saved when it is done, in results/joint.json in docs/benchmarks, and is not computed again without --again. PSNR is
 over the range of the truth, without any rescaling. Best weights are found by looking at the truth, which only the rivals may
-do. ASTRA comes with the extra: python -m pip install 'noiseflow[benchmark]'.
+do. ASTRA comes with the extra: python -m pip install '.[benchmark]' in the checkout.
 """
 
 from __future__ import annotations

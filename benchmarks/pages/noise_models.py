@@ -9,7 +9,7 @@
     python -m benchmarks.pages.noise_models page                           # noise_models.md and its figure, from the JSON
 
 Each row is saved when it is done, in results/noise_models.json in docs/benchmarks; `page` draws what is there. zuko and
-normflows come with the extra: python -m pip install 'noiseflow[benchmark]'.
+normflows come with the extra: python -m pip install '.[benchmark]' in the checkout.
 """
 
 from __future__ import annotations

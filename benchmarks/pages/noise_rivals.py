@@ -27,9 +27,7 @@ def require(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise SystemExit(
-            f"noise_models.py: {name} is not installed; python -m pip install 'noiseflow[benchmark]'"
-        ) from error
+        raise SystemExit(f"noise_models.py: {name} is not installed; python -m pip install '.[benchmark]'") from error
 
 
 class Rival(nn.Module):
