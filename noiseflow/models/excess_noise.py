@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Gaussian
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from recon.fields.fields import Field, MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy

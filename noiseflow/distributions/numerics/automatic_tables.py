@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.fingerprint import fingerprint
-from noiseflow.distributions.picked import needs_image
-from noiseflow.distributions.pixels import is_traced
-from noiseflow.distributions.tables import Table, Values
-from noiseflow.distributions.tabulated import RootScale
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.numerics.fingerprint import fingerprint
+from noiseflow.distributions.numerics.signal_table import Table, Values
+from noiseflow.distributions.numerics.table_axes import RootScale
+from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18
 """Smallest number of pixels for which a table is used, if no gradient is required."""

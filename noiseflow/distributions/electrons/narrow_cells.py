@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_contour import positive_rate
-from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.electrons.contour import positive_rate
+from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_contour import positive_rate
-from noiseflow.distributions.electron_terms import REACH, log_poisson
+from noiseflow.distributions.electrons.contour import positive_rate
+from noiseflow.distributions.electrons.poisson_terms import REACH, log_poisson
 
 WIDEST = 3.0  # electrons: the sum then has at most two dozen terms
 _FARTHEST = (
