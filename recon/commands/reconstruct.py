@@ -53,6 +53,10 @@ def reconstruct(
             help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
     ] = None,
+    channel: Annotated[
+        str | None,
+        typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
+    ] = None,
     transforms: Annotated[Path | None, typer.Option(help="Alignment of IMOD (.xf) to apply to the stack.")] = None,
     method: Annotated[
         str,
@@ -208,6 +212,7 @@ def reconstruct(
             invert_contrast=invert_contrast,
             mask=mask,
             mask_nan=mask_nan,
+            channel=channel,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with step_report(json_mode=json) as progress:
