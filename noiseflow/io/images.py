@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _NO_IMAGES = {
     **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), "a file of tilt angles (--angles)"),
-    ".xf": "a file of alignments (--transforms)",
+    ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
 

@@ -53,7 +53,12 @@ def reconstruct(
             help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
     ] = None,
-    transforms: Annotated[Path | None, typer.Option(help="Alignment of IMOD (.xf) to apply to the stack.")] = None,
+    alignment: Annotated[
+        Path | None,
+        typer.Option(
+            help="Alignment to apply: a .json file of --save-alignment, also of another channel, or IMOD's .xf."
+        ),
+    ] = None,
     method: Annotated[
         str,
         typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}."),
@@ -113,6 +118,9 @@ def reconstruct(
     refine_alignment: Annotated[
         bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
     ] = False,
+    save_alignment: Annotated[
+        Path | None, typer.Option(help="File for the alignment: .json, or .xf (with .tlt) for IMOD.")
+    ] = None,
     tilt_axis: Annotated[
         float | None,
         typer.Option(
@@ -170,7 +178,7 @@ def reconstruct(
     """
     from noiseflow.io import locked, require_other
     from noiseflow.io.mapped import is_large
-    from recon.commands.inputs import files_read, load_tilt_series, prepare
+    from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.methods import find_method, settings_of
     from recon.report.page import read_reference
@@ -180,8 +188,10 @@ def reconstruct(
 
     output = Output(json)
     targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
+    if save_alignment is not None:
+        check_alignment_file(save_alignment, alignment, tilts, overwrite=overwrite)
     for path in (out, *error_bar_paths(out).values(), shell_band_path(out)):
-        require_other(path, tilts, angles, transforms, mask, reference, noise_model)
+        require_other(path, tilts, angles, alignment, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)
@@ -202,7 +212,6 @@ def reconstruct(
         tilt_series = load_tilt_series(
             tilts,
             angles=angles,
-            transforms=transforms,
             mode=mode,
             invert_tilt=invert_tilt,
             invert_contrast=invert_contrast,
@@ -215,6 +224,8 @@ def reconstruct(
                 tilt_series,
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
+                alignment=alignment,
+                save_alignment=save_alignment,
                 keep_tilts=keep_tilts,
                 device=chosen_device,
                 output=output,
@@ -249,7 +260,7 @@ def reconstruct(
                 tilt_series,
                 outcome,
                 seconds=time.perf_counter() - started,
-                inputs=files_read(tilts, angles, transforms, mask, noise_model, reference),
+                inputs=files_read(tilts, angles, alignment, mask, noise_model, reference),
                 seed=seed,
                 prepared=prepared,
                 halves=halves,

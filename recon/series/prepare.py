@@ -68,6 +68,7 @@ def prepare(
     *,
     tilt_axis: float | None = None,
     refine_alignment: bool = False,
+    alignment: Alignment | None = None,
     keep_tilts: bool = False,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
@@ -80,13 +81,15 @@ def prepare(
         tilt_series: the series as read.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to search it.
         refine_alignment: find the axis and the shift of every image.
+        alignment: the alignment of the same tilts, such as that of another channel, in place of a search.
         keep_tilts: keep tilts that are inconsistent with the others, with a warning.
         device: torch device.
         progress: called at each step of the alignment.
 
     Raises:
-        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, or the
-            images are inconsistent with an axis along y and their file states another tilt axis.
+        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, the
+            images are inconsistent with an axis along y and their file states another tilt axis, or `alignment` is of other
+            tilts or comes with another option.
 
     Example:
         >>> import numpy as np, recon
@@ -100,14 +103,19 @@ def prepare(
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
     _warn_of_outliers(tilt_series)
     _warn_of_order(tilt_series.tilt_angles)
-    alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    if alignment is not None:
+        if refine_alignment or tilt_axis is not None:
+            raise ValueError("--alignment gives axis and shifts; remove --refine-alignment and --tilt-axis")
+        alignment = alignment.joined(tilt_series)
+    else:
+        alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
     check_contrast(tilt_series)
     found = screen(
         Orientation.of(tilt_series).series(tilt_series)
     )  # the standard orientation gives identical results for mirror images
-    _require_axis(tilt_series, found, tilt_axis)
+    _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
 
@@ -124,7 +132,9 @@ def _alignment(
         return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)
     if tilt_axis is None:
         return None
-    return Alignment(tilt_axis, np.zeros((series.num_tilts, 2)), series.tilt_angles)
+    height, width = series.images.shape[1:]
+    shifts, size = np.zeros((series.num_tilts, 2)), series.pixel_size
+    return Alignment(tilt_axis, shifts, series.tilt_angles, image_shape=(height, width), pixel_size=size)
 
 
 def _warn_of_order(angles: NDArray[np.float64]) -> None:
@@ -154,11 +164,11 @@ def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
         yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
 
 
-def _require_axis(series: TiltSeries, found: Screening, given: float | None) -> None:
-    """Handle a file that states another axis than y if the user gave none: warn if the images are consistent with y, because
-    aligned series may keep the entry; otherwise raise ValueError."""
+def _require_axis(series: TiltSeries, found: Screening) -> None:
+    """Handle a series that was not transformed and whose file states another axis than y: warn if the images are consistent with
+    y, because aligned series may keep the entry; otherwise raise ValueError."""
     stated = series.tilt_axis
-    if given is not None or stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
+    if stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
         return
     words = (
         f"the file states a tilt axis of {stated:g}°, but the images are assumed to be aligned, with the axis along y"
