@@ -18,6 +18,7 @@ from noiseflow.commands.console import (
     choose_device,
     step_report,
 )
+from noiseflow.commands.option_files import option_groups
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
     chosen_slices,
@@ -38,6 +39,16 @@ if TYPE_CHECKING:
     from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
+@option_groups(
+    {
+        "Input": ("angles", "transforms", "mask", "mask_nan", "invert_contrast"),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
+        "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
+        "Size": ("slices_at_once", "workers", "scheduler", "device"),
+        "Output": ("save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
+        "Advanced": ("resume", "checkpoint_interval", "dry_run"),
+    }
+)
 def reconstruct(
     context: typer.Context,
     tilts: Annotated[
