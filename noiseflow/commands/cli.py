@@ -23,6 +23,7 @@ from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version
 from noiseflow.plugins import load_plugin, package_of, plugins
+from noiseflow.threads import wait_passively
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "measure", "doctor")
 _TYPED = "noiseflow.typed"
@@ -175,6 +176,7 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
+    wait_passively()
     with steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
