@@ -51,7 +51,7 @@ def shared_options(command: Any) -> list[Any]:
 
     app = typer.Typer(add_completion=False)
     app.command()(declare)
-    made = {parameter.name: parameter for parameter in typer.main.get_command(app).params}
+    made: dict[str | None, Any] = {parameter.name: parameter for parameter in typer.main.get_command(app).params}
     made["help_all"].help = f"Show all options: {titles}."
     own = {parameter.name for parameter in command.params}
     wanted = ["options", "help_all"] if titles else ["options"]
