@@ -10,7 +10,7 @@ _load, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        from importlib.metadata import version
+        from noiseflow.installation import library_version
 
-        return version("noiseflow")
+        return library_version()
     return _load(name)
