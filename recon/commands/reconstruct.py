@@ -18,6 +18,7 @@ from noiseflow.commands.console import (
     choose_device,
     step_report,
 )
+from noiseflow.commands.option_files import option_groups
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
     chosen_slices,
@@ -33,11 +34,22 @@ from recon.fields.regularisers._names import DEFAULT, regulariser_names
 from recon.methods._names import method_names
 
 if TYPE_CHECKING:
+    from noiseflow.checks import Guard
     from recon.joint.checkpoint import Journal
     from recon.reconstruction import Reconstruction
     from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
+@option_groups(
+    {
+        "Input": ("angles", "transforms", "mask", "mask_nan", "invert_contrast"),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
+        "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
+        "Size": ("slices_at_once", "workers", "scheduler", "device"),
+        "Output": ("save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
+        "Advanced": ("resume", "checkpoint_interval", "dry_run"),
+    }
+)
 def reconstruct(
     context: typer.Context,
     tilts: Annotated[
@@ -254,7 +266,7 @@ def reconstruct(
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 options |= {"keep": journal.keep, "forget": journal.forget}
             with step_report(json_mode=json) as journal.report:
-                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
+                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc, guard=prepared.guard)
             verdict = targets.write(
                 output,
                 tilt_series,
@@ -274,7 +286,7 @@ def reconstruct(
 
 
 def _solve(
-    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool, guard: Guard
 ) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and the odd tilts if requested."""
     from recon.methods import reconstruct
@@ -284,17 +296,22 @@ def _solve(
         if journal.report is not None:
             journal.report("reconstructing", done, total, note)
 
+    def halves() -> tuple[Volume, Volume]:
+        even, odd = (
+            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
+            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
+        )
+        return even, odd
+
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
     outcome = reconstruct(tilt_series, grid, **options)
-    if not fsc:
-        return outcome, None
-    options["uncertainty"], scratch = 0, options.get("scratch")
-    halves = []
-    for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True):
-        if scratch is not None:
-            options["scratch"] = scratch.with_name(f"{name}-{scratch.name}")
-        halves.append(reconstruct(half, grid, **options, prefix=f"{name} tilts: ").volume)
-    return outcome, (halves[0], halves[1])
+    return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
+
+
+def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
+    """The options that differ for a half of the tilts."""
+    scratch = options.get("scratch")
+    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
 
 
 def _show_plan(

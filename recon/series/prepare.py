@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.checks import Guard
 from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
 from recon.series.orientation import Orientation
-from recon.series.screening import Screening, screen
+from recon.series.screening import Screening, require_specimen, screen
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
@@ -35,6 +36,7 @@ class Prepared:
         tilt_series: the aligned series, sorted by angle, without rejected tilts.
         screening: consistency of every tilt with the others, in the order of the given series.
         alignment: alignment of the raw images, in the order of the given series; None if they were not transformed.
+        guard: checks that failed, with their reasons.
 
     Example:
         >>> import numpy as np, recon
@@ -49,6 +51,7 @@ class Prepared:
     tilt_series: TiltSeries
     screening: Screening
     alignment: Alignment | None
+    guard: Guard = field(default_factory=Guard)
 
     @property
     def choices(self) -> dict[str, float | str]:
@@ -75,7 +78,7 @@ def prepare(
 ) -> Prepared:
     """Prepare a tilt series for reconstruction: checks, alignment, screening, and estimation of beam drift.
 
-    Doubtful results are reported as `UserWarning`.
+    Doubtful results are reported as `UserWarning`. A check that fails is listed in `Prepared.guard`; it does not stop the run.
 
     Args:
         tilt_series: the series as read.
@@ -87,9 +90,9 @@ def prepare(
         progress: called at each step of the alignment.
 
     Raises:
-        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, the
-            images are inconsistent with an axis along y and their file states another tilt axis, or `alignment` is of other
-            tilts or comes with another option.
+        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, at
+            least half of the images are blank, the images are inconsistent with an axis along y and their file states another
+            tilt axis, or `alignment` is of other tilts or comes with another option.
 
     Example:
         >>> import numpy as np, recon
@@ -101,7 +104,8 @@ def prepare(
     """
     if tilt_axis is not None and not abs(tilt_axis) <= 360:  # more than a full turn is a mistake
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
-    _warn_of_outliers(tilt_series)
+    guard = Guard()
+    guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:
         if refine_alignment or tilt_axis is not None:
@@ -111,13 +115,17 @@ def prepare(
         alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
-    check_contrast(tilt_series)
-    found = screen(
-        Orientation.of(tilt_series).series(tilt_series)
-    )  # the standard orientation gives identical results for mirror images
+    require_specimen(tilt_series)
+    guard("contrast", lambda: check_contrast(tilt_series), otherwise=None)
+    # the standard orientation gives identical results for mirror images
+    found = guard(
+        "screening",
+        lambda: screen(Orientation.of(tilt_series).series(tilt_series)),
+        otherwise=Screening.of_all(tilt_series.num_tilts),
+    )
     _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
-    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
+    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)
 
 
 def _alignment(
