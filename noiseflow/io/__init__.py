@@ -1,6 +1,5 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
-from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of

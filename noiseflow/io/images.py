@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.installation import install_command
 from noiseflow.io.checks import Unsupported, as_array, choose
 from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 from noiseflow.io.image_file import (
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 _NO_IMAGES = {
     **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), "a file of tilt angles (--angles)"),
-    ".xf": "a file of alignments (--transforms)",
+    ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
 _NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"}
@@ -73,7 +74,7 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            "install it with: pip install 'noiseflow[formats]'"
+            f"install it with: {install_command('formats')}"
         ) from error
     except Unsupported as error:
         raise error.about(path) from error

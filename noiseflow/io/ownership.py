@@ -9,10 +9,10 @@ files belong to the stack next to them.
 from __future__ import annotations
 
 import json
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from noiseflow.installation import library_version
 from noiseflow.io.image_file import MRC_SUFFIXES, TIFF_SUFFIXES
 
 MARK = "noiseflow"
@@ -22,7 +22,7 @@ _PAGE_HEAD = 1000
 
 def signature() -> str:
     """The mark with the version, such as ``noiseflow 0.1.0``."""
-    return f"{MARK} {version('noiseflow')}"
+    return f"{MARK} {library_version()}"
 
 
 def require_own(path: Path, *, overwrite: bool) -> None:
@@ -69,6 +69,8 @@ def is_own(path: Path) -> bool:
         return b"tEXtSoftware\0" + MARK.encode() in head
     if kind == ".csv":
         return head.startswith(f"# {MARK} ".encode())
+    if kind == ".json":
+        return f'"written_by": "{MARK}'.encode() in head
     return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
 
 

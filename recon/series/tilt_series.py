@@ -207,7 +207,6 @@ def read_tilt_series(
     path: str | Path,
     *,
     angles: str | Path | None = None,
-    transforms: str | Path | None = None,
     mode: Mode = "transmission",
     mask: NDArray[np.bool_] | None = None,
     mask_nan: bool = False,
@@ -220,11 +219,10 @@ def read_tilt_series(
         path: the stack, in any format that `noiseflow.io.read` supports.
         angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
             ``.mdoc`` next to the stack, or else the angles in the stack file.
-        transforms: IMOD alignment (``.xf``) to apply to the images, which become float32.
         mode: image formation.
         mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
-        mapped: memory-map the images, see `noiseflow.io.read`; not with a mask, NaNs or transforms.
+        mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
         channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
 
     Raises:
@@ -247,9 +245,7 @@ def read_tilt_series(
     images, mask = _masked(image_file.data, mask, mask_nan, str(path))
     io.require_contrast(images, path)
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
-    if transforms is not None:
-        images = io.apply_transforms(images, io.read_transforms(transforms))
-    tilt_axis = io.tilt_axis_of(path, image_file) if transforms is None else None
+    tilt_axis = io.tilt_axis_of(path, image_file)
     if mask is None:
         return TiltSeries(images, tilt_angles, pixel_size, mode, tilt_axis=tilt_axis)
     empty = ~mask.any((1, 2))
