@@ -24,7 +24,7 @@ def test_projections_of_independent_scenes_agree_with_the_slice_projector(name: 
 
 @pytest.mark.parametrize("noise", sorted(NOISES))
 def test_noise_is_centred_on_the_clean_images(noise: str) -> None:
-    made = independent_series("beads", noise, RANGES["±60°/2°"], size=32)
+    made = independent_series("smooth_blobs", noise, RANGES["±60°/2°"], size=32)
     images = made.series.images.astype(float)
     slope = np.polyfit(made.clean.ravel(), images.ravel(), 1)[0]
     assert slope == pytest.approx(1, abs=0.25 if noise == "8 bits, gamma" else 0.05)
