@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow import io
+from noiseflow import io, statistics
 from noiseflow.described import described, size_of
 from noiseflow.io import mapped
 from noiseflow.io.mapped import is_mapped
@@ -301,10 +301,9 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
 
 def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
     """Means of blocks of pixels, image by image; incomplete blocks are dropped, evenly at both edges."""
-    height, width = images.shape[1] // down, images.shape[2] // across
-    top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
-    whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
-    return np.stack([image.reshape(height, down, width, across).mean((1, 3)).astype(np.float32) for image in whole])
+    top, left = images.shape[1] % down // 2, images.shape[2] % across // 2
+    inner = (image[top:, left:].astype(np.float64) for image in images)
+    return np.stack([statistics.block_means(image, down, across).astype(np.float32) for image in inner])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
