@@ -29,6 +29,7 @@ def load_tilt_series(
     mask: Path | None,
     mask_nan: bool,
     mapped: bool = False,
+    channel: str | None = None,
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command.
 
@@ -42,6 +43,7 @@ def load_tilt_series(
         mask=None if mask is None else _read_mask(mask),
         mask_nan=mask_nan,
         mapped=mapped,
+        channel=channel,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @option_groups(
     {
-        "Input": ("angles", "transforms", "mask", "mask_nan", "invert_contrast"),
+        "Input": ("angles", "channel", "alignment", "mask", "mask_nan", "invert_contrast"),
         "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
         "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
@@ -64,6 +64,10 @@ def reconstruct(
         typer.Option(
             help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
+    ] = None,
+    channel: Annotated[
+        str | None,
+        typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
     ] = None,
     alignment: Annotated[
         Path | None,
@@ -229,6 +233,7 @@ def reconstruct(
             invert_contrast=invert_contrast,
             mask=mask,
             mask_nan=mask_nan,
+            channel=channel,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with step_report(json_mode=json) as progress:

@@ -229,6 +229,7 @@ def read_tilt_series(
     mask: NDArray[np.bool_] | None = None,
     mask_nan: bool = False,
     mapped: bool = False,
+    channel: str | int | None = None,
 ) -> TiltSeries:
     """Read a stack and its tilt angles.
 
@@ -240,8 +241,10 @@ def read_tilt_series(
         mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
         mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
+        channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
 
     Raises:
+        noiseflow.io.SeveralImages: there are several channels and none was chosen; a ValueError with their names.
         FileNotFoundError: the file does not exist, or there are no angles in or next to the stack.
         ValueError: a file cannot be read, the mask does not match, or the stack is not a valid `TiltSeries`.
 
@@ -251,7 +254,7 @@ def read_tilt_series(
         >>> recon.read_tilt_series(needle, mode="linear").images.shape
         (91, 64, 64)
     """
-    image_file = io.read(path, mapped=mapped)
+    image_file = io.read(path, mapped=mapped, channel=channel)
     if image_file.data.ndim != 3:
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
