@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ _ITERATIONS, _ROUNDS = 30, 6
 # degrees: steps of the search within 40° of ±90°; volumes of 24 voxels overlap when they are 5° apart
 _SPACING, _WIDEST = 10.0, 40.0
 _CANDIDATES = 4
+_RELAXATION = 1.5  # of steps towards a volume that follows them by half
 _TURN, _MOVE = 0.02, 0.5  # radians and voxels, of numerical derivatives: half a voxel at the edge of 48
 # of the variance: unrelated specimens predict each other's images to less than a third, as all are bright in the middle
 _LEAST = 0.4
@@ -134,7 +136,7 @@ def register(
                 f"the two series do not show one specimen about axes near 90° apart: the volume of each explains {share:.0%} of "
                 "the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
             )
-        return _registration(found[0], pair)
+        return _registration(pair.settled(found[0]), pair)
 
 
 def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
@@ -176,7 +178,7 @@ class _Pair:
         found = []
         steps = np.arange(-_WIDEST, _WIDEST + 1, _SPACING)
         for inverted in (False, True):
-            second = self._second(inverted)
+            second = self.volumes[1].flip(0) if inverted else self.volumes[1]
             for degrees in (*(90 + steps), *(-90 + steps)):
                 rotation = _in_plane(math.radians(degrees)).to(second)
                 turned = _sampled(self.volumes[0], rotation, torch.zeros_like(rotation[0]))
@@ -198,22 +200,50 @@ class _Pair:
         """Gauss–Newton steps; the best pose that was seen."""
         best = self._judged(pose)
         for _ in range(_ROUNDS):
-            tried = self._judged(self._step(best))
+            tried = self._judged(self._stepped(best, self._residuals))
             if tried.error >= best.error:
                 break
             best = tried
         return best
 
-    def _second(self, inverted: bool) -> Tensor:
-        """The volume of the second series; its tilt angles of the opposite sign flip it along z."""
-        return self.volumes[1].flip(0) if inverted else self.volumes[1]
+    def settled(self, pose: _Pose) -> _Pose:
+        """Gauss–Newton steps towards a volume of both series, which lacks less of its frequencies than that of one series."""
+        volume = (self.volumes[0] + self._from_second(self.volumes[1], pose)) / 2
+        for _ in range(_ROUNDS):
+            volume = self._of_both(volume, pose)
+            pose = self._stepped(pose, partial(self._from_volume, volume), _RELAXATION)
+        return self._judged(pose)
 
-    def _residuals(self, pose: _Pose) -> tuple[Tensor, Tensor]:
+    def _from_volume(self, volume: Tensor, pose: _Pose) -> tuple[Tensor, ...]:
+        """Images of the second series minus the projections of a volume in the frame of the first."""
+        return (self._residual(1, self._to_second(volume, pose)),)
+
+    def _of_both(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """SIRT iterations with the images of both series; a turn back stands for the adjoint of a turn."""
+        first, second = self.matchers
+        weights = [matcher.projector.T(seen) for matcher, seen in zip(self.matchers, self.seen, strict=True)]
+        inverse = 1 / (weights[0] + self._from_second(weights[1], pose)).clamp_min(1)
+        lengths = [matcher.projector(torch.ones_like(volume)).clamp_min(1) for matcher in self.matchers]
+        for _ in range(_ITERATIONS // 3):
+            here = (self.images[0] - first.projector(volume)) * self.seen[0] / lengths[0]
+            there = (self.images[1] - second.projector(self._to_second(volume, pose))) * self.seen[1] / lengths[1]
+            update = first.projector.T(here) + self._from_second(second.projector.T(there), pose)
+            volume = (volume + inverse * update).clamp_min(0)
+        return volume
+
+    def _to_second(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """A volume in the frame of the second series."""
+        found = _sampled(volume, pose.rotation, pose.shift / self.binning)
+        return found.flip(0) if pose.inverted else found
+
+    def _from_second(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """The reverse."""
+        back = -(pose.rotation @ pose.shift) / self.binning
+        return _sampled(volume.flip(0) if pose.inverted else volume, pose.rotation.T, back)
+
+    def _residuals(self, pose: _Pose) -> tuple[Tensor, ...]:
         """Images of the first and second series minus the projections of the other's volume, and 0 where nothing is seen."""
-        rotation, shift = pose.rotation, pose.shift / self.binning
-        there = _sampled(self.volumes[0], rotation, shift)
-        there = there.flip(0) if pose.inverted else there
-        here = _sampled(self._second(pose.inverted), rotation.T, -(rotation @ shift))
+        here, there = self._from_second(self.volumes[1], pose), self._to_second(self.volumes[0], pose)
         return self._residual(0, here), self._residual(1, there)
 
     def _residual(self, number: int, volume: Tensor) -> Tensor:
@@ -236,20 +266,21 @@ class _Pair:
             for images, seen, mean in zip(self.images, self.seen, means, strict=True)
         ]
 
-    def _step(self, pose: _Pose) -> _Pose:
-        powers, start = self._power, self._residuals(pose)
-        columns = []
+    def _stepped(self, pose: _Pose, residuals: Callable[[_Pose], tuple[Tensor, ...]], relaxation: float = 1.0) -> _Pose:
+        """A Gauss–Newton step of rotation and shift."""
+        columns, start = list[Tensor](), _joined(residuals(pose))
         for number in range(6):
             step = torch.zeros(6, dtype=torch.float64)
             step[number] = _TURN if number < 3 else _MOVE * self.binning
-            sides = [self._residuals(_moved(pose, sign * step)) for sign in (-1, 1)]
-            columns.append([(up - down) / (2 * step[number]) for down, up in zip(*sides, strict=True)])
-        normal, right = torch.zeros(6, 6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
-        for number, (residual, power) in enumerate(zip(start, powers, strict=True)):
-            slopes = torch.stack([column[number].flatten() for column in columns]).double().cpu()
-            normal += slopes @ slopes.T / float(power)
-            right += slopes @ residual.flatten().double().cpu() / float(power)
-        return _moved(pose, -torch.linalg.lstsq(normal, right[:, None]).solution[:, 0])
+            down, up = (_joined(residuals(_moved(pose, sign * step))) for sign in (-1, 1))
+            columns.append((up - down) / (2 * step[number]))
+        slopes = torch.stack(columns)
+        step = torch.linalg.lstsq(slopes @ slopes.T, (slopes @ start)[:, None]).solution[:, 0].cpu()
+        return _moved(pose, -relaxation * step)
+
+
+def _joined(residuals: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat([residual.flatten() for residual in residuals]).double()
 
 
 def _moved(pose: _Pose, step: Tensor) -> _Pose:
