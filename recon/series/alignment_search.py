@@ -25,9 +25,8 @@ _KEPT = (6, 3)  # number of directions kept after the smallest size, and after t
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
 _EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
 _ROUNDS, _FEWER_ROUNDS = 15, 5
-_AGAIN = (
-    3  # refinements before equally good directions are declared equal, because wrong ones move towards the true one
-)
+# Refinements before equally good directions are declared equal, because wrong ones move towards the true one
+_AGAIN = 3
 
 
 class AxisUndetermined(ValueError):

@@ -23,9 +23,8 @@ _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-_LEAST_DRIFT = (
-    0.04  # constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-)
+# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
+_LEAST_DRIFT = 0.04
 _FEWEST = 8
 _EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
