@@ -13,6 +13,7 @@ from noiseflow.commands.console import JsonOption, Output
 from noiseflow.commands.locations import OWN, folder_of, modules_of, shadows
 from noiseflow.installation import DISTRIBUTION, install_command, library_version
 from noiseflow.plugins import GROUPS, load_plugin, plugins
+from noiseflow.threads import waiting
 
 _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
 
@@ -30,7 +31,8 @@ def doctor(json: JsonOption = False) -> None:
     for problem in problems:
         out.line(f"\nwarning: {problem}")
     devices = _devices()
-    out.line(f"\ndevices: {'; '.join(devices)}\n")
+    out.line(f"\ndevices: {'; '.join(devices)}")
+    out.line(f"idle threads: {waiting()}; set this in your own programs too, before Python starts\n")
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
     rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
     for name, advice in rows:
@@ -47,6 +49,7 @@ def doctor(json: JsonOption = False) -> None:
             "folders": folders,
             "problems": problems,
             "devices": devices,
+            "idle_threads": waiting(),
             "extras": {
                 name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
             },

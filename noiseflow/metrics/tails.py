@@ -10,7 +10,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from noiseflow.described import described
-from noiseflow.distributions.numerical import as_noise_distribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 BEYOND = (3.0, 4.0, 5.0)
 """Distances from the mean, standard deviations of the model."""

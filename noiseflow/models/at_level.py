@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ModelAround
 
 
 class AtLevel(ModelAround):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.dead_time import DeadTimeDistribution
+from noiseflow.distributions.laws.dead_time import DeadTimeDistribution
 from noiseflow.models.base import NoiseModelBase
 
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval
-from noiseflow.distributions.normal import normal_cdf
-from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf
+from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter

@@ -8,17 +8,18 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import (
-    NoiseDistribution,
+from noiseflow.distributions.electrons.exact import log_density, log_tail
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import (
+    hazard_of,
     log_normal_cdf,
     log_normal_interval,
+    normal_cdf,
     normal_hazard,
 )
-from noiseflow.distributions.electrons import log_density, log_tail
-from noiseflow.distributions.normal import hazard_of, normal_cdf
-from noiseflow.distributions.pixelwise import compilable, pixelwise
-from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)

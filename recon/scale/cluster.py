@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from noiseflow.installation import install_command
+from noiseflow.threads import PASSIVE, waiting
 
 _ONE_AT_A_TIME = threading.Lock()
 _PATIENCE = 20  # s; a running scheduler answers within one
@@ -62,6 +63,8 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     options: dict[str, Any] = {"dashboard_address": None, "processes": True, "silence_logs": 50}
+    if not waiting():
+        options["env"] = PASSIVE
     threads = max(1, usable_cores() // (workers or 1))
     with (
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
