@@ -15,7 +15,7 @@ import noiseflow
 from noiseflow import Gaussian, SignalDependentGaussian, fit
 from recon.benchmarks.scenes import Cell, Results
 from recon.benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace

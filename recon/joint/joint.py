@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from noiseflow import Gaussian
 from noiseflow.distributions.picked import needs_image
 from noiseflow.kept_memory import kept_memory
-from recon.fields.fields import Field, MultiresolutionField
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers._names import DEFAULT
@@ -32,7 +33,7 @@ from recon.joint.vacuum import stays_empty
 from recon.projection.base import Projector
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.image_formation import Linear
-from recon.projection.projector import SliceProjector, from_rays
+from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -256,6 +257,7 @@ class JointReconstructor:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             made = self.make_field(grid.shape, scale=scale).to(self.device)
+        made.voxel_size = grid.voxel_size
         rate = learning_rate(rough, made)
         rough = rough if rows is None else start.rows(rows).to(self.device)
         made.start_from(rough)
@@ -384,11 +386,9 @@ class JointReconstructor:
         """Fit the volume with the choices made."""
         result, model = run.fit_whole(), run.runner.tasks["whole"].signal_model
         noise_model = run.noise_model
-        with torch.no_grad():
-            volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
-            shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
-            images = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-        found = Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
+        model.field.occupied = None if model.occupancy is None else model.occupancy.mask
+        volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
+        found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 
 

@@ -98,7 +98,9 @@ MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], in
 SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
-_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty")
+_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty", "field")
+# relative difference; sizes in file headers are rounded to four digits and more
+_SAME_SIZE = 1e-3
 
 
 @described()
@@ -117,6 +119,7 @@ class Method:
         plan: function that returns the stages of its fit, the number of slices of the slab, and the share of voxels that are not
             skipped; None if there is no plan.
         blockwise: function that makes the choices for all slices; None if blocks are not supported.
+        memory: bytes that it needs besides those for the grid and the images.
 
     Example:
         >>> from recon.methods import find_method
@@ -134,10 +137,15 @@ class Method:
     refuses: tuple[str, ...] = ()
     plan: MakePlan | None = None
     blockwise: SettleBlocks | None = None
+    memory: int = 0
 
     def takes(self, setting: str) -> bool:
         """Whether it supports a setting."""
         return setting not in self.refuses and (self.fitted or setting not in _OF_FITS)
+
+    def more_memory(self, field: str | None = None) -> int:
+        """Bytes for the method and the named field besides those for the grid and the images."""
+        return self.memory + (max(kind.more_memory for kind in field_kinds(field)) if self.takes("field") else 0)
 
 
 _Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
@@ -227,6 +235,7 @@ def reconstruct(
         True
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
+    _require_pixels(tilt_series, grid)
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
         result = reconstruct(
@@ -258,6 +267,25 @@ def reconstruct(
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+
+
+def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
+    """Check that voxels are as large as pixels.
+
+    Raises:
+        ValueError: they are not.
+    """
+    height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
+    if grid.height != height:
+        raise ValueError(
+            f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights, and "
+            "voxel_size for other voxels"
+        )
+    if pixel is not None and grid.voxel_size is not None and not np.isclose(grid.voxel_size, pixel, rtol=_SAME_SIZE):
+        raise ValueError(
+            f"the grid has voxels of {grid.voxel_size:g} Å and the images pixels of {pixel:g} Å; give a grid of pixels, and "
+            "voxel_size for other voxels"
+        )
 
 
 def _of_distinct_tilts(

@@ -1,7 +1,7 @@
 """Least squares on plain voxels without total variation, with early stopping."""
 
 from noiseflow import Gaussian
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.methods._fitted import fitted
 
 METHOD = fitted(

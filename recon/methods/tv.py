@@ -1,7 +1,7 @@
 """Least squares with total variation on plain voxels."""
 
 from noiseflow import Gaussian
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers.total_variation import TotalVariation
 from recon.methods._fitted import fitted
 
