@@ -83,7 +83,7 @@ def test_wheel_is_small_whole_and_licensed(shipped: Path) -> None:
     sources = {str(f.relative_to(ROOT)) for p in ("noiseflow", "recon", "calibration") for f in (ROOT / p).rglob("*")}
     wanted = {name for name in sources if (ROOT / name).is_file() and "__pycache__" not in name}
     assert wanted <= set(names), sorted(wanted - set(names))
-    assert not [name for name in names if re.match(r"(tests|docs|build)/", name)]
+    assert not [name for name in names if re.match(r"(tests|docs|build|benchmarks)/", name)]
     licences = {name.split("/licenses/")[1] for name in names if "/licenses/" in name}
     data = {str(f.relative_to(ROOT)) for p in ("noiseflow", "recon") for f in (ROOT / p / "data").rglob("LICENSE")}
     assert licences == data | {"LICENSE"}

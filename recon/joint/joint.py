@@ -213,7 +213,7 @@ class JointReconstructor:
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
         """The slices with the highest and the lowest contrast, and their signal model."""
-        num_slices = self._num_slices(grid)
+        num_slices = self.num_slices(grid)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
         rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
@@ -284,7 +284,7 @@ class JointReconstructor:
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and noise < _QUIET
         described = quiet and given is None  # by a noise model that is fitted after the volume
-        rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
+        rows = contrast_slab(tilt_series, self.num_slices(whole.field, quiet=quiet))
         facts = Facts(
             choose_noise=given is None and not described,
             learn_noise=given is None or learns(given),
@@ -372,7 +372,7 @@ class JointReconstructor:
     def _halvings(self, model: TomographySignal) -> int:
         return HalfResolution.times(model) if self.coarse_to_fine else 0
 
-    def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
+    def num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
         """Number of slices of the slab. Small slices need more to distinguish weights, and gaps of tilts need twice as many
         voxels. Quiet series, with long trial fits, use no more than that."""
         if self.slab is not None:

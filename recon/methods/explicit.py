@@ -8,5 +8,5 @@ METHOD = fitted(
     "explicit",
     "Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best.",
     lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "weight": 0.0},
-    refuses=("weight", "regulariser"),
+    refuses=("weight", "regulariser", "field"),
 )

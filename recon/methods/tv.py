@@ -9,5 +9,5 @@ METHOD = fitted(
     "tv",
     "Least squares with total variation on plain voxels.",
     lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "regulariser": TotalVariation()},
-    refuses=("regulariser",),
+    refuses=("regulariser", "field"),
 )

@@ -80,7 +80,15 @@ def find_alignment(
         search = _Search(tilt_series, tilt_axis, device, progress)
         match, evidence = search.run()
     shifts = match.shifts.double().cpu().numpy()
-    return Alignment(search.stated(match.degrees), shifts, tilt_series.tilt_angles, tuple(evidence))
+    height, width = tilt_series.images.shape[1:]
+    return Alignment(
+        search.stated(match.degrees),
+        shifts,
+        tilt_series.tilt_angles,
+        tuple(evidence),
+        image_shape=(height, width),
+        pixel_size=tilt_series.pixel_size,
+    )
 
 
 @dataclass(frozen=True)

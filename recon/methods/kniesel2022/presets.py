@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from recon.methods.kniesel2022.network import DENSEST, CoordinateDensity, PaperField, PaperFlow, by_density, stratified
+from recon.fields.kinds.kniesel2022 import DENSEST, CoordinateDensity, PaperField
+from recon.methods.kniesel2022.network import PaperFlow, by_density, stratified
 from recon.projection.image_formation import Transmission
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid

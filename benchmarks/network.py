@@ -1,0 +1,62 @@
+"""The coordinate network of Kniesel et al. (CVPR 2022), evaluated once on the whole voxel grid and projected to all tilts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from noiseflow import Gaussian, fit
+from recon.fields.kinds.kniesel2022 import DENSEST, PaperField
+from recon.joint.joint import JointReconstructor
+from recon.joint.signal_model import TomographySignal
+from recon.joint.task import block_mask
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+WIDTHS = (32, 64, 128, 256)
+_DENSITY_SCALE = 7.0
+_STEPS = 300
+_HIGHEST_RATE, _RATE_TIMES_WIDTH = 0.02, 1.28
+_EMPTY = -4.0
+
+
+def fit_network(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    *,
+    width: int,
+    noise_model: Callable[[], nn.Module] | None = None,
+    num_steps: int = _STEPS,
+    seed: int = 0,
+) -> NDArray[Any]:
+    """Fit the network by least squares, then with a noise model if given; held-out pixels select the best step.
+
+    Args:
+        tilt_series: the data.
+        grid: the voxel grid.
+        width: width of the hidden layers.
+        noise_model: function that creates a noise model to fit jointly with the volume.
+        num_steps: full-batch steps of Adam; half of them by least squares if there is a noise model.
+        seed: seed of all random choices.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        start = JointReconstructor(noise_model=Gaussian, seed=seed).signal_model(tilt_series, grid)
+        field = PaperField(grid.shape, width=width, scale=2 * _DENSITY_SCALE / DENSEST / grid.width)
+        nn.init.constant_(field.network.last.bias, _EMPTY)  # type: ignore[union-attr, arg-type]
+        rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
+        model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)
+        images = torch.from_numpy(np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32))
+        generator = torch.Generator().manual_seed(seed)
+        held_out = block_mask(images.shape, generator=generator)
+        options: dict[str, Any] = {"held_out": held_out, "generator": generator, "digitise": False}
+        first = num_steps if noise_model is None else math.ceil(num_steps / 2)
+        fit(Gaussian(), model, images, num_steps=first, **options)
+        if noise_model is not None:
+            fit(noise_model(), model, images, num_steps=num_steps - first, learning_rate=0.03, **options)
+    return field.volume().numpy()
