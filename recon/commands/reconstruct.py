@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 @option_groups(
     {
         "Input": ("angles", "channel", "alignment", "mask", "mask_nan", "invert_contrast"),
-        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus", "defocus_kernel"),
         "Method": ("preset", "field", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
         "Output": ("voxel_size", "save_field", "save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
@@ -172,6 +172,13 @@ def reconstruct(
             "ignored below a quarter of a pixel."
         ),
     ] = 0.0,
+    defocus_kernel: Annotated[
+        str,
+        typer.Option(
+            help="What the blur depends on: depth of each voxel; or image: distance of the pixel from the tilt axis times "
+            "tan(tilt), as in Kniesel et al. 2022."
+        ),
+    ] = "depth",
     slices_at_once: Annotated[
         int | None,
         typer.Option(min=1, help="Reconstruct in blocks of this many slices; chosen automatically for large volumes."),
@@ -237,7 +244,7 @@ def reconstruct(
     method, chosen_device = method_of(method, preset), choose_device(device)
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
     options |= {"regulariser": regulariser, "field": field, "uncertainty": uncertainty}
-    options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
+    options |= {"window": window, "denoiser": denoiser, "defocus": defocus, "defocus_kernel": defocus_kernel}
     settings_of(**options)
     if voxel_size is not None or save_field is not None:
         require_setting(method, "voxel-size" if save_field is None else "save-field")

@@ -82,6 +82,8 @@ class JointReconstructor:
             voxels wide (only without defocus).
         defocus: blur to model, pixels per voxel out of the focal plane, see
             `recon.projection.defocused_projector.DefocusedProjector`.
+        defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
+            `recon.projection.defocused_projector.ImageDefocusedProjector`.
         slab: number of slices of the slab; by default 24, or more if slices are small.
         schedule: numbers of steps and learning rates.
         seed: seed of all random choices.
@@ -110,6 +112,7 @@ class JointReconstructor:
     skip_vacuum: bool = True
     coarse_to_fine: bool = True
     defocus: float = 0.0
+    defocus_kernel: str = "depth"
     slab: int | None = None
     schedule: Schedule = field(default_factory=Schedule)
     seed: int = 0
@@ -198,7 +201,7 @@ class JointReconstructor:
             detector_width=tilt_series.images.shape[2],
             device=self.device,
         )
-        return with_defocus(in_focus, self.defocus)
+        return with_defocus(in_focus, self.defocus, self.defocus_kernel)
 
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]

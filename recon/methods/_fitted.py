@@ -24,7 +24,7 @@ from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
@@ -160,7 +160,7 @@ class FittedBlock:
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit of a method with user settings."""
-    names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
+    names = ("weight", "num_steps", "defocus", "defocus_kernel", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
     if settings.regulariser is not None:
         shared["regulariser"] = find_regulariser(settings.regulariser)
@@ -223,7 +223,7 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
 
 def _describe_defocus(defocus: float, model: TomographySignal) -> str:
     what = "below a quarter of a pixel, ignored"
-    if isinstance(model.projector, DefocusedProjector):
+    if isinstance(model.projector, DefocusedProjector | ImageDefocusedProjector):
         what = f"blurs up to {model.projector.blurs[-1]:.2g} pixels"
     return f"{defocus:g}, {what}"
 

@@ -22,6 +22,7 @@ from recon.joint.plan import FitStage
 from recon.joint.run import Progress, RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._names import GROUP, method_names
+from recon.projection.defocused_projector import KERNELS
 from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
@@ -48,6 +49,7 @@ class Settings:
         window: window of the back-projection, one of `recon.projection.wbp.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
+        defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
         seed: seed of all random choices.
         device: torch device.
         progress: called with completed steps, expected steps and a note.
@@ -72,6 +74,7 @@ class Settings:
     window: str | None = None
     denoiser: str | None = None
     defocus: float = 0.0
+    defocus_kernel: str = "depth"
     seed: int = 0
     device: torch.device | str = "cpu"
     progress: Progress | None = None
@@ -88,6 +91,8 @@ class Settings:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
+        if self.defocus_kernel not in KERNELS:
+            raise ValueError(f"--defocus-kernel {self.defocus_kernel}: choose {' or '.join(KERNELS)}")
         if self.regulariser is not None:
             find_regulariser(self.regulariser)
         field_kinds(self.field)

@@ -16,7 +16,7 @@ from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import DirectionalVariation, Regulariser, SecondOrderVariation, TotalVariation
 from recon.projection.base import Projector
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.projector import SliceProjector
 from recon.projection.tiles import Tiles
 
@@ -29,7 +29,11 @@ def in_focus():
     return SliceProjector(tilt_angles=_ANGLES, depth=6, width=9, detector_width=11, dtype=torch.float64)
 
 
-PROJECTORS = {"slices": in_focus, "defocused": lambda: DefocusedProjector(in_focus(), 0.2)}
+PROJECTORS = {
+    "slices": in_focus,
+    "defocused": lambda: DefocusedProjector(in_focus(), 0.2),
+    "defocused in the image": lambda: ImageDefocusedProjector(in_focus(), 0.2),
+}
 
 
 class SumOfAttenuation(Regulariser):
