@@ -36,7 +36,15 @@ def preset_method(name: str, description: str) -> Method:
         choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
         return Reconstruction(volume, model.images(), name, state.noise_model, signal_model=model, choices=choices)
 
-    return Method(name, description, run, learns_noise=True, memory=PRESETS[name].memory, continuous=True)
+    return Method(
+        name,
+        description,
+        run,
+        learns_noise=True,
+        memory=PRESETS[name].memory,
+        continuous=True,
+        refuses=("second axis",),
+    )
 
 
 METHOD = preset_method(
