@@ -175,6 +175,8 @@ def _with_field(
     """The settings with the field that ``auto`` chooses, and what it is to tell of the choice."""
     if settings.field != AUTO:
         return settings, {} if settings.field is None else {"field": settings.field}
+    if tilt_series.axes is not None:
+        raise ValueError("--field auto compares fields on some slices, which two axes share; name a field")
     fit, kinds = reconstructor(settings, options), field_kinds(AUTO)
     choice = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
     return replace(settings, field=choice.name), {"field": choice.in_words()}

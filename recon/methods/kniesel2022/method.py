@@ -7,7 +7,7 @@ from dataclasses import replace
 from recon.joint.signal_model import TomographySignal
 from recon.methods._registry import Method, Settings
 from recon.methods.kniesel2022.presets import PRESETS
-from recon.projection.projector import SliceProjector
+from recon.projection.dual_axis import projector_of
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -24,13 +24,7 @@ def preset_method(name: str, description: str) -> Method:
         preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)
         state = preset.start(tilt_series, max_steps=settings.num_steps)
         settings.run_stage(name, state)
-        projector = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles,
-            depth=grid.depth,
-            width=grid.width,
-            detector_width=width,
-            device=settings.device,
-        )
+        projector = projector_of(tilt_series, grid, settings.device)
         model = TomographySignal(state.field(grid), projector, state.response, weight=0.0)
         volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
         choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
