@@ -1,0 +1,109 @@
+"""The reconstruction of one prepared series by `noiseflow reconstruct`, from the plan to the files."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from noiseflow.commands.console import Output, step_report
+from recon.commands.results import Targets
+from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
+from recon.methods import find_method, reconstruct, settings_of
+from recon.report.page import even_odd, read_reference
+from recon.scale.cluster import client_of
+from recon.series.tilt_series import VolumeGrid
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from noiseflow.checks import Guard
+    from recon.joint.checkpoint import Journal
+    from recon.reconstruction import Reconstruction
+    from recon.series.prepare import Prepared
+    from recon.series.tilt_series import TiltSeries, Volume
+
+
+@dataclass(frozen=True)
+class VolumeRun:
+    """The options of a run; a call reconstructs one volume.
+
+    Attributes:
+        context: the command, for the line that resumes it.
+        output: where results are printed.
+        options: settings of `recon.reconstruct`.
+        noise_model: a fitted noise model that is kept fixed, and its file.
+        device: torch device.
+        thickness, reference, fsc, resume, checkpoint_interval, slices_at_once, workers, scheduler, dry_run: options of the
+            command.
+    """
+
+    context: typer.Context
+    output: Output
+    options: dict[str, Any]
+    device: str
+    noise_model: tuple[nn.Module | None, Path | None] = (None, None)
+    thickness: int | None = None
+    reference: Path | None = None
+    fsc: bool = False
+    resume: bool = False
+    checkpoint_interval: float = 60.0
+    slices_at_once: int | None = None
+    workers: int | None = None
+    scheduler: str | None = None
+    dry_run: bool = False
+    warned: Sequence[str] = field(default=())
+
+    def __call__(self, prepared: Prepared, targets: Targets, inputs: Sequence[Path]) -> dict[str, Any]:
+        """Reconstruct one volume, write its files and print its results; the results for programs."""
+        series, out, output = prepared.tilt_series, targets.volume, self.output
+        grid = VolumeGrid.of(series, self.thickness)
+        truth = None if self.reference is None else read_reference(self.reference, grid)
+        fixed, model_file = self.noise_model
+        settings = _settings(series, grid, {**self.options, "fsc": self.fsc, "slices at once": self.slices_at_once}, model_file)
+        options = self.options | {"noise_model": fixed, "device": self.device}
+        journal = open_journal(out, settings, resume=self.resume, interval=self.checkpoint_interval, output=output)
+        slices_at_once, method = self.slices_at_once, self.options["method"]
+        if slices_at_once is None and series.axes is None:
+            many = self.workers if self.scheduler is None else 2
+            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many)
+        memory = memory_line(series, grid, method, self.device, slices_at_once, self.workers or 1)
+        output.line(memory)
+        disk = disk_line(series, grid, slices_at_once, error_bars=options["uncertainty"] > 0, halves=self.fsc)
+        if slices_at_once is not None or self.dry_run:
+            output.line(disk)
+        if self.dry_run:
+            return _show_plan(series, grid, options, slices_at_once, {"memory": memory, "disk": disk}, output)
+        started = time.perf_counter()
+        with (
+            stoppable(journal, self.context),
+            scratch_beside(out) as scratch,
+            client_of(self.workers, self.scheduler) as client,
+        ):
+            if slices_at_once is not None:
+                options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
+                options |= {"keep": journal.keep, "forget": journal.forget}
+            with step_report(json_mode=output.json) as journal.report:
+                outcome, halves = _solve(series, grid, options, journal, fsc=self.fsc, guard=prepared.guard)
+            result = targets.write(
+                output,
+                series,
+                outcome,
+                seconds=time.perf_counter() - started,
+                inputs=inputs,
+                seed=options["seed"],
+                prepared=prepared,
+                halves=halves,
+                reference=truth,
+                warned=self.warned,
+                filled=None if slices_at_once is None else scratch,
+            )
+        journal.discard()
+        return result
+
+
