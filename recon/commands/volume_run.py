@@ -5,18 +5,22 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import typer
 
 from noiseflow.commands.console import Output, step_report
 from recon.commands.results import Targets
 from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
+from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
+from recon.scale.blocks import fitted_slices
 from recon.scale.cluster import client_of
+from recon.scale.cost import expected_seconds
 from recon.series.tilt_series import VolumeGrid
 
 if TYPE_CHECKING:
@@ -57,7 +61,7 @@ class VolumeRun:
     workers: int | None = None
     scheduler: str | None = None
     dry_run: bool = False
-    warned: Sequence[str] = field(default=())
+    warned: Sequence[str] = ()
 
     def __call__(self, prepared: Prepared, targets: Targets, inputs: Sequence[Path]) -> dict[str, Any]:
         """Reconstruct one volume, write its files and print its results; the results for programs."""
@@ -65,7 +69,9 @@ class VolumeRun:
         grid = VolumeGrid.of(series, self.thickness)
         truth = None if self.reference is None else read_reference(self.reference, grid)
         fixed, model_file = self.noise_model
-        settings = _settings(series, grid, {**self.options, "fsc": self.fsc, "slices at once": self.slices_at_once}, model_file)
+        settings = _settings(
+            series, grid, {**self.options, "fsc": self.fsc, "slices at once": self.slices_at_once}, model_file
+        )
         options = self.options | {"noise_model": fixed, "device": self.device}
         journal = open_journal(out, settings, resume=self.resume, interval=self.checkpoint_interval, output=output)
         slices_at_once, method = self.slices_at_once, self.options["method"]
@@ -88,7 +94,7 @@ class VolumeRun:
             if slices_at_once is not None:
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 options |= {"keep": journal.keep, "forget": journal.forget}
-            with step_report(json_mode=output.json) as journal.report:
+            with step_report(json_mode=output.json_mode) as journal.report:
                 outcome, halves = _solve(series, grid, options, journal, fsc=self.fsc, guard=prepared.guard)
             result = targets.write(
                 output,
@@ -107,3 +113,70 @@ class VolumeRun:
         return result
 
 
+def _solve(
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool, guard: Guard
+) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
+    """The reconstruction, and those of the even and the odd tilts if requested."""
+
+    def progress(done: int, total: int, note: str) -> None:
+        if journal.report is not None:
+            journal.report("reconstructing", done, total, note)
+
+    def halves() -> tuple[Volume, Volume]:
+        even, odd = (
+            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
+            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
+        )
+        return even, odd
+
+    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
+    outcome = reconstruct(tilt_series, grid, **options)
+    return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
+
+
+def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
+    """The options that differ for a half of the tilts."""
+    scratch = options.get("scratch")
+    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
+
+
+def _show_plan(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    options: dict[str, Any],
+    slices_at_once: int | None,
+    needed: dict[str, str],
+    output: Output,
+) -> dict[str, Any]:
+    """Print the plan; its JSON form."""
+    method = find_method(options["method"])
+    result: dict[str, Any] = {"method": method.name, **needed, "slices_at_once": slices_at_once}
+    result |= {"stages": [], "expected_seconds": None}
+    if method.plan is None:
+        output.line(f"{method.name}: {method.description} This method has no plan of stages.")
+    else:
+        made = {name: value for name, value in options.items() if name != "method"}
+        stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
+        fitted = None if slices_at_once is None else fitted_slices(grid.height, slices_at_once)
+        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted)
+        output.line(f"slab: {slab} of {grid.height} slices")
+        output.line(describe(stages))
+        output.line(f"expected: about {seconds:.0f} s on this machine")
+        result |= {"stages": [asdict(stage) for stage in stages], "expected_seconds": seconds}
+    return result
+
+
+def _settings(
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], noise_model: Path | None
+) -> dict[str, Any]:
+    """All settings that determine the volume, with digests of the data."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam, tilt_series.axes):
+        if array is not None:
+            digest.update(f"{array.dtype}{array.shape}".encode())
+            for part in array:
+                digest.update(np.ascontiguousarray(part).tobytes())
+    data = {"tilt series": digest.hexdigest(), "mode": tilt_series.mode, "grid": list(grid.shape)}
+    known = noise_model is not None and noise_model.is_file()
+    model = hashlib.blake2b(noise_model.read_bytes(), digest_size=16).hexdigest() if noise_model and known else None
+    return {**options, **data, "noise model": model}
