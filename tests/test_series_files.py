@@ -346,3 +346,70 @@ def test_transforms_made_on_unbinned_images_are_scaled(tmp_path: Path) -> None:
     assert given.shifts[0].tolist() == [1, -2]
     io.write(tmp_path / "a.st", raw)  # the stack that was aligned
     assert recon.read_alignment(tmp_path / "a.xf", series).joined(series).shifts[0].tolist() == [1, -2]
+
+
+@with_cases
+def test_pixels_are_in_the_sense_that_their_writer_meant() -> None:
+    plain = io.read(CASES / "bf_u8.tif").data
+    np.testing.assert_array_equal(io.read(CASES / "bf_imodsigned.mrc").data, plain)
+    masks = [io.read(CASES / name).data != 0 for name in ("mask_imod.mrc", "mask_ok.tif")]
+    np.testing.assert_array_equal(*masks)
+    assert io.read(CASES / "u8_nostat.mrc").data.max() == 250
+    with pytest.warns(UserWarning, match="MINISWHITE"):
+        white = recon.read_tilt_series(CASES / "msw.tif")
+    assert likeness(white.images, projections("truth.mrc", white.tilt_angles)).min() > 0.9
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_miniswhite_is_inverted_for_every_depth(tmp_path: Path, mapped: bool) -> None:
+    for kind in (np.uint8, np.uint16):
+        data = np.arange(120).reshape(4, 5, 6).astype(kind)
+        tifffile.imwrite(tmp_path / "a.tif", np.iinfo(kind).max - data, photometric="miniswhite")
+        with pytest.warns(UserWarning, match="MINISWHITE"):
+            np.testing.assert_array_equal(io.read(tmp_path / "a.tif", mapped=mapped).data, data)
+    tifffile.imwrite(tmp_path / "a.tif", data.astype(np.float32), photometric="miniswhite")
+    with pytest.raises(ValueError, match="MINISWHITE"):
+        io.read(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate", "angstrom"),
+    [("CENTIMETER", 1e7, 10), ("INCH", 2.54e7, 10), ("INCH", 300, None), ("INCH", 1200, None), ("NONE", 5, None)],
+)
+def test_resolutions_for_printers_are_sizes_if_they_are_fine_enough(
+    tmp_path: Path, unit: str, rate: float, angstrom
+) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", STACK, resolution=(rate, rate), resolutionunit=unit, photometric="minisblack")
+    found = io.read(tmp_path / "a.tif").voxel_size
+    assert found == (None if angstrom is None else pytest.approx((angstrom,) * 3, rel=1e-6))
+
+
+@pytest.mark.parametrize("suffix", [".mrc.gz", ".st.bz2", ".preali", ".hdf"])
+def test_packed_stacks_and_further_suffixes(suffix: str, tmp_path: Path) -> None:
+    import bz2
+    import gzip
+
+    import h5py
+
+    path = tmp_path / f"series{suffix}"
+    io.write(tmp_path / "plain.mrc", STACK, voxel_size=(3.0,) * 3)
+    plain = (tmp_path / "plain.mrc").read_bytes()
+    if suffix == ".hdf":
+        with h5py.File(path, "w") as file:
+            file["images"] = STACK
+    else:
+        path.write_bytes({".mrc.gz": gzip.compress, ".st.bz2": bz2.compress}.get(suffix, bytes)(plain))
+    (tmp_path / "series.rawtlt").write_text("-9\n0\n9\n")
+    series = recon.read_tilt_series(path)
+    np.testing.assert_array_equal(series.images, STACK)
+    assert series.tilt_angles.tolist() == [-9, 0, 9]
+    if suffix != ".hdf":
+        path.write_bytes(path.read_bytes()[:-60])
+        with pytest.raises(ValueError, match="cannot be read"):
+            recon.read_tilt_series(path)
+
+
+def test_an_emi_file_needs_the_ser_file_of_its_pixels(tmp_path: Path) -> None:
+    (tmp_path / "a.emi").write_bytes(bytes(100))
+    with pytest.raises(ValueError, match=r"a_1\.ser"):
+        io.read(tmp_path / "a.emi")

@@ -18,6 +18,7 @@ from noiseflow.io.image_file import (
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
+    PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
     TIFF_SUFFIXES,
@@ -65,6 +66,8 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
+    if path.suffix.lower() in PACKED_SUFFIXES:
+        return _unpacked(path, member or channel)
     reader = _reader(path, member or wanted, mapped=mapped)
     try:
         named = path.suffix.lower() in _NAMED
@@ -155,6 +158,27 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix == PNG_SUFFIX:
         return png.read
     return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
+
+
+def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
+    """The image in a file that gzip or bzip2 packed, such as ``.mrc.gz``; it is unpacked to a temporary file first."""
+    import bz2
+    import gzip
+    import shutil
+    import tempfile
+
+    opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.stem
+        try:
+            with opener(path, "rb") as packed, plain.open("wb") as target:
+                shutil.copyfileobj(packed, target)
+            image = read(plain, channel=channel)
+        except (EOFError, gzip.BadGzipFile) as error:
+            raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(plain), str(path))) from error
+    return image
 
 
 def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:
