@@ -71,7 +71,8 @@ def test_one_volume_for_each_element_and_one_report(maps, run):
     shapes = {io.read(maps / f"v_{name}.mrc").data.shape for name in ("iron", "oxygen")}
     assert len(shapes) == 1
     page = (maps / "report" / "index.html").read_text(encoding="utf-8")
-    assert "iron" in page and "oxygen" in page
+    assert "iron" in page
+    assert "oxygen" in page
     again = run(
         "reconstruct",
         maps / "iron.npy",
