@@ -16,6 +16,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from noiseflow.installation import DISTRIBUTION
+
 PICTURES = Path(__file__).resolve().parent / "images" / "screenshots"
 EXPOSURES = "exposures_miro/channel1_050ms.tif", "exposures_miro/channel1_long.tif"
 COLOURS = 64  # of a palette: text stays sharp, and a picture below 150 kB
@@ -52,9 +54,9 @@ def take_napari(folder: Path) -> None:
     viewer = napari.Viewer(show=True)
     viewer.window.resize(1280, 720)
     for file, colours in ((needle, "gray"), (folder / "needle.mrc", "inferno")):
-        (layer,) = viewer.open([file], plugin="noiseflow", colormap=colours)
+        (layer,) = viewer.open([file], plugin=DISTRIBUTION, colormap=colours)
         layer.contrast_limits = 0, float(layer.data.max())
-    viewer.window.add_plugin_dock_widget("noiseflow", "Reconstruct a tilt series")
+    viewer.window.add_plugin_dock_widget(DISTRIBUTION, "Reconstruct a tilt series")
     viewer.grid.enabled = True
     viewer.dims.set_current_step(0, 32)
     for _ in range(20):

@@ -6,6 +6,8 @@ import warnings
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from noiseflow.installation import DISTRIBUTION
+
 GROUPS = (
     "noiseflow.commands",
     "noiseflow.methods",
@@ -13,14 +15,13 @@ GROUPS = (
     "noiseflow.regularisers",
     "noiseflow.self_tests",
 )
-_OWN = "noiseflow"
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
     """The entry points of a group by name, not loaded; those of noiseflow itself come first."""
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=group):
-        if point.name not in found or package_of(point) == _OWN:
+        if point.name not in found or package_of(point) == DISTRIBUTION:
             found[point.name] = point
     return found
 

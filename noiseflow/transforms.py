@@ -5,7 +5,6 @@ Up to version 0.1, this module held the monotone maps of flows, now in ``noisefl
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -120,15 +119,3 @@ def _wrapped_like(noisy: Tensor, image: Tensor) -> Tensor:
 
     wrapped: Tensor = tv_tensors.wrap(noisy, like=image)
     return wrapped
-
-
-def __getattr__(name: str) -> Any:
-    """Names that this module had in version 0.1, kept for one version."""
-    from noiseflow.distributions import transforms as increasing_maps
-
-    if name.startswith("_") or not hasattr(increasing_maps, name):
-        raise AttributeError(f"module 'noiseflow.transforms' has no attribute {name!r}")
-    warnings.warn(
-        f"{name} has moved; import it from noiseflow.distributions.transforms", DeprecationWarning, stacklevel=2
-    )
-    return getattr(increasing_maps, name)

@@ -17,9 +17,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+import benchmarks.named
 import calibration.report.page
 import noiseflow
-import recon.benchmarks.named
 import recon.commands.results
 import recon.simulate.streaming
 from noiseflow import io
@@ -39,7 +39,7 @@ COMMANDS = {
     "benchmark": "--quick --size 12 --out {out}/benchmark",
     "demo": "--out {out}/demo",
 }
-LOADED = (calibration.report, recon.benchmarks.named, recon.commands.results, recon.simulate.streaming)
+LOADED = (calibration.report, benchmarks.named, recon.commands.results, recon.simulate.streaming)
 SPAN = {"sample": 0.3, "simulate": 0.8, "compare": 2.0, "evaluate": 4.0, "reconstruct": 6.0}
 """Seconds to stop within; about as long as the command takes, or some of the longer ones' many."""
 

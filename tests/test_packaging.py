@@ -17,13 +17,16 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from noiseflow import installation
+from noiseflow.installation import DISTRIBUTION
+
 ROOT = Path(__file__).parent.parent
 
 
 def test_constraints_pin_everything_the_tests_install() -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {canonicalize_name(line.split("==")[0]) for line in lines if "==" in line}
-    pending, seen = [("noiseflow", "test")], set()
+    pending, seen = [(DISTRIBUTION, "test")], set()
     while pending:
         name, extra = pending.pop()
         seen.add((name, extra))
@@ -36,7 +39,7 @@ def test_constraints_pin_everything_the_tests_install() -> None:
                 continue
             wanted = [(canonicalize_name(requirement.name), each) for each in ("", *requirement.extras)]
             pending += [each for each in wanted if each not in seen]
-    installed = {name for name, _ in seen if _is_installed(name)} - {"noiseflow", "pip", "setuptools"}
+    installed = {name for name, _ in seen if _is_installed(name)} - {DISTRIBUTION, "pip", "setuptools"}
     cuda = {name for name in installed if name.startswith(("nvidia-", "cuda-")) or name == "triton"}
     assert installed - cuda <= pinned, f"not in constraints.txt: {sorted(installed - cuda - pinned)}"
 
@@ -80,7 +83,7 @@ def test_wheel_is_small_whole_and_licensed(shipped: Path) -> None:
     sources = {str(f.relative_to(ROOT)) for p in ("noiseflow", "recon", "calibration") for f in (ROOT / p).rglob("*")}
     wanted = {name for name in sources if (ROOT / name).is_file() and "__pycache__" not in name}
     assert wanted <= set(names), sorted(wanted - set(names))
-    assert not [name for name in names if re.match(r"(tests|docs|build)/", name)]
+    assert not [name for name in names if re.match(r"(tests|docs|build|benchmarks)/", name)]
     licences = {name.split("/licenses/")[1] for name in names if "/licenses/" in name}
     data = {str(f.relative_to(ROOT)) for p in ("noiseflow", "recon") for f in (ROOT / p / "data").rglob("LICENSE")}
     assert licences == data | {"LICENSE"}
@@ -117,7 +120,7 @@ def test_demo_of_the_installed_wheel_needs_no_checkout(shipped: Path, tmp_path: 
 
 def test_what_pip_installs_by_default_is_free_of_the_gpl() -> None:
     """The extra [formats] brings RosettaSciIO, GPL-3.0; nobody gets it without asking for it."""
-    pending, seen = ["noiseflow"], set()
+    pending, seen = [DISTRIBUTION], set()
     while pending:
         name = pending.pop()
         if name in seen or not _is_installed(name):
@@ -143,3 +146,16 @@ def test_supported_pythons_are_said_alike_everywhere() -> None:
     versions = {c.split(" :: ")[-1] for c in project["classifiers"] if re.search(r"Python :: 3\.\d+$", c)}
     assert versions == {"3.11"}
     assert "Python ≥ 3.11" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_no_hint_installs_the_other_project_that_has_our_import_name() -> None:
+    """`pip install noiseflow` would install another project of the index; hints name our distribution or the checkout."""
+    files = [file for name in ("noiseflow", "recon", "calibration", "docs") for file in (ROOT / name).rglob("*.*")]
+    texts = [file for file in [*files, *ROOT.glob("*.md")] if file.suffix in {".py", ".md", ".ipynb", ".yaml"}]
+    wrong = re.compile(r"pip install (-\S+ )*['\"]?noiseflow(?!-)")
+    assert not [str(file.relative_to(ROOT)) for file in texts if wrong.search(file.read_text(encoding="utf-8"))]
+
+
+def test_hints_outside_a_checkout_name_our_distribution(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(installation, "_CHECKOUT", tmp_path)
+    assert installation.install_command("formats") == f"pip install '{DISTRIBUTION}[formats]'"

@@ -19,6 +19,7 @@ import noiseflow
 import recon
 from noiseflow import metrics
 from noiseflow.fitting.selection import select
+from noiseflow.installation import library_version
 from noiseflow.metrics.spatial import spatial_structure
 from recon.methods import find_method
 
@@ -258,10 +259,9 @@ def program(*words: str, **environment: str) -> subprocess.CompletedProcess[str]
 
 
 def test_version_is_the_packages() -> None:
-    from importlib.metadata import version
 
     done = program("--version")
-    assert (done.returncode, done.stdout.split()) == (0, ["noiseflow", version("noiseflow")])
+    assert (done.returncode, done.stdout.split()) == (0, ["noiseflow", library_version()])
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 HERE = Path(__file__).resolve().parent
 FOLDER = HERE / "generated"
 PAGES = sorted(page for page in HERE.glob("*.md") if page.stem != "index")
-NEEDS = "*A tutorial of noiseflow; its one requirement is `pip install noiseflow`.*"
+NEEDS = "*A tutorial of noiseflow; its one requirement is `pip install noiseflow-microscopy`.*"
 BLOCK = re.compile(r"^```(python|sh|\{literalinclude\})([^\n]*)\n(.*?)^```\n", flags=re.DOTALL | re.MULTILINE)
 INCLUDED = re.compile(r"^```\{include\} (\S+)\n:start-after: (.+)\n:end-before: \"?(.+?)\"?\n```", flags=re.MULTILINE)
 SAVED = re.compile(r'^figure\.savefig\("([^"]+)"', flags=re.MULTILINE)

@@ -12,7 +12,6 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
@@ -21,7 +20,9 @@ from typer.core import TyperCommand, TyperGroup
 from noiseflow.commands.console import START_AGAIN, Invocation, end_stopped, invoked
 from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
+from noiseflow.installation import DISTRIBUTION, library_version
 from noiseflow.plugins import load_plugin, package_of, plugins
+from noiseflow.threads import wait_passively
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "measure", "doctor")
 _TYPED = "noiseflow.typed"
@@ -45,7 +46,7 @@ def build_app() -> typer.Typer:
     for name in sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
         try:
             command = load_plugin(found[name])
-            if package_of(found[name]) != "noiseflow":
+            if package_of(found[name]) != DISTRIBUTION:
                 _require_command(command)
         except (ImportError, TypeError) as error:
             app.command(name, context_settings=_ANY_WORDS)(_broken(str(error)))
@@ -149,7 +150,7 @@ def _flags_without_type(parameters: list[Any]) -> list[Any]:
 
 def _show_version(asked: bool) -> None:
     if asked:
-        print(f"noiseflow {version('noiseflow')}")
+        print(f"noiseflow {library_version()}")
         raise typer.Exit()
 
 
@@ -166,6 +167,7 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
+    wait_passively()
     with steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)

@@ -11,7 +11,9 @@ import typer
 
 from noiseflow.commands.console import JsonOption, Output
 from noiseflow.commands.locations import OWN, folder_of, modules_of, shadows
+from noiseflow.installation import DISTRIBUTION, install_command, library_version
 from noiseflow.plugins import GROUPS, load_plugin, plugins
+from noiseflow.threads import waiting
 
 _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
 
@@ -21,7 +23,7 @@ def doctor(json: JsonOption = False) -> None:
     out = Output(json)
     packages = _packages()
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
-    out.line(f"noiseflow {version('noiseflow')}, {python}\n")
+    out.line(f"noiseflow {library_version()}, {python}\n")
     folders = _folders(list(packages))
     packed = [(name, found or "missing", folders[name]) for name, found in packages.items()]
     out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *packed])
@@ -29,7 +31,8 @@ def doctor(json: JsonOption = False) -> None:
     for problem in problems:
         out.line(f"\nwarning: {problem}")
     devices = _devices()
-    out.line(f"\ndevices: {'; '.join(devices)}\n")
+    out.line(f"\ndevices: {'; '.join(devices)}")
+    out.line(f"idle threads: {waiting()}; set this in your own programs too, before Python starts\n")
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
     rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
     for name, advice in rows:
@@ -42,10 +45,11 @@ def doctor(json: JsonOption = False) -> None:
     out.result(
         {
             "healthy": healthy,
-            "versions": {"noiseflow": version("noiseflow"), "python": platform.python_version(), **packages},
+            "versions": {"noiseflow": library_version(), "python": platform.python_version(), **packages},
             "folders": folders,
             "problems": problems,
             "devices": devices,
+            "idle_threads": waiting(),
             "extras": {
                 name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
             },
@@ -123,11 +127,11 @@ def _requirements() -> dict[str, list[str]]:
     from packaging.requirements import Requirement
 
     found: dict[str, list[str]] = {}
-    for line in requires("noiseflow") or []:
+    for line in requires(DISTRIBUTION) or []:
         requirement = Requirement(line)
         _, _, extra = line.partition("extra == ")
         extra = extra.strip(" \"')")
-        if requirement.name != "noiseflow" and (
+        if requirement.name != DISTRIBUTION and (
             requirement.marker is None or requirement.marker.evaluate({"extra": extra})
         ):
             found.setdefault(extra, []).append(requirement.name)
@@ -135,7 +139,7 @@ def _requirements() -> dict[str, list[str]]:
 
 
 def _advice(extra: str, missing: list[str]) -> str:
-    return f"missing {', '.join(missing)}; install with: pip install 'noiseflow[{extra}]'" if missing else "installed"
+    return f"missing {', '.join(missing)}; install with: {install_command(extra)}" if missing else "installed"
 
 
 def _version(name: str) -> str | None:

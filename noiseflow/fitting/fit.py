@@ -22,6 +22,7 @@ from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.threads import few_threads, warn_if_spinning
 
 _log = logging.getLogger("noiseflow")
 
@@ -146,7 +147,11 @@ def fit(
     if resume is not None:
         loop.load_state(resume)
     schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
-    return loop.run(schedule, progress, checkpoint)
+    if loop.signal_optimiser is not None:
+        warn_if_spinning()
+        return loop.run(schedule, progress, checkpoint)
+    with few_threads(batch_size):
+        return loop.run(schedule, progress, checkpoint)
 
 
 def _usable(signal_model: nn.Module, observation: Tensor, mask: Tensor | None, skip_non_finite: bool) -> Tensor:

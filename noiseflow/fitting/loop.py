@@ -20,6 +20,7 @@ from noiseflow.fitting.pixels import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.threads import few_threads
 
 Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
@@ -150,8 +151,11 @@ class FitLoop:
         joint = self.signal_optimiser is not None
         finite = self._signal_step(schedule.batch_size)
         if self.noise_optimiser is not None and (not joint or step % schedule.noise_interval == 0):
-            for _ in range(schedule.noise_steps if joint else 1):
-                finite &= take_step(self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size)))
+            with few_threads(schedule.batch_size):
+                for _ in range(schedule.noise_steps if joint else 1):
+                    finite &= take_step(
+                        self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size))
+                    )
             if self.average is not None and finite:
                 self.average.update()
             if self.table is not None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.fitting.fit import fit
+from noiseflow.installation import install_command
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.around import as_noise_model
@@ -57,9 +58,7 @@ def _deepinv() -> Any:
     try:
         return import_module("noiseflow.interop.deepinv")
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "this needs deepinv; install it with: python -m pip install 'noiseflow[deepinv]'"
-        ) from error
+        raise ModuleNotFoundError(f"this needs deepinv; install it with: {install_command('deepinv')}") from error
 
 
 def to_pn2v_gmm(

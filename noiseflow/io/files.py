@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from noiseflow.installation import install_command
 from noiseflow.io.folder import files_of
 from noiseflow.io.image_file import WRITE_SUFFIXES
 from noiseflow.io.ownership import require_own
@@ -43,7 +44,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
         )
     is_zarr = path.suffix.lower() == ".zarr"
     if is_zarr and importlib.util.find_spec("zarr") is None:
-        raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: pip install 'noiseflow[formats]'")
+        raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: {install_command('formats')}")
     if path.is_dir() and not is_zarr:
         raise ValueError(f"{path} is a folder; name an output file")
     target = link_target(path)

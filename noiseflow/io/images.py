@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.installation import install_command
 from noiseflow.io.checks import Unsupported, as_array
 from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 from noiseflow.io.image_file import (
@@ -66,7 +67,7 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            "install it with: pip install 'noiseflow[formats]'"
+            f"install it with: {install_command('formats')}"
         ) from error
     except Unsupported as error:
         raise ValueError(f"{path} {error}") from error

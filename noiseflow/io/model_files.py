@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Iterator, Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +12,7 @@ import torch
 from torch import nn
 
 import noiseflow
+from noiseflow.installation import library_version
 from noiseflow.io import check_output
 from noiseflow.io.tensor_files import save_tensors
 from noiseflow.models.base import NoiseModelBase
@@ -104,7 +104,7 @@ def save(
     metadata = {
         "format": "noiseflow noise model",
         "format_version": str(FORMAT_VERSION),
-        "library_version": version("noiseflow"),
+        "library_version": library_version(),
         "model": json.dumps(_describe(model)),
         "units": units or str(getattr(model, "measured_in", "detector units")),
         "provenance": json.dumps(dict(provenance or {}), default=str),

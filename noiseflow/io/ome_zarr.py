@@ -6,13 +6,13 @@ Source: https://ngff.openmicroscopy.org/0.5
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
@@ -52,7 +52,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
     multiscale: dict[str, Any] = {"name": path.stem.split(".")[0], "type": "mean", "datasets": datasets}
     multiscale["axes"] = [{"name": axis, "type": "space", **unit} for axis in axes]
     group.attrs["ome"] = {"version": "0.5", "multiscales": [multiscale]}
-    group.attrs["_creator"] = {"name": MARK, "version": version("noiseflow")}
+    group.attrs["_creator"] = {"name": MARK, "version": library_version()}
 
 
 def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[slice, ...]]:

@@ -9,10 +9,10 @@ files belong to the stack next to them.
 from __future__ import annotations
 
 import json
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from noiseflow.installation import library_version
 from noiseflow.io.image_file import MRC_SUFFIXES, TIFF_SUFFIXES
 
 MARK = "noiseflow"
@@ -22,7 +22,7 @@ _PAGE_HEAD = 1000
 
 def signature() -> str:
     """The mark with the version, such as ``noiseflow 0.1.0``."""
-    return f"{MARK} {version('noiseflow')}"
+    return f"{MARK} {library_version()}"
 
 
 def require_own(path: Path, *, overwrite: bool) -> None:

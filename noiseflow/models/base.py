@@ -257,7 +257,3 @@ class NoiseModelBase(Described, ABC):
         """Device of the parameters and buffers; the CPU for a model without any."""
         tensors = (tensor for group in (self.parameters(), self.buffers()) for tensor in group)
         return next((tensor.device for tensor in tensors), torch.device("cpu"))
-
-
-ArrayModel = NoiseModelBase
-"""The name of `NoiseModelBase` in version 0.1; kept for one version."""

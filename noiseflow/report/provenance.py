@@ -10,9 +10,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from noiseflow.commands.console import invocation
+from noiseflow.installation import DISTRIBUTION
 from noiseflow.io import files_of
 
-_PACKAGES = ("noiseflow", "torch", "numpy", "scipy")
+_PACKAGES = (DISTRIBUTION, "torch", "numpy", "scipy")
 
 
 def provenance(

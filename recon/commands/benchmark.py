@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -41,8 +42,9 @@ def benchmark(
     """Measure run time against error of every method, on this machine. Interrupted runs resume."""
     from dataclasses import replace
 
-    from recon.benchmarks.named import BENCHMARKS, Options, check_figures
-    from recon.benchmarks.rivals import QUICK, Effort
+    _find_checkout()
+    from benchmarks.named import BENCHMARKS, Options, check_figures
+    from benchmarks.rivals import QUICK, Effort
 
     output = Output(json)
     names = names or ["rivals"]
@@ -69,6 +71,21 @@ def benchmark(
     except KeyboardInterrupt:
         kept = f"finished results are kept in {out}; run the same command to resume"
         raise KeyboardInterrupt(kept) from None
+
+
+def _find_checkout() -> None:
+    """Make the folder `benchmarks` importable, which is part of the source tree and not of the installed package.
+
+    Raises:
+        FileNotFoundError: this is not a source tree.
+    """
+    root = Path(__file__).parents[2]
+    if not (root / "benchmarks" / "named.py").is_file():
+        raise FileNotFoundError(
+            "benchmarks are part of noiseflow's source tree, not of the installed package: clone its repository, "
+            "run `pip install --editable .` there, and start `noiseflow benchmark` again"
+        )
+    sys.path.append(str(root))
 
 
 def _check_method(method: str | None, names: list[str]) -> None:

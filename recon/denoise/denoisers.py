@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
+from noiseflow.installation import install_command
 from recon.denoise import stabilise
 
 Array = NDArray[Any]
@@ -66,7 +67,7 @@ def bm3d(image: Array, strength: float) -> Array:
         import bm3d as package
     except ModuleNotFoundError:
         raise ValueError(
-            "denoiser bm3d needs its package: pip install 'noiseflow[bm3d]' (its licence allows non-commercial use only)"
+            f"denoiser bm3d needs its package: {install_command('bm3d')} (its licence allows non-commercial use only)"
         ) from None
     return np.asarray(package.bm3d(image, sigma_psd=strength))
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
+from noiseflow.installation import library_version
 from noiseflow.io import atomic_path, output_folder
 from noiseflow.io.ownership import is_own
 from noiseflow.io.partials import clear_all_leftovers
@@ -228,7 +228,7 @@ class Journal:
     def _start(self) -> None:
         self._require_own()
         self.discard()
-        description = {"format": _FORMAT, "library_version": version("noiseflow"), "settings": self.settings}
+        description = {"format": _FORMAT, "library_version": library_version(), "settings": self.settings}
         description["choices"] = self._choices
         with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
             partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
@@ -250,7 +250,7 @@ class Journal:
             self._choices = dict(kept.get("choices", {}))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"the checkpoint's {_RUN} is damaged; {advice}") from error
-        if format_ != _FORMAT or kept.get("library_version") != version("noiseflow"):
+        if format_ != _FORMAT or kept.get("library_version") != library_version():
             raise ValueError(f"the checkpoint was written by another version of noiseflow; {advice}")
         names = [name for name in {**settings, **self.settings} if settings.get(name) != self.settings.get(name)]
         if names:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from noiseflow import Gaussian, fit
+from noiseflow.threads import num_threads
 from recon.fields.fields import Field, MultiresolutionField
 from recon.joint.signal_model import TomographySignal
 from recon.projection.image_formation import Linear, Transmission
@@ -90,7 +91,8 @@ def coarse_start(
     rate = learning_rate(start, field)
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
-    fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
+    with num_threads(1):  # operations on 24³ voxels
+        fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
     return field.volume() / binning
 
 

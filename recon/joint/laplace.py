@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 
-class Laplace(ArrayModel):
+class Laplace(NoiseModelBase):
     """Laplace noise with the same width at all signals.
 
     Args:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from recon.napari.files import get_reader, write_image
-from recon.napari.widget import reconstruct_widget
+from noiseflow.threads import wait_passively
+
+wait_passively()  # here, because the plugin's own modules import torch
+from recon.napari.files import get_reader, write_image  # noqa: E402
+from recon.napari.widget import reconstruct_widget  # noqa: E402
 
 __all__ = ["get_reader", "reconstruct_widget", "write_image"]

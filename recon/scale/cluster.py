@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from noiseflow.installation import install_command
+from noiseflow.threads import PASSIVE, waiting
+
 _ONE_AT_A_TIME = threading.Lock()
 _PATIENCE = 20  # s; a running scheduler answers within one
 
@@ -46,7 +49,7 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         import dask.distributed
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "--workers and --scheduler need dask.distributed; install it with: pip install 'noiseflow[distributed]'"
+            f"--workers and --scheduler need dask.distributed; install it with: {install_command('distributed')}"
         ) from error
     library: Any = dask.distributed  # it has no types
     if scheduler is not None:
@@ -60,6 +63,8 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     options: dict[str, Any] = {"dashboard_address": None, "processes": True, "silence_logs": 50}
+    if not waiting():
+        options["env"] = PASSIVE
     threads = max(1, usable_cores() // (workers or 1))
     with (
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,

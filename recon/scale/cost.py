@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
+from noiseflow.threads import num_threads
 from recon.joint.plan import FitStage
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -59,14 +60,10 @@ def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
         detector_width=tilt_series.images.shape[2],
     )
     columns = torch.rand(grid.depth * grid.width, _SLICES)
-    threads, seconds = torch.get_num_threads(), list[float]()
-    torch.set_num_threads(1)  # the CPU time of one thread does not depend on the load
-    try:
-        with torch.no_grad():
-            for _ in range(_REPEATS):
-                started = time.thread_time()
-                projector.backproject(projector.project(columns))
-                seconds.append(time.thread_time() - started)
-    finally:
-        torch.set_num_threads(threads)
-    return min(seconds) / (_SLICES * threads)
+    seconds = list[float]()
+    with torch.no_grad(), num_threads(1):  # the CPU time of one thread does not depend on the load
+        for _ in range(_REPEATS):
+            started = time.thread_time()
+            projector.backproject(projector.project(columns))
+            seconds.append(time.thread_time() - started)
+    return min(seconds) / (_SLICES * torch.get_num_threads())

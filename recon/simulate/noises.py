@@ -16,12 +16,12 @@ from noiseflow.distributions.base import (
     log_normal_interval,
     normal_quadrature,
 )
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
-class KnownNoise(ArrayModel, ABC):
+class KnownNoise(NoiseModelBase, ABC):
     """Base class of noise models without trainable parameters."""
 
     @abstractmethod

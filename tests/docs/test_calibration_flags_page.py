@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import runpy
+from importlib import import_module
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
@@ -11,7 +11,7 @@ BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 def test_page_is_written_from_its_json() -> None:
     rows = json.loads((BENCHMARKS / "results" / "calibration_flags.json").read_text(encoding="utf-8"))
-    script = runpy.run_path(str(BENCHMARKS / "calibration_flags.py"))
+    script = vars(import_module("benchmarks.pages.calibration_flags"))
     assert (BENCHMARKS / "calibration_flags.md").read_text(encoding="utf-8") == script["page"](rows)
     assert len(rows) > 30
     assert not script["silent"](rows)
@@ -19,7 +19,7 @@ def test_page_is_written_from_its_json() -> None:
 
 
 def test_page_of_coverage_is_written_from_its_trials() -> None:
-    script = runpy.run_path(str(BENCHMARKS / "calibration_coverage.py"))
+    script = vars(import_module("benchmarks.pages.calibration_coverage"))
     trials = {kind: script["rows_of"](kind) for kind in script["KINDS"]}
     assert (BENCHMARKS / "calibration_coverage.md").read_text(encoding="utf-8") == script["page"](
         trials, script["machines"]()
@@ -29,5 +29,5 @@ def test_page_of_coverage_is_written_from_its_trials() -> None:
 
 def test_page_of_time_is_written_from_its_json() -> None:
     found = json.loads((BENCHMARKS / "results" / "calibration_time.json").read_text(encoding="utf-8"))
-    script = runpy.run_path(str(BENCHMARKS / "calibration_time.py"))
+    script = vars(import_module("benchmarks.pages.calibration_time"))
     assert (BENCHMARKS / "calibration_time.md").read_text(encoding="utf-8") == script["page"](found)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from benchmarks.pages import calibration, calibration_page
 
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 
@@ -17,23 +18,12 @@ def content() -> dict[str, Any]:
     return found
 
 
-def benchmark() -> Any:
-    spec = importlib.util.spec_from_file_location("calibration_benchmark", BENCHMARKS / "calibration.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_a_part_that_is_not_measured_is_said_to_be_so() -> None:
-    import calibration_page
-
     assert calibration_page.page({}).count("Not measured") == 5
 
 
 def test_json_agrees_with_the_trials_kept() -> None:
-    module, stored = benchmark(), content()["parameters"]
+    module, stored = calibration, content()["parameters"]
     found = module.parameters(range(300), 1, 0.0, module.ROWS)
     for name in ("gain", "read_noise", "offset"):
         assert found[name]["coverage_90"] == pytest.approx(stored[name]["coverage_90"])
@@ -41,7 +31,7 @@ def test_json_agrees_with_the_trials_kept() -> None:
 
 
 def test_trials_go_on_where_they_stopped(tmp_path: Path) -> None:
-    module, rows = benchmark(), tmp_path / "rows.jsonl"
+    module, rows = calibration, tmp_path / "rows.jsonl"
     rows.write_text('{"seed": 0, "kept": true}\n{"seed": 7, "kept": true}\n', encoding="utf-8")
     found = module.run(_trial, range(3), 1, 1.0, rows)
     assert found == [{"seed": 0, "kept": True}, {"seed": 1}, {"seed": 2}, {"seed": 7, "kept": True}]

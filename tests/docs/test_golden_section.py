@@ -6,7 +6,7 @@ import pytest
 
 
 def test_golden_section_finds_the_minimum() -> None:
-    from joint_accuracy import golden_section
+    from benchmarks.pages.joint_accuracy import golden_section
 
     places: list[float] = []
 

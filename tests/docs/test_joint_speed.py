@@ -6,7 +6,7 @@ import pytest
 
 
 def test_steps_and_skipping_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    import joint_speed
+    from benchmarks.pages import joint_speed
 
     monkeypatch.setattr(joint_speed, "_STEPS", 3)
     row = joint_speed.steps("shells", 16, repeats=1)

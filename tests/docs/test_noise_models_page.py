@@ -20,7 +20,7 @@ def content() -> dict[str, Any]:
 
 
 def test_figure_draws_from_part_of_the_rows(tmp_path: Path) -> None:
-    import noise_figure
+    from benchmarks.pages import noise_figure
 
     part = content()
     part["accuracy"] = part["accuracy"][:3]
@@ -30,7 +30,7 @@ def test_figure_draws_from_part_of_the_rows(tmp_path: Path) -> None:
 
 
 def test_a_row_is_replaced_and_the_file_is_whole_after_each(tmp_path: Path) -> None:
-    import noise_models
+    from benchmarks.pages import noise_models
 
     results = noise_models.Results(tmp_path / "rows.json")
     for kl in (0.5, 0.25):
@@ -44,7 +44,7 @@ def test_a_row_is_replaced_and_the_file_is_whole_after_each(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("as_published", [False, True])
 def test_the_papers_density_integrates_to_one_only_with_the_right_derivative(as_published: bool) -> None:
-    from noise_rivals import PaperFlow
+    from benchmarks.pages.noise_rivals import PaperFlow
 
     flow = PaperFlow(as_published=as_published)
     integral = flow.integral(0.5)
@@ -54,7 +54,7 @@ def test_the_papers_density_integrates_to_one_only_with_the_right_derivative(as_
 def rivals() -> list[Any]:
     pytest.importorskip("zuko")
     pytest.importorskip("normflows")
-    import noise_rivals
+    from benchmarks.pages import noise_rivals
 
     return [
         *(noise_rivals.make(name, {})[0] for name in noise_rivals.SETTINGS),
@@ -80,9 +80,8 @@ def test_rivals_are_normalised_and_invertible() -> None:
 @torch.no_grad()
 def test_known_noises_have_the_likelihood_of_their_samples() -> None:
     """E[log p] of samples is the negative entropy, so another density of the same samples is less likely."""
-    import noise_truths
-
     import noiseflow
+    from benchmarks.pages import noise_truths
 
     for name, noise in noise_truths.noises().items():
         clean = noise_truths.clean_image(*noise.signals, 64).reshape(-1).repeat(4)
@@ -95,8 +94,8 @@ def test_known_noises_have_the_likelihood_of_their_samples() -> None:
 
 
 def test_a_missing_rival_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    import noise_rivals
+    from benchmarks.pages import noise_rivals
 
     monkeypatch.setitem(sys.modules, "zuko", None)
-    with pytest.raises(SystemExit, match=r"pip install 'noiseflow\[benchmark\]'"):
+    with pytest.raises(SystemExit, match=r"pip install '\.\[benchmark\]'"):
         noise_rivals.make("zuko", {})

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
-import runpy
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 PAGES = {
-    "joint.md": ("joint.json", "joint_page.py", "page"),
-    "scale.md": ("scale.json", "scale_page.py", "page"),
-    "scale_estimates.md": ("scale.json", "scale_page.py", "estimates"),
-    "calibration.md": ("calibration.json", "calibration_page.py", "page"),
-    "noise_models.md": ("noise_models.json", "noise_page.py", "page"),
-    "priors.md": ("priors.json", "priors.py", "page"),
-    "selection.md": ("selection.json", "selection.py", "page"),
-    "uncertainty.md": ("uncertainty.json", "uncertainty.py", "page"),
+    "joint.md": ("joint.json", "joint_page", "page"),
+    "scale.md": ("scale.json", "scale_page", "page"),
+    "scale_estimates.md": ("scale.json", "scale_page", "estimates"),
+    "calibration.md": ("calibration.json", "calibration_page", "page"),
+    "noise_models.md": ("noise_models.json", "noise_page", "page"),
+    "priors.md": ("priors.json", "priors", "page"),
+    "selection.md": ("selection.json", "selection", "page"),
+    "uncertainty.md": ("uncertainty.json", "uncertainty", "page"),
 }
 
 
@@ -25,5 +25,5 @@ PAGES = {
 def test_a_page_says_what_its_json_says(page: str) -> None:
     results, script, function = PAGES[page]
     content = json.loads((BENCHMARKS / "results" / results).read_text(encoding="utf-8"))
-    write = runpy.run_path(str(BENCHMARKS / script))[function]
+    write = vars(import_module(f"benchmarks.pages.{script}"))[function]
     assert (BENCHMARKS / page).read_text(encoding="utf-8") == write(content)

@@ -14,13 +14,13 @@ NAMES = ("run_time.md", "paper_table.md", "ablations.md", "needle.md")
 
 @pytest.mark.parametrize("name", NAMES)
 def test_page_agrees_with_its_json(name: str) -> None:
-    import rivals
+    from benchmarks.pages import rivals
 
     assert (BENCHMARKS / name).read_text(encoding="utf-8") == rivals.PAGES[name](rivals.RESULTS)
 
 
 def test_run_time_page_leads_with_what_users_get_and_ranks_no_unfinished_curve() -> None:
-    import rivals
+    from benchmarks.pages import rivals
 
     page = rivals.run_time(rivals.RESULTS)
     assert page.index("With default settings") < page.index("| method | at its best with")
@@ -30,7 +30,7 @@ def test_run_time_page_leads_with_what_users_get_and_ranks_no_unfinished_curve()
 
 
 def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:
-    import rivals
+    from benchmarks.pages import rivals
 
     assert "64³, 96³, 128³ on a CPU: not measured" in rivals.run_time(tmp_path)
     assert set(rivals.PAGES) == set(NAMES)
@@ -39,7 +39,7 @@ def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_a_page_shows_a_changed_figure_and_the_rows_that_are_missing(tmp_path: Path) -> None:
-    import rivals
+    from benchmarks.pages import rivals
 
     figures = {
         f"{kind}{figure} {scaling}": 0.25
@@ -58,7 +58,7 @@ def test_a_page_shows_a_changed_figure_and_the_rows_that_are_missing(tmp_path: P
 
 
 def test_rows_of_earlier_days_name_the_commit_that_recorded_them() -> None:
-    import record_commits
+    from benchmarks.pages import record_commits
 
     new, old = {"psnr": 2.0}, {"psnr": 1.0, "load": 1.4}
     versions = [("ccc", "day 3", {"a": new, "b": old}), ("bbb", "day 2", {"a": new}), ("aaa", "day 1", {"a": old})]
@@ -69,7 +69,7 @@ def test_rows_of_earlier_days_name_the_commit_that_recorded_them() -> None:
 
 
 def test_pictures_show_every_row_and_stand_on_their_page() -> None:
-    import rivals
+    from benchmarks.pages import rivals
 
     ((_, content),) = rivals._named_files(rivals.RESULTS, "needle-")
     panels = rivals._needle_panels(content["cells"])

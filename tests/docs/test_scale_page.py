@@ -14,7 +14,7 @@ from recon.scale.blocks import HALO, blocks
 
 
 def test_a_seam_is_the_jump_across_a_border() -> None:
-    from scale_measure import middle_rows, psnr, seams, seams_beside
+    from benchmarks.pages.scale_measure import middle_rows, psnr, seams, seams_beside
 
     generator = np.random.default_rng(0)
     truth = generator.random((6, 64, 8), dtype=np.float32)
@@ -44,7 +44,7 @@ def test_a_seam_is_the_jump_across_a_border() -> None:
 
 
 def test_memory_of_a_command_is_that_of_its_own_process(tmp_path: Path) -> None:
-    from scale_measure import run
+    from benchmarks.pages.scale_measure import run
 
     array = np.random.default_rng(0).random((8, 8, 8), dtype=np.float32)
     io.write(tmp_path / "v.mrc", array)

@@ -133,15 +133,3 @@ def test_torchvision_images_keep_their_type_and_masks_their_values() -> None:
     assert type(noisy) is tv_tensors.Image
     assert kept is mask
     assert other is first
-
-
-def test_old_names_of_the_module_still_work() -> None:
-    from noiseflow import transforms
-
-    with pytest.warns(DeprecationWarning, match="distributions.transforms"):
-        assert transforms.Spline is noiseflow.distributions.transforms.Spline
-
-
-def test_modules_under_their_old_names_are_attributes() -> None:
-    with pytest.warns(DeprecationWarning, match=r"noiseflow\.fitting\.selection"):
-        assert noiseflow.selection.select is noiseflow.select

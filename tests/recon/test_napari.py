@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
+from noiseflow.installation import DISTRIBUTION
 from noiseflow.io.mapped import is_mapped
 from recon.napari import get_reader, write_image
 from recon.napari.widget import reconstruct_layer, reconstruct_layers
@@ -25,7 +26,7 @@ def needle(data, tmp_path):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_manifest_is_valid_and_its_functions_exist():
     npe2 = pytest.importorskip("npe2", reason="needs the extra [napari]")
-    manifest = npe2.PluginManifest.from_distribution("noiseflow")
+    manifest = npe2.PluginManifest.from_distribution(DISTRIBUTION)
     manifest.validate_imports()
     (reader,), (writer,) = manifest.contributions.readers, manifest.contributions.writers
     assert set(reader.filename_patterns) == {f"*{suffix}" for suffix in io.SUFFIXES}
@@ -117,7 +118,7 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     application = QApplication.instance() or QApplication([])
     npe2.PluginManager.instance().discover()
     viewer = ViewerModel()
-    (layer,) = viewer.open(str(needle), plugin="noiseflow")
+    (layer,) = viewer.open(str(needle), plugin=DISTRIBUTION)
     form = reconstruct_widget()
     form.tilts.choices = [layer]
     form(viewer=viewer, tilts=layer, method="tv", thickness=16, num_steps=8)
@@ -129,5 +130,5 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     assert volume.data.shape == (16, 6, 64)
     assert not layer.visible
     assert viewer.dims.current_step[0] == 8
-    (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin="noiseflow")
+    (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin=DISTRIBUTION)
     np.testing.assert_array_equal(io.read(written).data, volume.data)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from noiseflow.distributions.base import LatentDistribution
 from noiseflow.distributions.transforms import Radial
-from noiseflow.models.base import ArrayModel
+from noiseflow.models.base import NoiseModelBase
 
 _PARAMETER_RANGE = 10.0
 
@@ -52,7 +52,7 @@ class CoordinateDensity(nn.Module):
         return torch.cat([torch.sin(phases), torch.cos(phases)], -1)
 
 
-class PaperFlow(ArrayModel):
+class PaperFlow(NoiseModelBase):
     """Radial layers on the residual; small networks compute the parameters of the later ones from the signal.
 
     Args:

@@ -4,6 +4,7 @@ import pytest
 
 from noiseflow.commands import doctor
 from noiseflow.commands.cli import main
+from noiseflow.installation import install_command
 
 
 def test_healthy_installation(run) -> None:
@@ -21,7 +22,7 @@ def test_missing_packages_come_with_the_line_that_installs_them(monkeypatch: pyt
     monkeypatch.setattr(doctor, "run_self_tests", dict)
     formats = run("doctor")["extras"]["formats"]
     assert formats["missing"] == ["rosettasciio"]
-    assert "pip install 'noiseflow[formats]'" in formats["advice"]
+    assert install_command("formats") in formats["advice"]
 
 
 def test_failed_self_test_is_told_and_exits_with_1(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

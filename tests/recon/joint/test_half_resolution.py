@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.nn import functional
 
+from benchmarks.scenes import make_scene
 from noiseflow import Gaussian
-from recon.benchmarks.scenes import make_scene
 from recon.fields.fields import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation

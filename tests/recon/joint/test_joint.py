@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import noiseflow
-from recon.benchmarks import needle as benchmark_needle
+from benchmarks import needle as benchmark_needle
 from recon.fields.fields import VoxelField
 from recon.joint.candidates import first_noise, noise_candidates
 from recon.joint.joint import JointReconstructor

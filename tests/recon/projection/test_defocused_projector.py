@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.benchmarks.defocus import defocused_scene
-from recon.benchmarks.scenes import make_scene
+from benchmarks.defocus import defocused_scene
+from benchmarks.scenes import make_scene
 from recon.joint.joint import JointReconstructor
 from recon.methods import _registry as methods
 from recon.metrics.metrics import compare

@@ -12,9 +12,9 @@ import typer
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
+from benchmarks.needle import load as load_needle
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
-from recon.benchmarks.needle import load as load_needle
 from recon.commands.measure import measure
 from recon.fields.fields import VoxelField
 from recon.fields.regularisers import Regulariser

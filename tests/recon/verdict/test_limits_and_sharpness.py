@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.benchmarks.sabotage import spoil
-from recon.benchmarks.scenes import Scene, make_scene
+from benchmarks.sabotage import spoil
+from benchmarks.scenes import Scene, make_scene
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.verdict.coarse import coarse_series
 from recon.verdict.geometry import Geometry

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from recon.benchmarks.sabotage import spoil
-from recon.benchmarks.scenes import make_scene
-from recon.benchmarks.ways import WAYS, Spoilt
+from benchmarks.defects import WAYS, Spoilt
+from benchmarks.sabotage import spoil
+from benchmarks.scenes import make_scene
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
 from recon.series.screening import screen

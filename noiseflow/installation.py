@@ -1,0 +1,31 @@
+"""The installed distribution: its name, its version, and the command that adds an extra."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+
+# On the Python package index, `noiseflow` is another project: a distribution of its own name installs ours.
+DISTRIBUTION = "noiseflow-microscopy"
+_CHECKOUT = Path(__file__).parents[1]
+
+
+def library_version() -> str:
+    """The version of the installed library."""
+    return version(DISTRIBUTION)
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra, from the checkout where the library is loaded from one.
+
+    Args:
+        extra: name of the extra, such as ``"formats"``.
+
+    Example:
+        >>> from noiseflow.installation import install_command
+        >>> "[formats]" in install_command("formats")
+        True
+    """
+    if (_CHECKOUT / "pyproject.toml").is_file():
+        return f"pip install '.[{extra}]' (in {_CHECKOUT})"
+    return f"pip install '{DISTRIBUTION}[{extra}]'"

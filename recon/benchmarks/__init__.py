@@ -1,1 +1,0 @@
-"""Benchmarks of the reconstruction; `noiseflow benchmark` runs them."""
