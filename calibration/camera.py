@@ -13,7 +13,17 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import BIAS, Grade, Reason, Verdict, frames_correlated, verdict_of
+from calibration.verdict import (
+    BIAS,
+    Grade,
+    Reason,
+    Verdict,
+    bent_response,
+    frames_correlated,
+    uneven_field,
+    verdict_of,
+    without_consequences,
+)
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -105,7 +115,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
             f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled or compressed. "
             "Use raw frames.",
         )
-    found += frames_correlated(figures.lag)
+    found += frames_correlated(figures.lag) + bent_response(figures.bend)
     if figures.chi_squared > LARGEST_CHI_SQUARED:
         text = f"the variance is not linear in the signal (χ² per degree of freedom {figures.chi_squared:.1f})"
         add(
@@ -143,6 +153,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
+    found = without_consequences(found, figures.pattern) + uneven_field(figures.pattern, figures.gain.median)
     return verdict_of([one for one in found if one.name != "not saturated"])
 
 

@@ -19,8 +19,10 @@ from calibration.detector.figures import (
 )
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
+from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.repair import LEAST_SHARE, Repairs
-from calibration.detector.shape import field_deviation
+from calibration.detector.residual import residual_of
+from calibration.detector.response import Response
 from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Image, rails
@@ -33,10 +35,6 @@ GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
 LEAST_MISFIT = 0.8
 """χ² per degree of freedom below which the histograms scatter less than those of independent pixels can. It varies by 0.05 over
 the roughly 1000 cells of a typical calibration. The frames of a burst share their mean, which reduces the scatter a little."""
-
-WIDEST_GAIN = 0.03
-"""Largest relative half-width of the gain's 90 % interval: twice the target accuracy. A wider interval means that the exposures
-contain too few electrons or too little contrast."""
 
 BIAS = 0.02
 """Largest relative error of the gain without a warning: the target accuracy of the calibration."""
@@ -98,6 +96,7 @@ def judge_calibration(
         correlation: correlation of the residuals of `pairs`.
         repairs: violated assumptions that were modelled before the measurement.
     """
+    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation)
     reasons = [
         *_scene(repairs, correlation),
         *_independence(pairs),
@@ -105,6 +104,7 @@ def judge_calibration(
         *_shape(detector, figures),
         *_range(pairs, detector, figures, repairs),
     ]
+    reasons = [*uneven_field(pattern, figures.gain.median), *without_consequences(reasons, pattern)]
     return verdict_of(reasons)
 
 
@@ -286,16 +286,7 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
                 "joined converters", "doubtful" if few else "bad", text + ". Record with a single converter setting."
             )
         )
-    gain = figures.gain
-    half = (gain.q95 - gain.q05) / (2 * gain.median)
-    if half > WIDEST_GAIN:
-        text = f"the uncertainty of the gain is ±{half:.0%}. Add exposures, record a scene with more contrast, or add flats "
-        found.append(Reason("gain uncertain", "doubtful", text + "at several levels."))
-    field = field_deviation(pairs)
-    if field > MOST_UNEVEN_FIELD:
-        text = f"at equal signal the noise variance differs by {field:.0%} rms across the field: the frames were divided by a "
-        text += "flat field or corrected for shading, so no single gain applies"
-        found.append(Reason("uneven field", "doubtful", text + ". Use uncorrected frames."))
+    found += bent_response(detector.response)
     for pair in pairs:
         if pair.exposure_ratio is not None and not pair.one_setting:
             text = f"the fitted ratio of the exposures is {1 / pair.scaling.slope:.3g}, the given one {pair.exposure_ratio:.3g}. "
@@ -307,6 +298,35 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
         text = f"{max(shares):.1%} of the pixels are at full-well saturation, below the converter's upper limit"
         found.append(Reason("saturation", "doubtful", text + ". Use a shorter exposure."))
     return found
+
+
+def bent_response(response: Response) -> list[Reason]:
+    """Return the reason to report if the response is not linear."""
+    if not response.bent:
+        return []
+    text = f"the response is not linear: the signal grows as light^{response.exponent:.3f} (± {response.error:.3f}), or the dark "
+    text += "frames or the exposure ratio belong to another setting. The gain is the local one at the mean signal"
+    return [Reason("nonlinear response", "doubtful", text + ". Use raw frames, and dark frames of the same setting.")]
+
+
+def without_consequences(reasons: Sequence[Reason], pattern: Pattern) -> list[Reason]:
+    """Leave out what classes of pixels with gains of their own explain: a period, and fine detail common to both exposures."""
+    if not pattern.factors or pattern.relative <= BIAS:
+        return list(reasons)
+    return [one for one in reasons if one.name not in ("periodic noise", "short contained")]
+
+
+def uneven_field(pattern: Pattern, gain: float) -> list[Reason]:
+    """Return the reason to report if the noise at equal signal depends on the place."""
+    if pattern.relative <= (MOST_UNEVEN_FIELD if pattern.name == "field" else BIAS):
+        return []
+    text = f"at equal signal the noise variance differs by {pattern.relative:.1%} rms (± {pattern.error:.1%}) "
+    if pattern.name == "field":
+        text += "across the field: the frames were divided by a flat field or corrected for shading, so no single gain applies"
+        return [Reason("uneven field", "doubtful", text + ". Use uncorrected frames.")]
+    gains = ", ".join(f"{gain * one:.4g}" for one in pattern.factors)
+    text += f"between classes of pixels ({pattern.name}), whose gains are {gains} counts/e⁻: amplifiers or filters of their own"
+    return [Reason("uneven gains", "doubtful", text + ". Calibrate each class alone.")]
 
 
 def full_share(pair: AlignedPair) -> float:

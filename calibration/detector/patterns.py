@@ -1,4 +1,4 @@
-"""Noise that differs between parts of the field: shading corrections, and gains of amplifiers, rows, columns or colour filters."""
+"""Noise that differs between parts of the field: shading corrections, gains of amplifiers, rows, columns or colour filters."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GROUPS: dict[str, Groups] = {
     "every fourth column": _modulo(1, 4),
     "every fourth row": _modulo(0, 4),
 }
-"""Classes of pixels that may have amplifiers or filters of their own, coarsest first; functions of row, column and frame shape."""
+"""Classes of pixels that may have amplifiers or filters of their own; functions of row, column and frame shape."""
 
 
 @described(relative="of the noise variance", error="of the noise variance")
@@ -64,13 +64,14 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         residuals: standardised residuals of frames of equal size.
         inflation: factor of the standard error of a variance due to correlation between pixels.
     """
-    shape = residuals[0].z.shape
+    shape = residuals[0].mask.shape
     total, square, number = np.zeros(shape), 0.0, np.zeros(shape)
     for one in residuals:
-        squares = one.z**2 * one.mask
-        mean = float(squares.sum() / max(one.mask.sum(), 1))
+        squares = (one.z**2 * one.mask).reshape(-1, *shape)
+        mean = float(squares.sum() / max(one.mask.sum() * len(squares), 1))
         relative = np.where(one.mask, squares / max(mean, np.finfo(float).tiny) - 1, 0.0)
-        total, number, square = total + relative, number + one.mask, square + float(np.sum(relative**2))
+        total, number = total + relative.sum(0), number + len(squares) * one.mask
+        square += float(np.sum(relative**2))
     usual = inflation**2 * square / max(float(number.sum()), 1.0)  # variance of a relative square
     found = [(name, *_of_classes(total, number, group, usual)) for name, group in GROUPS.items()]
     found.append(("field", *_of_field(total, number, usual)))
@@ -82,7 +83,9 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
     return Pattern(name, relative, error, factors)
 
 
-def _of_classes(total: Image, number: Image, group: Groups, usual: float) -> tuple[float, float, int, tuple[float, ...]]:
+def _of_classes(
+    total: Image, number: Image, group: Groups, usual: float
+) -> tuple[float, float, int, tuple[float, ...]]:
     """Return excess χ² in standard errors, relative deviation (rms), degrees of freedom, and the factor of each class."""
     label = group(*np.indices(total.shape), total.shape).ravel()
     count = np.bincount(label, number.ravel())

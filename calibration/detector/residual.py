@@ -55,7 +55,8 @@ class Residual:
     """Standardised residual of a pair's short exposure.
 
     Attributes:
-        z: (y, x) residual over the standard deviation at its level, clipped at `CUT`, 0 outside the mask.
+        z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CUT`; 0 outside
+            the mask.
         mask: (y, x) valid pixels.
         share: share of the residual variance due to the noise of the signal.
         spread: (y, x) standard deviation at the level, counts.
@@ -70,7 +71,14 @@ class Residual:
 
 
 def residual_of(pair: AlignedPair) -> Residual:
-    """Compute the standardised residual of a pair."""
+    """Return the standardised residual of a pair, which is computed once."""
+    known = vars(pair)
+    if "_residual" not in known:
+        known["_residual"] = _residual_of(pair)
+    return known["_residual"]  # type: ignore[no-any-return]
+
+
+def _residual_of(pair: AlignedPair) -> Residual:
     share = float(pair.share[pair.mask].mean())
     blur = _LITTLE_BLUR if share < _LITTLE_NOISE else _MUCH_BLUR
     difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Image
 from noiseflow.described import described
 
@@ -50,13 +51,29 @@ class Response:
         """Whether the exponent differs from 1 significantly and by more than `LEAST_CURVATURE`."""
         return self.known and abs(self.exponent - 1) > max(CLEAR * self.error, LEAST_CURVATURE)
 
+    def local(self, gain: Interval) -> Interval:
+        """Return the local gain at the mean signal from the gain of a linear response.
+
+        The median changes only if the response is bent; the interval covers the exponents that are possible.
+        """
+        middle = self.middle if self.bent else 1.0
+        low, high = min(self.low, middle), max(self.high, middle)
+        below = np.hypot(np.log(gain.median / max(gain.q05, 1e-3 * gain.median)), np.log(middle / low))
+        above = np.hypot(np.log(max(gain.q95, gain.median) / gain.median), np.log(high / middle))
+        median = middle * gain.median
+        return Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
+
+
+LINEAR = Response(1.0, 0.0, True, 1.0, 1.0, 1.0)
+"""A response known to be linear."""
+
 
 def response_of(
     signal: Image,
     variance: Image,
     error: Image,
     *,
-    offset: float | None = None,
+    offset: tuple[float, float] | None = None,
     ratio: tuple[float, float] | None = None,
 ) -> Response:
     """Fit the exponent to the variances at several signals.
@@ -69,7 +86,7 @@ def response_of(
         signal: (L,) counts; dark frames may be among them.
         variance: (L,) counts².
         error: (L,) standard errors of `variance`, counts².
-        offset: signal without light, counts; None if unknown.
+        offset: signal without light and its standard error, counts; None if unknown.
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
     """
     weight = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
@@ -77,9 +94,13 @@ def response_of(
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
         weight = weight * (near / max(near.sum(), np.finfo(float).tiny) + 1 / len(EXPONENTS))  # the ratio may be wrong
-    curve = None if offset is None else _curve(signal - offset, variance, error)
-    if curve is not None:
-        chi_squared, gains = curve
+    # the nodes and weights of a Gauss-Hermite rule of three points
+    shifts = () if offset is None else ((0.0, 2 / 3), (-np.sqrt(3), 1 / 6), (np.sqrt(3), 1 / 6))
+    found = [(_curve(signal - offset[0] - by * offset[1], variance, error), share) for by, share in shifts if offset]
+    curves = [(one, share) for one, share in found if one is not None]
+    if curves:
+        chi_squared = -2 * np.logaddexp.reduce([np.log(share) - 0.5 * one[0] for one, share in curves])
+        gains = curves[0][0][1]
         scale = max(float(chi_squared.min()) / max(len(signal) - 3, 1), 1.0)
         weight = weight * np.exp(-0.5 * (chi_squared - chi_squared.min()) / scale)
         change = gains / float(np.interp(1.0, EXPONENTS, gains))
@@ -87,7 +108,7 @@ def response_of(
     exponent = float(weight @ EXPONENTS)
     spread = float(np.sqrt(weight @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
     low, middle, high = (float(one) for one in _quantiles(change, weight, (0.05, 0.5, 0.95)))
-    return Response(exponent, spread, curve is not None or ratio is not None, low, middle, high)
+    return Response(exponent, spread, bool(curves) or ratio is not None, low, middle, high)
 
 
 def _curve(light: Image, variance: Image, error: Image) -> tuple[Image, Image] | None:

@@ -22,8 +22,8 @@ often; excluding them would remove the noise to be measured."""
 def threshold(z: Image) -> float:
     """Return the deviation that the tail of the noise reaches with probability 1/20, at least `LEAST_DEVIATION`.
 
-    The tail beyond two standard deviations is continued as an exponential function, which bounds that of normal, Poisson and gamma
-    noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
+    The tail beyond two standard deviations is continued as an exponential function, which bounds that of normal, Poisson and
+    gamma noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
 
     Args:
         z: deviations in standard deviations, any shape.
@@ -39,7 +39,7 @@ def threshold(z: Image) -> float:
 
 
 def tracks(z: Image, limit: float) -> Mask:
-    """Return the mask of values beyond a limit, with the touching values beyond `TRACK`; the last two axes are those of a frame."""
+    """Return the mask of values beyond a limit and of touching values beyond `TRACK`; the last two axes are those of a frame."""
     far = np.abs(z) > limit
     if not far.any():
         return far
