@@ -20,9 +20,8 @@ from calibration.verdict import (
     Verdict,
     bent_response,
     frames_correlated,
-    uneven_field,
     verdict_of,
-    without_consequences,
+    with_pattern,
 )
 from noiseflow.described import described
 
@@ -153,7 +152,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
-    found = without_consequences(found, figures.pattern) + uneven_field(figures.pattern, figures.gain.median)
+    found = with_pattern(found, figures.pattern, correlation, figures.gain.median)
     return verdict_of([one for one in found if one.name != "not saturated"])
 
 
@@ -280,6 +279,11 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
             _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)"),
         ),
         ("excess-noise factor F²", _text(figures.excess_factor, "")),
+        (
+            "exponent of the response",
+            f"{figures.bend.exponent:.4g} ± {figures.bend.error:.2g}" if figures.bend.known else _value(None, ""),
+        ),
+        ("outliers of single frames", f"{figures.outliers}, excluded"),
         ("defective pixels", f"{int(camera.maps['defects'].sum())}"),
     ]
     return [(name, text.strip()) for name, text in rows]
@@ -314,6 +318,8 @@ def summary_of(camera: Camera) -> dict[str, Any]:
         for level in figures.levels
         if level.variance > 0
     ]
+    found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
+    found["outliers"] = figures.outliers
     found["defects"] = int(camera.maps["defects"].sum())
     return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.reasons], "camera": found}
 

@@ -96,7 +96,8 @@ def judge_calibration(
         correlation: correlation of the residuals of `pairs`.
         repairs: violated assumptions that were modelled before the measurement.
     """
-    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation)
+    shared = pairs[0].frames / max(pairs[0].frames - 1, 1)  # residuals from a mean that the frames of a burst share
+    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation * np.sqrt(shared))
     reasons = [
         *_scene(repairs, correlation),
         *_independence(pairs),
@@ -104,8 +105,7 @@ def judge_calibration(
         *_shape(detector, figures),
         *_range(pairs, detector, figures, repairs),
     ]
-    reasons = [*uneven_field(pattern, figures.gain.median), *without_consequences(reasons, pattern)]
-    return verdict_of(reasons)
+    return verdict_of(with_pattern(reasons, pattern, correlation, figures.gain.median))
 
 
 def verdict_of(reasons: Sequence[Reason]) -> Verdict:
@@ -309,11 +309,17 @@ def bent_response(response: Response) -> list[Reason]:
     return [Reason("nonlinear response", "doubtful", text + ". Use raw frames, and dark frames of the same setting.")]
 
 
-def without_consequences(reasons: Sequence[Reason], pattern: Pattern) -> list[Reason]:
-    """Leave out what classes of pixels with gains of their own explain: a period, and fine detail common to both exposures."""
-    if not pattern.factors or pattern.relative <= BIAS:
+def with_pattern(reasons: Sequence[Reason], pattern: Pattern, correlation: Correlation, gain: float) -> list[Reason]:
+    """Add that the noise depends on the place, and leave out what follows from it.
+
+    Classes of pixels with gains of their own have a period, and give both exposures the same fine detail. Resampling has a period
+    too, but correlates neighbours.
+    """
+    if correlation.found and correlation.period:
         return list(reasons)
-    return [one for one in reasons if one.name not in ("periodic noise", "short contained")]
+    found = uneven_field(pattern, gain)
+    explained = ("periodic noise", "short contained") if found and pattern.factors else ()
+    return [*found, *(one for one in reasons if one.name not in explained)]
 
 
 def uneven_field(pattern: Pattern, gain: float) -> list[Reason]:

@@ -14,7 +14,7 @@ MOST_CLIPPED = 1e-3
 0.3 %."""
 
 CLEAR = 5.0
-"""Standard errors above which the light is not steady; the means of a few pixels of skewed noise exceed three in one set of 100."""
+"""Standard errors above which the light is not steady; the means of a few pixels of skewed noise exceed three once in 100."""
 
 COARSE = 0.24
 """Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between
