@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from calibration.exposures.frames import Image
+from calibration.exposures.frames import Image, rounding_step
 from calibration.exposures.scaling import Mask, spread_by_level
 
 LEAST_DEVIATION = 6.0
@@ -47,16 +47,17 @@ def tracks(z: Image, limit: float) -> Mask:
     return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > TRACK))
 
 
-def outliers_of(residual: Image, level: Image, mask: Mask) -> Mask:
+def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
     """Return the (y, x) mask of outliers among the residuals of one exposure; empty if too many stand out.
 
     Args:
         residual: (y, x) counts.
         level: (y, x) signal that sorts the residuals, counts.
         mask: (y, x) pixels to test.
+        step: rounding step, counts.
     """
     z = np.zeros(mask.shape)
-    z[mask] = residual[mask] / spread_by_level(level[mask], residual[mask])
+    z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask]), step)
     found = tracks(z, threshold(z[mask])) & mask
     return found if found.sum() <= MOST_OUTLIERS * mask.sum() else np.zeros_like(found)
 
@@ -76,7 +77,7 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     level = np.median(centred, axis=0) if number > 2 else centred.min(axis=0)
     difference = centred - level
     spread = spread_by_level(np.broadcast_to(level, frames.shape).ravel(), difference.ravel()).reshape(frames.shape)
-    z = difference / spread
+    z = difference / np.hypot(spread, rounding_step(frames))  # the next code is no outlier
     found = tracks(z, threshold(z))
     found &= found.sum(axis=0) <= 1 + number // 100
     if not 0 < found.sum() <= MOST_OUTLIERS * found.size:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from calibration.exposures.frames import ExposurePair, Image, rails
+from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, saturated
 from calibration.exposures.outliers import outliers_of
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
@@ -143,7 +143,9 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal = scaling.slope * long + scaling.intercept
-    found = outliers_of(pair.short - signal, scaling.slope * level + scaling.intercept, trusted)
+    found = outliers_of(
+        pair.short - signal, scaling.slope * level + scaling.intercept, trusted, step=rounding_step(pair.short)
+    )
     found = ndimage.binary_dilation(found, iterations=1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
