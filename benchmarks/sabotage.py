@@ -16,7 +16,7 @@ from benchmarks.needle import load
 from benchmarks.scenes import Cell, Results, Scene, make_scene
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import compare
-from recon.series.screening import screen
+from recon.series.screening import require_specimen, screen
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, draw_noise, stored_type
 from recon.verdict.judge import judge
@@ -107,6 +107,7 @@ def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = 
     """Screen, reconstruct and grade a series, as the command does."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
+        require_specimen(series)
         screening = screen(series)
         prepared = screening.passed(series)
         result = reconstruct(prepared, VolumeGrid.of(prepared, thickness), method=method, seed=seed)

@@ -17,6 +17,7 @@ from noiseflow.commands.console import (
     choose_device,
     progress_bar,
 )
+from noiseflow.commands.option_files import option_groups
 
 if TYPE_CHECKING:
     from calibration.detector.models import ModelScore
@@ -25,6 +26,12 @@ if TYPE_CHECKING:
     from calibration.registration.aligned import AlignedPair
 
 
+@option_groups(
+    {
+        "Input": ("flat_time", "dark_time", "exposure_ratio"),
+        "Advanced": ("kind", "seed", "device", "json", "overwrite"),
+    }
+)
 def calibrate(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
     short: Annotated[

@@ -1,9 +1,10 @@
 """Settings of Sphinx: `make docs` builds the pages into docs/_build/html."""
 
 import sys
-from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
+
+from noiseflow.installation import library_version
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE / "tutorials")]
@@ -11,7 +12,7 @@ sys.path[:0] = [str(HERE), str(HERE / "tutorials")]
 project = "noiseflow"
 author = "The noiseflow developers"
 copyright = f"2026, {author}"
-version = release = installed_version("noiseflow")
+version = release = library_version()
 
 extensions = [
     "myst_parser",

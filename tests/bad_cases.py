@@ -140,9 +140,9 @@ reconstruct {good}/one-tilt.npy -o {out}/v.mrc | images are constant
 reconstruct {good}/tilts.mrc --angles {bad}/same.tlt -o {out}/v.mrc | different angles
 reconstruct {good}/tilts.mrc --angles {bad}/no.mdoc -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/folder -o {out}/v.mrc | folder
-reconstruct {good}/tilts.mrc --transforms {bad}/missing.xf -o {out}/v.mrc | does not exist
-reconstruct {good}/tilts.mrc --transforms {bad}/wrong.xf -o {out}/v.mrc | six numbers
-reconstruct {good}/tilts.mrc --transforms {bad}/short.xf -o {out}/v.mrc | 1 transforms
+reconstruct {good}/tilts.mrc --alignment {bad}/missing.xf -o {out}/v.mrc | does not exist
+reconstruct {good}/tilts.mrc --alignment {bad}/wrong.xf -o {out}/v.mrc | six numbers
+reconstruct {good}/tilts.mrc --alignment {bad}/short.xf -o {out}/v.mrc | 1 transforms
 reconstruct {good}/tilts.mrc --method magic -o {out}/v.mrc | choose
 reconstruct {good}/tilts.mrc --mode haadf -o {out}/v.mrc | linear
 reconstruct {good}/tilts.mrc --thickness 0 -o {out}/v.mrc | thickness

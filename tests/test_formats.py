@@ -275,7 +275,7 @@ def test_transforms_are_applied_on_request(tmp_path: Path, run) -> None:
     run(
         "reconstruct",
         path,
-        "--transforms",
+        "--alignment",
         tmp_path / "series.xf",
         "-o",
         tmp_path / "v.mrc",

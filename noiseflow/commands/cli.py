@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from noiseflow.commands.console import START_AGAIN, Invocation, end_stopped, invoked
+from noiseflow.commands.option_files import arrange, shared_options, shows_everything, write_options
 from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version
@@ -26,7 +27,6 @@ from noiseflow.threads import wait_passively
 
 _ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "measure", "doctor")
 _TYPED = "noiseflow.typed"
-_UNASKED = ("DEFAULT", "DEFAULT_MAP")
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 
@@ -116,14 +116,23 @@ class _ListCommand(TyperCommand):
     ``--short a b c`` means ``--short a --short b --short c``.
     """
 
+    def __init__(self, *words: Any, **more: Any) -> None:
+        super().__init__(*words, **more)
+        self.params += shared_options(self)
+
     def get_params(self, ctx: Any) -> Any:
-        return _flags_without_type(super().get_params(ctx))
+        parameters = _flags_without_type(super().get_params(ctx))
+        arrange(self, parameters, everything=shows_everything(ctx))
+        return parameters
 
     def invoke(self, ctx: Any) -> Any:
-        given = {name: ctx.get_parameter_source(name).name not in _UNASKED for name in ctx.params}
+        given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
         with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
+        if (folder := ctx.params.get("report")) is not None and folder.is_dir():
+            write_options(folder / "options.toml", options)
+        return result
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = tuple(args)

@@ -1,11 +1,11 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
-from .alignment import apply_transforms as apply_transforms
 from .alignment import read_transforms as read_transforms
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
 from .angles import tilt_angles_of as tilt_angles_of
+from .checks import SeveralImages as SeveralImages
 from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite

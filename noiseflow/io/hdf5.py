@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from noiseflow.io.checks import require_room
+from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_degrees, recorded_angles
-from noiseflow.io.microscope import choose_member
 from noiseflow.io.units import in_angstrom
 
 

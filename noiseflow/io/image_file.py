@@ -25,16 +25,19 @@ class ImageFile:
     """Contents of an image file.
 
     Attributes:
-        data: pixels in the data type of the file, (y, x) or (section, y, x).
+        data: pixels in the data type of the file, (y, x) or (section, y, x); readers may return (channel, section, y, x),
+            of which `read` chooses one channel.
         voxel_size: Å along (z, y, x), or None if the file does not state it.
         tilt_angles: (section,) degrees, or None if the file does not state them.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
+        channels: names of the channels, if the file holds several.
     """
 
     data: NDArray[Any]
     voxel_size: VoxelSize | None = None
     tilt_angles: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
+    channels: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         size = "unknown" if self.voxel_size is None else " x ".join(f"{edge:.5g}" for edge in self.voxel_size) + " Å"

@@ -69,6 +69,8 @@ def is_own(path: Path) -> bool:
         return b"tEXtSoftware\0" + MARK.encode() in head
     if kind == ".csv":
         return head.startswith(f"# {MARK} ".encode())
+    if kind == ".json":
+        return f'"written_by": "{MARK}'.encode() in head
     return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
 
 

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import floating
 from noiseflow.described import described
-from noiseflow.distributions.numerical import as_noise_distribution
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.scan_noise import ScanDistribution
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from noiseflow import io
 from noiseflow.commands.console import Output, StepReport
 from recon.commands.options import parse_mode
+from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
 from recon.series.contrast import invert_contrast as inverted
 from recon.series.prepare import Prepared as Prepared
 from recon.series.prepare import prepare as prepare_series
@@ -22,13 +23,13 @@ def load_tilt_series(
     path: Path,
     *,
     angles: Path | None,
-    transforms: Path | None,
     mode: str,
     invert_tilt: bool,
     invert_contrast: bool,
     mask: Path | None,
     mask_nan: bool,
     mapped: bool = False,
+    channel: str | None = None,
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command.
 
@@ -38,11 +39,11 @@ def load_tilt_series(
     series = read_tilt_series(
         path,
         angles=angles,
-        transforms=transforms,
         mode=parse_mode(mode),
         mask=None if mask is None else _read_mask(mask),
         mask_nan=mask_nan,
         mapped=mapped,
+        channel=channel,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)
@@ -61,23 +62,37 @@ def prepare(
     *,
     tilt_axis: float | None,
     refine_alignment: bool,
+    alignment: Path | None,
+    save_alignment: Path | None,
     keep_tilts: bool,
     device: str,
     output: Output,
     report: StepReport | None = None,
 ) -> Prepared:
-    """As `recon.prepare`, and print the alignment that was found."""
+    """As `recon.prepare` with files of alignments, and print the alignment that was found."""
     prepared = prepare_series(
         tilt_series,
         tilt_axis=tilt_axis,
         refine_alignment=refine_alignment,
+        alignment=None if alignment is None else read_alignment(alignment, tilt_series),
         keep_tilts=keep_tilts,
         device=device,
         progress=report,
     )
     if refine_alignment and prepared.alignment is not None:
         output.line(prepared.alignment.in_words())
+    if save_alignment is not None:
+        if prepared.alignment is None:
+            raise ValueError("--save-alignment: there is no alignment; find it with --refine-alignment")
+        for path in write_alignment(save_alignment, prepared.alignment):
+            output.line(f"alignment: {path}")
     return prepared
+
+
+def check_alignment_file(path: Path, *inputs: Path | None, overwrite: bool) -> None:
+    """Check that `--save-alignment` can be written. Raises as `noiseflow.io.check_output` and `noiseflow.io.require_other`."""
+    io.check_output(path, suffixes=ALIGNMENT_SUFFIXES, overwrite=overwrite)
+    io.require_other(path, *inputs)
 
 
 def _read_mask(path: Path) -> NDArray[Any]:

@@ -17,17 +17,22 @@ def parse_mode(text: str) -> Mode:
     Raises:
         ValueError: the mode is unknown.
     """
-    if text not in ("transmission", "linear"):
+    modes: dict[str, Mode] = dict.fromkeys(("transmission", "bright-field", "bf"), "transmission")
+    modes |= dict.fromkeys(("linear", "haadf", "adf", "edx", "eds"), "linear")
+    if text.lower() not in modes:
         raise ValueError(f"--mode {text}: choose transmission (bright field) or linear (HAADF, EDX)")
-    return "linear" if text == "linear" else "transmission"
+    return modes[text.lower()]
 
 
 def method_of(method: str, preset: str | None) -> str:
-    """The method that `--method` or `--preset` names.
+    """The method that `--method`, in upper or lower case, or `--preset` names.
 
     Raises:
         ValueError: the preset is unknown, or `--method` is given too.
     """
+    from recon.methods._names import method_names
+
+    method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:
         return method
     from recon.methods.kniesel2022.presets import PRESETS

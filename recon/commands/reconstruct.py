@@ -18,6 +18,7 @@ from noiseflow.commands.console import (
     choose_device,
     step_report,
 )
+from noiseflow.commands.option_files import option_groups
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
     chosen_slices,
@@ -33,11 +34,22 @@ from recon.fields.regularisers._names import DEFAULT, regulariser_names
 from recon.methods._names import method_names
 
 if TYPE_CHECKING:
+    from noiseflow.checks import Guard
     from recon.joint.checkpoint import Journal
     from recon.reconstruction import Reconstruction
     from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
+@option_groups(
+    {
+        "Input": ("angles", "channel", "alignment", "mask", "mask_nan", "invert_contrast"),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
+        "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
+        "Size": ("slices_at_once", "workers", "scheduler", "device"),
+        "Output": ("save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
+        "Advanced": ("resume", "checkpoint_interval", "dry_run"),
+    }
+)
 def reconstruct(
     context: typer.Context,
     tilts: Annotated[
@@ -53,7 +65,16 @@ def reconstruct(
             help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
     ] = None,
-    transforms: Annotated[Path | None, typer.Option(help="Alignment of IMOD (.xf) to apply to the stack.")] = None,
+    channel: Annotated[
+        str | None,
+        typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
+    ] = None,
+    alignment: Annotated[
+        Path | None,
+        typer.Option(
+            help="Alignment to apply: a .json file of --save-alignment, also of another channel, or IMOD's .xf."
+        ),
+    ] = None,
     method: Annotated[
         str,
         typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}."),
@@ -113,6 +134,9 @@ def reconstruct(
     refine_alignment: Annotated[
         bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
     ] = False,
+    save_alignment: Annotated[
+        Path | None, typer.Option(help="File for the alignment: .json, or .xf (with .tlt) for IMOD.")
+    ] = None,
     tilt_axis: Annotated[
         float | None,
         typer.Option(
@@ -170,7 +194,7 @@ def reconstruct(
     """
     from noiseflow.io import locked, require_other
     from noiseflow.io.mapped import is_large
-    from recon.commands.inputs import files_read, load_tilt_series, prepare
+    from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.methods import find_method, settings_of
     from recon.report.page import read_reference
@@ -180,8 +204,10 @@ def reconstruct(
 
     output = Output(json)
     targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
+    if save_alignment is not None:
+        check_alignment_file(save_alignment, alignment, tilts, overwrite=overwrite)
     for path in (out, *error_bar_paths(out).values(), shell_band_path(out)):
-        require_other(path, tilts, angles, transforms, mask, reference, noise_model)
+        require_other(path, tilts, angles, alignment, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)
@@ -202,12 +228,12 @@ def reconstruct(
         tilt_series = load_tilt_series(
             tilts,
             angles=angles,
-            transforms=transforms,
             mode=mode,
             invert_tilt=invert_tilt,
             invert_contrast=invert_contrast,
             mask=mask,
             mask_nan=mask_nan,
+            channel=channel,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with step_report(json_mode=json) as progress:
@@ -215,6 +241,8 @@ def reconstruct(
                 tilt_series,
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
+                alignment=alignment,
+                save_alignment=save_alignment,
                 keep_tilts=keep_tilts,
                 device=chosen_device,
                 output=output,
@@ -243,13 +271,13 @@ def reconstruct(
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 options |= {"keep": journal.keep, "forget": journal.forget}
             with step_report(json_mode=json) as journal.report:
-                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc)
+                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc, guard=prepared.guard)
             verdict = targets.write(
                 output,
                 tilt_series,
                 outcome,
                 seconds=time.perf_counter() - started,
-                inputs=files_read(tilts, angles, transforms, mask, noise_model, reference),
+                inputs=files_read(tilts, angles, alignment, mask, noise_model, reference),
                 seed=seed,
                 prepared=prepared,
                 halves=halves,
@@ -263,7 +291,7 @@ def reconstruct(
 
 
 def _solve(
-    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool
+    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool, guard: Guard
 ) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and the odd tilts if requested."""
     from recon.methods import reconstruct
@@ -273,17 +301,22 @@ def _solve(
         if journal.report is not None:
             journal.report("reconstructing", done, total, note)
 
+    def halves() -> tuple[Volume, Volume]:
+        even, odd = (
+            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
+            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
+        )
+        return even, odd
+
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
     outcome = reconstruct(tilt_series, grid, **options)
-    if not fsc:
-        return outcome, None
-    options["uncertainty"], scratch = 0, options.get("scratch")
-    halves = []
-    for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True):
-        if scratch is not None:
-            options["scratch"] = scratch.with_name(f"{name}-{scratch.name}")
-        halves.append(reconstruct(half, grid, **options, prefix=f"{name} tilts: ").volume)
-    return outcome, (halves[0], halves[1])
+    return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
+
+
+def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
+    """The options that differ for a half of the tilts."""
+    scratch = options.get("scratch")
+    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
 
 
 def _show_plan(

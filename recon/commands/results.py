@@ -84,7 +84,9 @@ class Targets:
             outcome.volume.write(self.volume)
         bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
         self._remove_former(bars, output)
-        verdict = judge(tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment)
+        verdict = judge(
+            tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment, guard=prepared.guard
+        )
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])
         output.table(("figure", "value"), list(rows.items()))
@@ -96,8 +98,6 @@ class Targets:
         if outcome.uncertainty is not None and outcome.uncertainty.shells is not None:
             reach = outcome.uncertainty.shells.in_words(outcome.volume.voxel_size)
             output.line(f"expected resolution (correlation of 0.5 with the truth): {reach}")
-        for line in verdict.lines():
-            output.line(line)
         page = None
         if self.report is not None:
             content = reconstruction_report(
@@ -109,10 +109,13 @@ class Targets:
                 halves=halves,
                 reference=reference,
                 verdict=verdict,
+                guard=prepared.guard,
             )
             with io.output_folder(self.report):
                 page = content.save(self.report / "index.html")
             output.line(f"report: {page}")
+        for line in verdict.lines():  # after the report, whose parts may fail
+            output.line(line)
         fit = outcome.fit_result
         output.result(
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}

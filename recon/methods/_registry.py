@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from noiseflow.described import described
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
 from recon.fields.regularisers._registry import find_regulariser

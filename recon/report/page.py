@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 
 from noiseflow import io
 from noiseflow.arrays import strided
+from noiseflow.checks import Guard
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
@@ -48,6 +49,7 @@ def reconstruction_report(
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
     verdict: Verdict | None = None,
+    guard: Guard | None = None,
 ) -> Report:
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
 
@@ -60,27 +62,44 @@ def reconstruction_report(
         halves: reconstructions of the even and the odd tilts, for the Fourier shell correlation.
         reference: a reference volume for the Fourier shell correlation instead.
         verdict: the verdict, shown first with its charts.
+        guard: records the parts of the page that fail; the others are shown.
     """
     name = Path(inputs[0]).name if inputs else "tilt series"
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
-    if verdict is not None:
-        add_verdict(report, verdict, tilt_series, outcome)
+    guard = Guard() if guard is None else guard
+    parts: dict[str, Callable[[], None]] = {
+        "volume": lambda: _add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
+        "error bars": lambda: _add_uncertainty(report, tilt_series, outcome),
+        "tilt series": lambda: _add_tilts(report, tilt_series, outcome),
+        "beam and detector": lambda: _add_response(report, tilt_series, outcome),
+        "noise": lambda: _add_noise(report, tilt_series, outcome),
+        "convergence": lambda: _add_course(report, outcome),
+        "resolution": lambda: _add_resolution(report, outcome.volume, halves, reference),
+        "settings": lambda: _add_settings(report, tilt_series, outcome),
+    }
+    if (told := verdict) is not None:
+        guard("report: verdict", lambda: add_verdict(report, told, tilt_series, outcome), otherwise=None)
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
-    _add_volume(report, outcome.volume, _UNITS[tilt_series.mode])
-    if outcome.uncertainty is not None:
-        add_error_bars(report, tilt_series, outcome.volume, outcome.uncertainty, _UNITS[tilt_series.mode])
-        if outcome.caution is not None:
-            report.text(f"{outcome.caution[0].upper()}{outcome.caution[1:]}.")
-    _add_tilts(report, tilt_series, outcome)
-    _add_response(report, tilt_series, outcome)
-    _add_noise(report, tilt_series, outcome)
-    _add_course(report, outcome)
-    _add_resolution(report, outcome.volume, halves, reference)
-    report.heading("Settings and choices")
-    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    for part, add in parts.items():
+        guard(f"report: {part}", add, otherwise=None)
+    left_out = guard.in_words()
+    if left_out is not None:
+        report.text(f"{left_out[0].upper()}{left_out[1:]}.")
     report.heading("Provenance")
     report.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
     return report
+
+
+def _add_uncertainty(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
+    if outcome.uncertainty is not None:
+        add_error_bars(report, tilt_series, outcome.volume, outcome.uncertainty, _UNITS[tilt_series.mode])
+    if outcome.caution is not None:
+        report.text(f"{outcome.caution[0].upper()}{outcome.caution[1:]}.")
+
+
+def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
+    report.heading("Settings and choices")
+    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
 
 
 def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:

@@ -25,9 +25,8 @@ _KEPT = (6, 3)  # number of directions kept after the smallest size, and after t
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
 _EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
 _ROUNDS, _FEWER_ROUNDS = 15, 5
-_AGAIN = (
-    3  # refinements before equally good directions are declared equal, because wrong ones move towards the true one
-)
+# Refinements before equally good directions are declared equal, because wrong ones move towards the true one
+_AGAIN = 3
 
 
 class AxisUndetermined(ValueError):
@@ -80,7 +79,15 @@ def find_alignment(
         search = _Search(tilt_series, tilt_axis, device, progress)
         match, evidence = search.run()
     shifts = match.shifts.double().cpu().numpy()
-    return Alignment(search.stated(match.degrees), shifts, tilt_series.tilt_angles, tuple(evidence))
+    height, width = tilt_series.images.shape[1:]
+    return Alignment(
+        search.stated(match.degrees),
+        shifts,
+        tilt_series.tilt_angles,
+        tuple(evidence),
+        image_shape=(height, width),
+        pixel_size=tilt_series.pixel_size,
+    )
 
 
 @dataclass(frozen=True)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from noiseflow.checks import Guard
 from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
 from recon.series.orientation import Orientation
-from recon.series.screening import Screening, screen
+from recon.series.screening import Screening, require_specimen, screen
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
@@ -35,6 +36,7 @@ class Prepared:
         tilt_series: the aligned series, sorted by angle, without rejected tilts.
         screening: consistency of every tilt with the others, in the order of the given series.
         alignment: alignment of the raw images, in the order of the given series; None if they were not transformed.
+        guard: checks that failed, with their reasons.
 
     Example:
         >>> import numpy as np, recon
@@ -49,6 +51,7 @@ class Prepared:
     tilt_series: TiltSeries
     screening: Screening
     alignment: Alignment | None
+    guard: Guard = field(default_factory=Guard)
 
     @property
     def choices(self) -> dict[str, float | str]:
@@ -68,25 +71,28 @@ def prepare(
     *,
     tilt_axis: float | None = None,
     refine_alignment: bool = False,
+    alignment: Alignment | None = None,
     keep_tilts: bool = False,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Prepared:
     """Prepare a tilt series for reconstruction: checks, alignment, screening, and estimation of beam drift.
 
-    Doubtful results are reported as `UserWarning`.
+    Doubtful results are reported as `UserWarning`. A check that fails is listed in `Prepared.guard`; it does not stop the run.
 
     Args:
         tilt_series: the series as read.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to search it.
         refine_alignment: find the axis and the shift of every image.
+        alignment: the alignment of the same tilts, such as that of another channel, in place of a search.
         keep_tilts: keep tilts that are inconsistent with the others, with a warning.
         device: torch device.
         progress: called at each step of the alignment.
 
     Raises:
-        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, or the
-            images are inconsistent with an axis along y and their file states another tilt axis.
+        ValueError: the tilt axis is not a valid angle, there are too few tilts to align, images are moved out of view, at
+            least half of the images are blank, the images are inconsistent with an axis along y and their file states another
+            tilt axis, or `alignment` is of other tilts or comes with another option.
 
     Example:
         >>> import numpy as np, recon
@@ -98,18 +104,28 @@ def prepare(
     """
     if tilt_axis is not None and not abs(tilt_axis) <= 360:  # more than a full turn is a mistake
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
-    _warn_of_outliers(tilt_series)
+    guard = Guard()
+    guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
-    alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    if alignment is not None:
+        if refine_alignment or tilt_axis is not None:
+            raise ValueError("--alignment gives axis and shifts; remove --refine-alignment and --tilt-axis")
+        alignment = alignment.joined(tilt_series)
+    else:
+        alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
     if alignment is not None:
         tilt_series = alignment.apply(tilt_series)
-    check_contrast(tilt_series)
-    found = screen(
-        Orientation.of(tilt_series).series(tilt_series)
-    )  # the standard orientation gives identical results for mirror images
-    _require_axis(tilt_series, found, tilt_axis)
+    require_specimen(tilt_series)
+    guard("contrast", lambda: check_contrast(tilt_series), otherwise=None)
+    # the standard orientation gives identical results for mirror images
+    found = guard(
+        "screening",
+        lambda: screen(Orientation.of(tilt_series).series(tilt_series)),
+        otherwise=Screening.of_all(tilt_series.num_tilts),
+    )
+    _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
-    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment)
+    return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)
 
 
 def _alignment(
@@ -124,7 +140,9 @@ def _alignment(
         return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)
     if tilt_axis is None:
         return None
-    return Alignment(tilt_axis, np.zeros((series.num_tilts, 2)), series.tilt_angles)
+    height, width = series.images.shape[1:]
+    shifts, size = np.zeros((series.num_tilts, 2)), series.pixel_size
+    return Alignment(tilt_axis, shifts, series.tilt_angles, image_shape=(height, width), pixel_size=size)
 
 
 def _warn_of_order(angles: NDArray[np.float64]) -> None:
@@ -154,11 +172,11 @@ def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
         yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
 
 
-def _require_axis(series: TiltSeries, found: Screening, given: float | None) -> None:
-    """Handle a file that states another axis than y if the user gave none: warn if the images are consistent with y, because
-    aligned series may keep the entry; otherwise raise ValueError."""
+def _require_axis(series: TiltSeries, found: Screening) -> None:
+    """Handle a series that was not transformed and whose file states another axis than y: warn if the images are consistent with
+    y, because aligned series may keep the entry; otherwise raise ValueError."""
     stated = series.tilt_axis
-    if given is not None or stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
+    if stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
         return
     words = (
         f"the file states a tilt axis of {stated:g}°, but the images are assumed to be aligned, with the axis along y"

@@ -23,9 +23,8 @@ _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-_LEAST_DRIFT = (
-    0.04  # constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-)
+# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
+_LEAST_DRIFT = 0.04
 _FEWEST = 8
 _EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
@@ -48,6 +47,12 @@ class Screening:
     bad: NDArray[np.bool_]
     suspect: NDArray[np.bool_]
     unexplained: NDArray[np.float64]
+
+    @classmethod
+    def of_all(cls, count: int) -> Screening:
+        """All of `count` tilts are good."""
+        none = np.zeros(count, dtype=np.bool_)
+        return cls(np.ones(count), np.zeros(count), none, none, np.zeros(count))
 
     @property
     def drift(self) -> float:
@@ -89,19 +94,11 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
     SIRT iterations alternate with fits of the intensity of each tilt. The tilts whose residual likelihood deviates most from that
     of their neighbours are removed, and the procedure is repeated until none deviates.
-
-    Raises:
-        ValueError: at least half of the images are blank.
     """
     count = tilt_series.num_tilts
-    none = np.zeros(count, dtype=np.bool_)
     if count < _FEWEST:
-        return Screening(np.ones(count), np.zeros(count), none, none, np.zeros(count))
-    blank = int(sum(np.ptp(image) == 0 for image in tilt_series.images))
-    if 2 * blank >= count:
-        raise ValueError(
-            f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
-        )
+        return Screening.of_all(count)
+    none = np.zeros(count, dtype=np.bool_)
     lowered, _ = without_level(tilt_series)
     coarse = replace(lowered, images=coarse_images(lowered, _WIDTH, _HEIGHT), mask=None, beam=None)
     bad = none
@@ -118,6 +115,19 @@ def screen(tilt_series: TiltSeries) -> Screening:
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
             return Screening(beam, excess, none, bad, unexplained)
+
+
+def require_specimen(tilt_series: TiltSeries) -> None:
+    """Check that most images of a series of at least eight tilts show something.
+
+    Raises:
+        ValueError: at least half of the images are blank.
+    """
+    count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
+    if 2 * blank >= count >= _FEWEST:
+        raise ValueError(
+            f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
+        )
 
 
 def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:

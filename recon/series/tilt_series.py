@@ -207,11 +207,11 @@ def read_tilt_series(
     path: str | Path,
     *,
     angles: str | Path | None = None,
-    transforms: str | Path | None = None,
     mode: Mode = "transmission",
     mask: NDArray[np.bool_] | None = None,
     mask_nan: bool = False,
     mapped: bool = False,
+    channel: str | int | None = None,
 ) -> TiltSeries:
     """Read a stack and its tilt angles.
 
@@ -219,13 +219,14 @@ def read_tilt_series(
         path: the stack, in any format that `noiseflow.io.read` supports.
         angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
             ``.mdoc`` next to the stack, or else the angles in the stack file.
-        transforms: IMOD alignment (``.xf``) to apply to the images, which become float32.
         mode: image formation.
         mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
-        mapped: memory-map the images, see `noiseflow.io.read`; not with a mask, NaNs or transforms.
+        mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
+        channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
 
     Raises:
+        noiseflow.io.SeveralImages: there are several channels and none was chosen; a ValueError with their names.
         FileNotFoundError: the file does not exist, or there are no angles in or next to the stack.
         ValueError: a file cannot be read, the mask does not match, or the stack is not a valid `TiltSeries`.
 
@@ -235,7 +236,7 @@ def read_tilt_series(
         >>> recon.read_tilt_series(needle, mode="linear").images.shape
         (91, 64, 64)
     """
-    image_file = io.read(path, mapped=mapped)
+    image_file = io.read(path, mapped=mapped, channel=channel)
     if image_file.data.ndim != 3:
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
@@ -244,9 +245,7 @@ def read_tilt_series(
     images, mask = _masked(image_file.data, mask, mask_nan, str(path))
     io.require_contrast(images, path)
     pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
-    if transforms is not None:
-        images = io.apply_transforms(images, io.read_transforms(transforms))
-    tilt_axis = io.tilt_axis_of(path, image_file) if transforms is None else None
+    tilt_axis = io.tilt_axis_of(path, image_file)
     if mask is None:
         return TiltSeries(images, tilt_angles, pixel_size, mode, tilt_axis=tilt_axis)
     empty = ~mask.any((1, 2))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from noiseflow.checks import NotTested
 from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
@@ -30,7 +31,7 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
     """Single tilts that are predicted far worse than neighbouring tilts; tilts at the ends have few neighbours."""
     images, left = coarse.images[coarse.order], errors[coarse.order]
     if images.shape[1] < 2 or len(images) < 2 * _BESIDE:
-        return {}, []
+        raise NotTested(f"needs two rows and {2 * _BESIDE} tilts")
     structure = float(np.median([neighbours(image[None] - image.mean(), 1) for image in images]))
     shared = np.array([neighbours(each[None], 1) for each in left])
     beyond = shared - ndimage.median_filter(shared, _BESIDE, mode="nearest")
@@ -51,7 +52,7 @@ def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
     steps = np.diff(angles)
     if len(images) < 2 * _AROUND:
-        return {}, []
+        raise NotTested(f"needs {2 * _AROUND} tilts")
     flat = images - images.mean((1, 2), keepdims=True)
     power = (flat**2).mean((1, 2))
     shared = (flat[1:] * flat[:-1]).mean((1, 2))

@@ -12,21 +12,20 @@ _MARGIN = 2.0  # standard errors: a lead with a probability of 1 in 40 by chance
 _JUMP = 0.1  # nats per pixel above the best evaluation; final steps normally change the likelihood by some thousandths
 
 
-def fit_findings(result: Any, alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about the held-out likelihood and the axis."""
-    evidence, findings = _history(getattr(result, "fit_result", None))
-    findings += _weight(getattr(result, "weights_tried", None) or {})
+def axis(alignment: Alignment | None) -> tuple[dict[str, Any], list[Finding]]:
+    """Lead of the tilt axis over other directions."""
     if alignment is None or alignment.margin is None:
-        return evidence, findings
-    evidence["axis margin"] = alignment.margin
-    if alignment.margin < _MARGIN:
-        words = f"another tilt axis explains the images nearly as well, {alignment.margin:.1f} standard errors behind"
-        advice = "give the direction with --tilt-axis"
-        findings = [*findings, Finding("axis", min(2.9, _MARGIN / max(alignment.margin, 0.1)), words, advice)]
-    return evidence, findings
+        return {}, []
+    evidence = {"axis margin": alignment.margin}
+    if alignment.margin >= _MARGIN:
+        return evidence, []
+    words = f"another tilt axis explains the images nearly as well, {alignment.margin:.1f} standard errors behind"
+    advice = "give the direction with --tilt-axis"
+    return evidence, [Finding("axis", min(2.9, _MARGIN / max(alignment.margin, 0.1)), words, advice)]
 
 
-def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
+def convergence(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
+    """The held-out likelihood along the fit."""
     history = [] if fit_result is None else [float(value) for value in dict(fit_result.history).values()]
     if not history:
         return {}, []
@@ -41,22 +40,16 @@ def _history(fit_result: Any) -> tuple[dict[str, Any], list[Finding]]:
     return evidence, [Finding("fit", min(3.5, 1 + jump / (5 * _JUMP)), words, "compare with --method l2 or sirt")]
 
 
-def _weight(tried: dict[float, float]) -> list[Finding]:
+def weight(tried: dict[float, float]) -> tuple[dict[str, Any], list[Finding]]:
     """Check whether the best of the tried weights is at an end of the range, so that a better one may be outside."""
     if len(tried) < 2:
-        return []
+        return {}, []
     best = min(tried, key=lambda weight: tried[weight])
     if best == min(tried):  # the fit follows structure that is not noise
         words = f"held-out pixels prefer a weight of the regulariser below the lowest one tried, {best:.2g}"
-        return [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
+        return {}, [Finding("weight", 2.0, words, "give --weight, about 0.4 to 1, and compare with --method l2")]
     if best == max(tried):  # the residuals are misfit that only the regulariser reduces, and the volume becomes blocky
         words = f"held-out pixels prefer a weight of the regulariser above the highest one tried, {best:.2g}"
-        return [
-            Finding(
-                "weight",
-                2.0,
-                words,
-                "compare with --method l2, and align the series: the residuals are misfit rather than noise",
-            )
-        ]
-    return []
+        advice = "compare with --method l2, and align the series: the residuals are misfit rather than noise"
+        return {}, [Finding("weight", 2.0, words, advice)]
+    return {}, []

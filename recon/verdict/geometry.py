@@ -21,6 +21,8 @@ _SMALL = (
 )
 _LIKE_A_TURN = 0.211  # pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
+# degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
+_WIDEST = 190.0
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class Geometry:
 
     def angles(self) -> Gain:
         """The best other scale of the tilt angles."""
-        widest = float(np.abs(self.coarse.tilt_angles).max())
-        scales = [scale for scale in _SCALES if scale * widest <= 95]
+        span = float(np.ptp(self.coarse.tilt_angles))
+        scales = [scale for scale in _SCALES if scale < 1 or scale * span <= _WIDEST]
         return max(
             (self._with(f"multiplied by {scale:g}", tilt_angles=self.coarse.tilt_angles * scale) for scale in scales),
             key=_share,

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from recon.verdict.distortions import Distortion
 from recon.verdict.gap_fit import Unexplained
 from recon.verdict.geometry import Gain, Geometry
 from recon.verdict.residuals import neighbours
@@ -23,7 +22,7 @@ _BLUNT = 0.1  # uncertainty of the share of the structure: above it, the followi
 
 
 def geometry_findings(
-    geometry: Geometry, gap: Unexplained, expected: Unexplained, found: dict[str, Distortion]
+    geometry: Geometry, gap: Unexplained, expected: Unexplained
 ) -> tuple[dict[str, Any], list[Finding]]:
     """Evidence and findings of the coarse series."""
     tolerable = _TIMES * max(expected.share, 0.0) + _SLACK

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.series.tilt_series import TiltSeries
-from recon.verdict.limits import cliff, saturation
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
 
@@ -43,19 +42,8 @@ _DEAD, _STEP = (
 )  # standard deviation of a dead line relative to others; its step to its neighbours relative to the range
 
 
-def pixel_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about pixel values, from the slices with the highest contrast."""
-    images = residuals.images
-    evidence: dict[str, Any] = {}
-    findings: list[Finding] = []
-    for check in (saturation, cliff, _spikes, _lines, _region, _streaks, _borders, _seam, _blocks, _pattern, _uneven):
-        found, finding = check(tilt_series, images, residuals)
-        evidence |= found
-        findings += finding
-    return evidence, findings
-
-
-def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Pixels far outside the range of the others."""
     low, high = (float(end) for end in np.quantile(images[:: max(1, len(images) // 16)], (0.005, 0.995)))
     far = float(np.mean(np.abs(images - (low + high) / 2) > _SPIKE * max(high - low, 1e-30)))
     if far == 0 or high <= low:
@@ -67,7 +55,8 @@ def _spikes(tilt_series: TiltSeries, images: Array, _: Residuals) -> tuple[dict[
     ]
 
 
-def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+    """Rows and columns that hardly vary."""
     span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
     dead = {"rows": _dead(images.transpose(1, 0, 2), span), "columns": _dead(images.transpose(2, 0, 1), span)}
     findings = []
@@ -80,7 +69,7 @@ def _lines(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any],
     return {"dead lines": dead}, findings
 
 
-def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Pixels with a constant value in all tilts. At a limit of the values, where vacuum or saturation may be the cause, only
     pixels that differ from their surroundings count."""
     ends = float(images.min()), float(images.max())
@@ -103,7 +92,7 @@ def _region(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
     return {"dead pixels": share}, [Finding("lines", strength, sentence, "mask them with --mask FILE", "seen")]
 
 
-def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Rows or columns of single images whose mean residual differs from their neighbours by as much as the projections vary."""
     counts = {}
     for name, axis in (("rows", 2), ("columns", 1)):
@@ -120,7 +109,7 @@ def _streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
 
-def _borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Borders of single images with a constant value, unlike the adjacent pixels, as left by an alignment."""
     if tilt_series.mask is not None:  # borders are masked
         return {}, []
@@ -155,7 +144,7 @@ def _dead(lines: Array, span: float) -> int:
     return int((apart & (spread < _DEAD * np.median(spread))).sum())
 
 
-def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """A step between two columns in the mean of all tilts, in which edges of the object are smeared out."""
     steps = np.diff(images.mean((0, 1), dtype=np.float64))
     apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
@@ -170,7 +159,7 @@ def _seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], 
     return evidence, [Finding("pattern", 2.0, words, "correct the images with flats and darks first", "seen")]
 
 
-def _blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Steps at the borders of pixel blocks, along y and u, from lossy compression such as JPEG."""
     ratios = []
     for axis in (1, 2):
@@ -186,7 +175,7 @@ def _blocks(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any]
     return evidence, [Finding("pattern", 2.9, words, "use images without lossy compression", "seen")]
 
 
-def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Fine structure of the mean residual over the tilts, compared with that expected for independent tilts."""
     fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
     mean = fine.mean(0, keepdims=True)
@@ -211,7 +200,7 @@ def _pattern(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, 
     ]
 
 
-def _uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def uneven(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Smooth structure common to all residuals: uneven illumination or detector response."""
     residual = residuals.residual - _by_signal(images - residuals.residual, residuals.residual)
     mean = residual.mean(0, keepdims=True)

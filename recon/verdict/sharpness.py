@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.checks import NotTested
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import line_integrals
 from recon.verdict.residuals import Residuals
@@ -40,7 +41,7 @@ def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[d
     the sums of rows of line integrals, which are common to all tilts, and neighbouring tilts, which are nearly equal.
     """
     if residuals.images.shape[1] < _SMALLEST:
-        return {}, []
+        raise NotTested(f"needs {_SMALLEST} rows")
     images, angles = _integrals(tilt_series, residuals), residuals.tilt_angles
     growth, score = _growth(*blurs(images), angles)
     step, where = _step(images, angles)

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from noiseflow.checks import NotTested
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import Coarse
-from recon.verdict.continuity import breaks, single_tilts
-from recon.verdict.geometry import Geometry
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
@@ -32,28 +31,8 @@ _RADIANS = 1.6
 _DRIFT = 0.2  # relative beam drift: the fit follows it, but not exactly
 
 
-def tilt_findings(
-    tilt_series: TiltSeries, coarse: Coarse, geometry: Geometry, screening: Screening | None
-) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about the tilts; `geometry` provides their prediction from the others."""
-    evidence: dict[str, Any] = {}
-    findings: list[Finding] = []
-    for found, finding in (
-        _coverage(tilt_series.tilt_angles),
-        _repeats(tilt_series),
-        _twins(coarse),
-        _jumps(coarse),
-        _foreign(coarse, geometry.errors),
-        single_tilts(coarse, geometry.single_errors()),
-        breaks(coarse),
-        _screened(screening),
-    ):
-        evidence |= found
-        findings += finding
-    return evidence, findings
-
-
-def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
+def coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
+    """Range, gaps and number of the tilts."""
     directions = np.unique(np.round(np.mod(angles, 180), 3))
     gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
     wedge, inner = float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0
@@ -87,7 +66,7 @@ def _coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
     return evidence, findings
 
 
-def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
+def repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
     """Exactly equal images, which noise excludes for separate exposures."""
     groups: dict[bytes, int] = {}
     for image in tilt_series.images:
@@ -102,7 +81,7 @@ def _repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
     return {"repeated images": repeated}, [finding]
 
 
-def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
+def twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     """Images at the same angle must differ only by noise, which is independent between neighbouring rows."""
     order = coarse.order
     close = np.diff(coarse.tilt_angles[order]) < 0.02
@@ -122,7 +101,7 @@ def _twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     ]
 
 
-def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
+def jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     """Neighbouring tilts that differ much more than those around them, although a rotating object changes smoothly.
 
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
@@ -130,7 +109,7 @@ def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
     apart = np.diff(angles) > 0.02
     if apart.sum() < _AROUND or images.shape[1] < 2:
-        return {}, []
+        raise NotTested(f"needs two rows and {_AROUND + 1} tilts")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
     shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
@@ -151,10 +130,10 @@ def _jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     return evidence, [Finding("angles", strength, words, "check the list of angles and the images of these tilts")]
 
 
-def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
+def foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
     """Tilts that the others predict much worse than the rest, by the structure common to predicted and measured rows."""
     if coarse.images.shape[1] < 2:
-        return {}, []
+        raise NotTested("needs two rows")
     measured, predicted = (each - each.mean((1, 2), keepdims=True) for each in (coarse.images, coarse.images - errors))
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
@@ -174,7 +153,8 @@ def _foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Findin
     return evidence, [Finding("tilts", min(4.0, 1 + share / _LEFT_OUT), words, advice)]
 
 
-def _screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding]]:
+def screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding]]:
+    """How many tilts were excluded, and how much the beam drifts."""
     if screening is None:
         return {}, []
     share, drift = float(screening.bad.mean()), screening.drift

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
+from noiseflow.checks import Guard
 from recon.series.tilt_series import Volume
 
 Grade = Literal["good", "doubtful", "bad"]
@@ -65,12 +66,14 @@ class Verdict:
         reasons: sentences, seen findings first, then inferred ones, strongest first; for a good volume, the checks.
         evidence: numbers by name.
         findings: the findings behind the reasons.
+        not_tested: reasons of the checks that failed or could not be applied, by name.
     """
 
     grade: Grade
     reasons: tuple[str, ...]
     evidence: dict[str, Any] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    not_tested: dict[str, str] = field(default_factory=dict)
 
     @property
     def subjects(self) -> tuple[str, ...]:
@@ -79,19 +82,32 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Grade, reasons and evidence, JSON-serialisable."""
-        return {"grade": self.grade, "reasons": list(self.reasons), "evidence": self.evidence}
+        return {
+            "grade": self.grade,
+            "reasons": list(self.reasons),
+            "evidence": self.evidence,
+            "not_tested": self.not_tested,
+        }
 
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""
-        return [f"verdict: {self.grade}", *(f"  - {reason}" for reason in self.reasons)]
+        left_out = Guard(self.not_tested).in_words()
+        return [
+            f"verdict: {self.grade}",
+            *(f"  - {reason}" for reason in self.reasons),
+            *([left_out] if left_out else []),
+        ]
 
 
-def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str) -> Verdict:
-    """The verdict from findings; `good` is the sentence if there are none."""
+def verdict_of(
+    findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard | None = None
+) -> Verdict:
+    """The verdict from findings; `good` is the sentence if there are none, and `guard` knows what was not tested."""
+    left_out = {} if guard is None else guard.not_tested
     real = (each for each in findings if each.strength >= 1)
     found = sorted(real, key=lambda each: (_KINDS.index(each.kind), -each.strength))
     if not found:
-        return Verdict("good", (good,), evidence)
+        return Verdict("good", (good,), evidence, not_tested=left_out)
     first = _unrepeated(found)[:_TOLD]
     reasons = [f"{each.sentence}; {each.advice}" for each in first]
     worst = next((each for each in first if each.bad), None)
@@ -99,7 +115,7 @@ def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: s
         number = first.index(worst)
         reasons[number] = worst.sentence
         reasons[0] = f"{_capital(worst.advice)}: {_small(reasons[0])}"
-    return Verdict("doubtful" if worst is None else "bad", tuple(reasons), evidence, tuple(first))
+    return Verdict("doubtful" if worst is None else "bad", tuple(reasons), evidence, tuple(first), left_out)
 
 
 def _unrepeated(findings: list[Finding]) -> list[Finding]:

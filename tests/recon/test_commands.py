@@ -84,7 +84,7 @@ def test_bad_series_gives_one_clear_line_and_no_volume(series, tmp_path, damage,
     ("arguments", "words"),
     [
         (["--method", "magic"], "choose one of"),
-        (["--mode", "haadf"], "linear"),
+        (["--mode", "sem"], "linear"),
         (["--weight", "-1"], "zero or more"),
         (["--thickness", "0"], "thickness"),
         (["--noise-model", "none.safetensors"], "none.safetensors"),

@@ -13,46 +13,11 @@ IMAGES = RNG.random((3, 9, 9)).astype(np.float32)
 IDENTITY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def transforms(*rows: list[list[float]]) -> np.ndarray:
-    return np.array(rows, dtype=float)
-
-
-def test_identity_changes_nothing() -> None:
-    moved = io.apply_transforms(IMAGES, np.stack([IDENTITY] * 3))
-    np.testing.assert_allclose(moved, IMAGES, atol=1e-5)
-
-
-def test_shift_moves_the_image_by_dx_to_the_right_and_dy_down_the_rows() -> None:
-    moved = io.apply_transforms(IMAGES[:1], transforms([[1, 0, 2], [0, 1, -1]]))
-    np.testing.assert_allclose(moved[0, :-1, 2:], IMAGES[0, 1:, :-2], atol=1e-5)
-    np.testing.assert_allclose(moved[0, :, :2], IMAGES[0].mean(), atol=1e-5)
-
-
-def test_rotation_is_about_the_middle_and_turns_x_towards_y() -> None:
-    image = np.zeros((1, 9, 9), np.float32)
-    image[0, 4, 7] = 1  # three pixels along +x from the middle
-    moved = io.apply_transforms(image, transforms([[0, -1, 0], [1, 0, 0]]))
-    assert np.unravel_index(moved[0].argmax(), (9, 9)) == (7, 4)  # along +y
-
-
-def test_a_transform_and_its_inverse_give_the_image_back() -> None:
-    y, x = np.mgrid[:64, :64]
-    smooth = np.exp(-((x - 30) ** 2 + (y - 35) ** 2) / 60)[None].astype(np.float32)
-    matrix = np.array([[0.98, -0.1], [0.12, 1.03]])
-    shift = np.array([1.7, -2.3])
-    inverse = np.linalg.inv(matrix)
-    there = io.apply_transforms(smooth, np.column_stack([matrix, shift])[None])
-    back = io.apply_transforms(there, np.column_stack([inverse, -inverse @ shift])[None])
-    np.testing.assert_allclose(back[0, 15:50, 15:50], smooth[0, 15:50, 15:50], atol=2e-3)
-
-
 def test_xf_files_are_read_and_wrong_ones_named(tmp_path: Path) -> None:
     path = tmp_path / "a.xf"
     path.write_text("   1.0 0.5   0.0 1.0   2.5  -3.5\n\n1 0 0 1 0 0\n")
     found = io.read_transforms(path)
     np.testing.assert_array_equal(found, [[[1, 0.5, 2.5], [0, 1, -3.5]], IDENTITY])
-    with pytest.raises(ValueError, match="3 images and 2 transforms"):
-        io.apply_transforms(IMAGES, found)
     for text, message in (
         ("1 0 0 1 0\n", "line 1: six numbers"),
         ("1 0 0 1 0 x\n", "line 1: six numbers"),

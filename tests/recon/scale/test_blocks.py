@@ -150,7 +150,6 @@ def test_tilts_of_a_large_mapped_series_in_any_order_stay_on_the_disk(scene, tmp
 
 PREPARED = {
     "masked": lambda path, masked: read_tilt_series(path, mask=masked, mapped=True),
-    "aligned by a file": lambda path, _: read_tilt_series(path, transforms=path.with_suffix(".xf"), mapped=True),
     "aligned": lambda path, _: Alignment(3.0, np.full((21, 2), 0.5), np.arange(-60, 61, 6.0)).apply(
         read_tilt_series(path, mapped=True)
     ),

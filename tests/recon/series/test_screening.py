@@ -14,6 +14,7 @@ from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
+from recon.series.prepare import prepare
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.simulate.phantoms import make_phantom
@@ -130,4 +131,4 @@ def test_a_series_of_mostly_blank_images_is_refused_with_their_number():
     images = np.zeros((13, 12, 12), np.float32)
     images[4:6] = np.random.default_rng(0).random((2, 12, 12))
     with pytest.raises(ValueError, match="11 of 13 images are blank"):
-        screen(TiltSeries(images, np.linspace(-60, 60, 13), mode="linear"))
+        prepare(TiltSeries(images, np.linspace(-60, 60, 13), mode="linear"))

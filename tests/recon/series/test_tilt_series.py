@@ -100,15 +100,6 @@ def test_microscope_file_reads_with_the_angles_of_its_tags():
     assert series.pixel_size == pytest.approx(179.949, rel=1e-5)
 
 
-def test_alignment_is_applied_on_request(tmp_path):
-    io.write(tmp_path / "tilts.mrc", images())
-    (tmp_path / "tilts.tlt").write_text("-40\n0\n40\n")
-    (tmp_path / "tilts.xf").write_text("1 0 0 1 1 0\n" * 3)
-    moved = read_tilt_series(tmp_path / "tilts.mrc", transforms=tmp_path / "tilts.xf")
-    np.testing.assert_allclose(moved.images[:, :, 1:], images()[:, :, :-1], atol=1e-5)
-    np.testing.assert_array_equal(read_tilt_series(tmp_path / "tilts.mrc").images, images())
-
-
 def test_tensors_are_taken_and_the_value_tells_what_it_holds():
     series = TiltSeries(torch.from_numpy(images()), ANGLES, 4.5, "linear")
     assert isinstance(series.images, np.ndarray)

@@ -12,13 +12,12 @@ import pytest
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
 from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.verdict import tilts
 from recon.verdict.coarse import coarse_series
-from recon.verdict.geometry import Geometry
+from recon.verdict.judge import PIXELS
 from recon.verdict.limits import cliff, saturation
-from recon.verdict.pixels import pixel_findings
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import blurs, sharpness_findings
-from recon.verdict.tilts import tilt_findings
 
 NAMES = ("half of the tilts out of focus", "blur that grows with the tilt")
 
@@ -33,6 +32,14 @@ def spoilt(phantom: str, noise: str, name: str) -> TiltSeries:
 
 def residuals(series: TiltSeries, clean: Any) -> Residuals:
     return Residuals.of(series, clean.astype(np.float32))
+
+
+def pixel_part(series: TiltSeries, left: Residuals) -> tuple[dict[str, Any], list[Any]]:
+    """Evidence and findings of all checks of pixel values."""
+    parts = [check(series, left.images, left) for check in PIXELS.values()]
+    return {name: value for part, _ in parts for name, value in part.items()}, [
+        each for _, found in parts for each in found
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -96,8 +103,8 @@ def test_few_counts_have_no_pile_at_their_highest() -> None:
 def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     made = scene("shells", "clipped")
     series = spoilt("shells", "clipped", "half of the columns with another gain")
-    assert "pattern" in {each.subject for each in pixel_findings(series, residuals(series, made.clean.images))[1]}
-    assert pixel_findings(made.noisy, residuals(made.noisy, made.clean.images))[1] == []
+    assert "pattern" in {each.subject for each in pixel_part(series, residuals(series, made.clean.images))[1]}
+    assert pixel_part(made.noisy, residuals(made.noisy, made.clean.images))[1] == []
 
 
 @pytest.mark.parametrize(
@@ -106,10 +113,10 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
 def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> None:
     made = scene(phantom, noise)
     series = spoilt(phantom, noise, "one region black in all images")
-    found = pixel_findings(series, residuals(series, made.clean.images))[1]
+    found = pixel_part(series, residuals(series, made.clean.images))[1]
     assert any("have a constant value in all tilts" in each.sentence for each in found)
     masked = replace(series, mask=made.noisy.images == series.images)
-    assert pixel_findings(masked, residuals(masked, made.clean.images))[0]["dead pixels"] == 0
+    assert pixel_part(masked, residuals(masked, made.clean.images))[0]["dead pixels"] == 0
 
 
 @pytest.mark.parametrize(
@@ -117,7 +124,7 @@ def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> 
 )
 def test_vacuum_without_noise_is_not_dead(phantom: str, noise: str) -> None:
     clean = scene(phantom, noise).clean
-    assert pixel_findings(clean, residuals(clean, clean.images))[0]["dead pixels"] == 0
+    assert pixel_part(clean, residuals(clean, clean.images))[0]["dead pixels"] == 0
 
 
 def test_copies_of_images_raise_no_warning() -> None:
@@ -125,6 +132,7 @@ def test_copies_of_images_raise_no_warning() -> None:
     coarse = coarse_series(series, VolumeGrid.of(series, None))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        evidence, findings = tilt_findings(series, coarse, Geometry(coarse), None)
+        evidence, _ = tilts.jumps(coarse)
+        _, findings = tilts.repeats(series)
     assert np.isfinite(evidence["largest jump"])
     assert "repeats" in {each.subject for each in findings}

@@ -1,0 +1,78 @@
+"""Options from a file, options written by a run, and the groups of the help."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from noiseflow.commands.cli import main
+
+
+def run(*words: object) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in words])
+    if end.value.code:
+        raise RuntimeError(end.value.code)
+
+
+@pytest.fixture
+def tilts(tmp_path: Path) -> Path:
+    angles = np.arange(-60.0, 61.0, 6.0)
+    images = np.random.default_rng(0).normal(5.0, 0.2, (len(angles), 6, 12)).astype(np.float32)
+    images[:, :, 4:8] += 4
+    np.save(tmp_path / "tilts.npy", images)
+    np.savetxt(tmp_path / "tilts.rawtlt", angles)
+    return tmp_path / "tilts.npy"
+
+
+def test_options_of_a_file_are_used_and_words_of_the_command_take_precedence(tilts: Path) -> None:
+    file = tilts.with_name("run.toml")
+    file.write_text('mode = "linear"\nmethod = "sirt"\nsteps = 3\nreport = "nowhere"\n', encoding="utf-8")
+    report = tilts.with_name("report")
+    run("reconstruct", tilts, "-o", tilts.with_name("a.npy"), "--options", file, "--report", report, "--thickness", 12)
+    written = tomllib.loads((report / "options.toml").read_text(encoding="utf-8"))
+    assert (written["mode"], written["method"], written["steps"], written["thickness"]) == ("linear", "sirt", 3, 12)
+    assert written["report"] == str(report)
+    assert not tilts.with_name("nowhere").exists()
+
+
+def test_the_options_of_a_report_repeat_its_run(tilts: Path) -> None:
+    report, first = tilts.with_name("report"), tilts.with_name("first.npy")
+    run("reconstruct", tilts, "-o", first, "--mode", "linear", "--method", "SIRT", "--steps", 4, "--report", report)
+    before = np.load(first)
+    first.unlink()
+    run("reconstruct", "--options", report / "options.toml")
+    assert np.array_equal(np.load(first), before)
+
+
+def test_an_unknown_option_of_a_file_is_named_with_the_nearest_one(
+    tilts: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tilts.with_name("run.toml")
+    file.write_text("thicknes = 3\n", encoding="utf-8")
+    with pytest.raises(RuntimeError, match="1"):
+        run("reconstruct", tilts, "-o", tilts.with_name("a.npy"), "--options", file)
+    assert "'thicknes'" in (told := capsys.readouterr().err)
+    assert "thickness" in told
+
+
+@pytest.mark.parametrize("text", ["mode: linear", "\x00", "mode = \n"])
+def test_a_file_that_is_no_toml_is_refused(tilts: Path, text: str) -> None:
+    tilts.with_name("run.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(RuntimeError, match="1"):
+        run("reconstruct", tilts, "-o", tilts.with_name("a.npy"), "--options", tilts.with_name("run.toml"))
+    assert not tilts.with_name("a.npy").exists()
+
+
+def test_help_shows_few_options_and_help_all_every_one(capsys: pytest.CaptureFixture[str]) -> None:
+    run("reconstruct", "-h")
+    short = capsys.readouterr().out
+    run("reconstruct", "--help-all")
+    everything = capsys.readouterr().out
+    assert "--mode" in short
+    assert "--checkpoint-interval" not in short
+    assert "--checkpoint-interval" in everything
+    assert short.count("\n") < 60
