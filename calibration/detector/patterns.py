@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,17 +18,17 @@ CHANCE = 6.0
 LEAST_PIXELS = 100
 """Fewest pixels of a class; their mean square is then known to 14 %."""
 
-Groups = Callable[[Image, Image, tuple[int, ...]], Image]
+Groups = Callable[[Any, Any, tuple[int, ...]], Any]
 
 
 def _modulo(axis: int, period: int) -> Groups:
-    return lambda *index: np.asarray(index[axis] % period)  # type: ignore[call-overload]
+    return lambda y, x, shape: (y, x)[axis] % period
 
 
 GROUPS: dict[str, Groups] = {
-    "left and right halves": lambda y, x, shape: np.asarray(2 * x >= shape[1], int),
-    "upper and lower halves": lambda y, x, shape: np.asarray(2 * y >= shape[0], int),
-    "quadrants": lambda y, x, shape: np.asarray(2 * (2 * y >= shape[0]) + (2 * x >= shape[1]), int),
+    "left and right halves": lambda y, x, shape: (2 * x >= shape[1]).astype(int),
+    "upper and lower halves": lambda y, x, shape: (2 * y >= shape[0]).astype(int),
+    "quadrants": lambda y, x, shape: 2 * (2 * y >= shape[0]) + (2 * x >= shape[1]),
     "every second column": _modulo(1, 2),
     "every second row": _modulo(0, 2),
     "2 × 2 mosaic": lambda y, x, shape: 2 * (y % 2) + x % 2,
@@ -65,7 +66,8 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         inflation: factor of the standard error of a variance due to correlation between pixels.
     """
     shape = residuals[0].mask.shape
-    total, square, number = np.zeros(shape), 0.0, np.zeros(shape)
+    total, number = np.zeros((2, *shape))
+    square = 0.0
     for one in residuals:
         squares = (one.z**2 * one.mask).reshape(-1, *shape)
         mean = float(squares.sum() / max(one.mask.sum() * len(squares), 1))
@@ -73,21 +75,24 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         total, number = total + relative.sum(0), number + len(squares) * one.mask
         square += float(np.sum(relative**2))
     usual = inflation**2 * square / max(float(number.sum()), 1.0)  # variance of a relative square
-    found = [(name, *_of_classes(total, number, group, usual)) for name, group in GROUPS.items()]
+    found: list[tuple[str, float, float, int, tuple[float, ...]]] = [
+        (name, *_of_classes(total, number, group, usual)) for name, group in GROUPS.items()
+    ]
     found.append(("field", *_of_field(total, number, usual)))
     best = max(found, key=lambda one: one[1])
-    name, excess, relative, freedom, factors = best
+    name, excess, deviation, freedom, factors = best
     if excess < CHANCE:
         return Pattern()
     error = float(np.sqrt(usual / number.sum()) * np.sqrt(freedom))
-    return Pattern(name, relative, error, factors)
+    return Pattern(name, deviation, error, factors)
 
 
 def _of_classes(
     total: Image, number: Image, group: Groups, usual: float
 ) -> tuple[float, float, int, tuple[float, ...]]:
     """Return excess χ² in standard errors, relative deviation (rms), degrees of freedom, and the factor of each class."""
-    label = group(*np.indices(total.shape), total.shape).ravel()
+    y, x = np.indices(total.shape)
+    label = group(y, x, total.shape).ravel()
     count = np.bincount(label, number.ravel())
     if len(count) < 2 or count.min() < LEAST_PIXELS:
         return 0.0, 0.0, 0, ()

@@ -155,9 +155,8 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0])
     _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
-    counts = MaskCounts(
-        *(int(m.sum()) for m in (~covered, (railed & trusted) | lost, hot, dead)), outliers=int(found.sum())
-    )
+    lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
+    counts = MaskCounts(*(int(one.sum()) for one in lost_by))
     return AlignedPair(
         pair.short, pair.long, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio
     )
