@@ -12,6 +12,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
+from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
@@ -182,7 +183,7 @@ def _period(residual: Residual) -> float:
     for z, signal in ((residual.z, scene), (residual.z.swapaxes(-1, -2), scene.T)):
         own = maximum_filter1d(_lines(signal.mean(0)), 3)
         rows = tuple(range(z.ndim - 1))
-        for profile in ((z**2).mean(rows), (z[..., 1:] * z[..., :-1]).mean(rows)):
+        for profile in ((z**2).mean(rows), neighbour_products(z).mean(rows)):
             if len(profile) < LEAST_PROFILE:
                 continue
             relative = _lines(profile)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -89,6 +89,14 @@ def _residual_of(pair: AlignedPair) -> Residual:
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
     return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal)
+
+
+def by_own_signal(pair: AlignedPair) -> Residual:
+    """Return the residual over the noise expected at each pixel's own signal, which the pixels of a mosaic do not share."""
+    found = residual_of(pair)
+    least = 0.1 * float(np.mean(found.spread[pair.mask] ** 2))
+    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), least))
+    return replace(found, z=np.clip(found.z * found.spread / spread, -CUT, CUT), spread=spread)
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from calibration.exposures.frames import Image, rounding_step
+from calibration.exposures.frames import Image, rails, rounding_step
 from calibration.exposures.scaling import Mask, spread_by_level
 
 LEAST_DEVIATION = 6.0
@@ -80,6 +80,8 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     z = difference / np.hypot(spread, rounding_step(frames))  # the next code is no outlier
     found = tracks(z, threshold(z))
     found &= found.sum(axis=0) <= 1 + number // 100
+    low, high = rails(frames)
+    found &= ~np.any((frames <= low) | (frames >= high), axis=0)
     if not 0 < found.sum() <= MOST_OUTLIERS * found.size:
         return frames, 0
     cleaned = frames.copy()

@@ -64,6 +64,7 @@ def prepare(
     refine_alignment: bool,
     alignment: Path | None,
     save_alignment: Path | None,
+    second_axis: TiltSeries | None,
     keep_tilts: bool,
     device: str,
     output: Output,
@@ -75,12 +76,15 @@ def prepare(
         tilt_axis=tilt_axis,
         refine_alignment=refine_alignment,
         alignment=None if alignment is None else read_alignment(alignment, tilt_series),
+        second_axis=second_axis,
         keep_tilts=keep_tilts,
         device=device,
         progress=report,
     )
     if refine_alignment and prepared.alignment is not None:
         output.line(prepared.alignment.in_words())
+    if prepared.registration is not None:
+        output.line(prepared.registration.in_words())
     if save_alignment is not None:
         if prepared.alignment is None:
             raise ValueError("--save-alignment: there is no alignment; find it with --refine-alignment")

@@ -17,6 +17,8 @@ from noiseflow import Gaussian, fit
 from noiseflow.threads import num_threads
 from recon.fields.fields import Field, MultiresolutionField
 from recon.joint.signal_model import TomographySignal
+from recon.projection.base import Projector
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import attenuation_scale, rough_volume
@@ -115,13 +117,15 @@ class _BestResponse(nn.Module):
         return signal
 
 
-def _binned(
-    tilt_series: TiltSeries, grid: VolumeGrid, binning: int
-) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
+def _binned(tilt_series: TiltSeries, grid: VolumeGrid, binning: int) -> tuple[TiltSeries, NDArray[np.bool_], Projector]:
     """The binned series with a mask, and the projector of a grid with voxels of that size."""
     images, share = (np.stack(parts) for parts in zip(*_binned_images(tilt_series, binning), strict=True))
     mask = share > 0
     images[~mask] = images[mask].mean()
+    axes = tilt_series.axes
+    if axes is not None:  # incomplete bins shift the centre by less than half a bin
+        binned = TiltSeries(images, tilt_series.tilt_angles, None, tilt_series.mode, axes=axes)
+        return binned, mask, projector_of(binned, VolumeGrid(-(-grid.depth // binning), *images.shape[1:]))
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=-(-grid.depth // binning),

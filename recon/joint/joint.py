@@ -29,10 +29,9 @@ from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
-from recon.projection.base import Projector
-from recon.projection.defocused_projector import with_defocus
+from recon.projection.base import Projector, from_rays
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
-from recon.projection.projector import SliceProjector, from_rays
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -182,14 +181,7 @@ class JointReconstructor:
 
     def projector(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Projector:
         """Line integrals through any slices of the grid."""
-        in_focus = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles,
-            depth=grid.depth,
-            width=grid.width,
-            detector_width=tilt_series.images.shape[2],
-            device=self.device,
-        )
-        return with_defocus(in_focus, self.defocus)
+        return projector_of(tilt_series, grid, self.device, self.defocus)
 
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]

@@ -71,8 +71,8 @@ def read_alignment(path: str | Path, tilt_series: TiltSeries | None = None) -> A
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "series.xf"
         >>> _ = path.write_text("1 0 0 1 2.5 0\\n" * 3)
         >>> series = recon.TiltSeries(np.random.default_rng(0).random((3, 8, 8)), [-30.0, 0.0, 30.0], mode="linear")
-        >>> recon.read_alignment(path, series).shifts[0].tolist()  # (y, x) of the raw images
-        [0.0, -2.5]
+        >>> recon.read_alignment(path, series).shifts[0, 1].item()  # pixels along x
+        -2.5
     """
     path = Path(path)
     if path.suffix.lower() != ".json":

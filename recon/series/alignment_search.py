@@ -111,7 +111,7 @@ class _Search:
     ) -> None:
         self.angles, self.given, self.progress = series.tilt_angles, tilt_axis, progress
         self.known = series.tilt_axis if tilt_axis is None else tilt_axis
-        self.images = _line_integrals(series).to(device)
+        self.images = line_integrals_of(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
         size = max(series.images.shape[1:])
         self.binnings = _binnings(size)
@@ -268,7 +268,7 @@ def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
     return _weighed(matcher, best, candidate.known)
 
 
-def _line_integrals(tilt_series: TiltSeries) -> Tensor:
+def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     """Images as line integrals, of order one."""
     lowered, _ = without_level(tilt_series)
     integrals = estimate_response(lowered).invert(torch.from_numpy(lowered.images)).detach()

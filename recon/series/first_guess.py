@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from recon.projection.base import Projector
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.tilt_series import TiltSeries, block_means
 
@@ -45,10 +45,11 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 
-def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
-    """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
+def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: Projector) -> Tensor:
+    """A few iterations of SIRT on bands of four slices, (z, y/4, x); of single slices, if they are not independent."""
     images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.device)
+    together = 1 if projector.fixed_height else min(4, images.shape[1])
+    bands = functional.avg_pool2d(images[:, None], (together, 1))[:, 0].to(projector.device)
     with torch.no_grad():
         return sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
 
@@ -60,9 +61,9 @@ def attenuation_scale(volume: Tensor) -> float:
 
 
 def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
-    """The `num_slices` neighbouring slices with the largest variation of the images."""
+    """The `num_slices` neighbouring slices with the largest variation of the images; all of a series about two axes."""
     height = tilt_series.images.shape[1]
-    if num_slices >= height:
+    if num_slices >= height or tilt_series.axes is not None:
         return slice(0, height)
     start = int(_variation(tilt_series, num_slices).argmax())
     return slice(start, start + num_slices)

@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 from torch import Tensor
 
 from noiseflow.described import described
+from noiseflow.statistics import robust_deviation
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
@@ -106,7 +107,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
         beam, residual, predicted = _fit_beam(coarse, bad)
         nll = _negative_log_likelihood(residual, predicted, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
-        spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
+        spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
         unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2)) / max(float(coarse.images.var()), 1e-30)
         if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):

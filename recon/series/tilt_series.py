@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow import io
+from noiseflow import io, statistics
 from noiseflow.described import described, size_of
 from noiseflow.io import mapped
 from noiseflow.io.mapped import is_mapped
@@ -32,6 +32,9 @@ class TiltSeries:
         mask: (tilt, y, u), True for pixels to use; None for all. Fits exclude the other pixels; classical methods use their
             values in `images`, which should be plausible.
         beam: (tilt,) incident intensity relative to the median if the beam drifts; the initial value of a fit.
+        axes: (tilt,) direction of each tilt axis in the specimen, degrees from y towards −x, if there are two: 0, or a number
+            near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
+            orientation at zero tilt. See `recon.DualAxisProjector`.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
 
@@ -53,6 +56,7 @@ class TiltSeries:
     mask: NDArray[np.bool_] | None = None
     beam: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
+    axes: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -78,7 +82,9 @@ class TiltSeries:
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
         _require_several_views(self.images)
-        _check_angles(self.tilt_angles)
+        if self.axes is not None and np.shape(self.axes) != self.tilt_angles.shape:
+            raise ValueError(f"axes needs one direction for each of the {len(self.images)} tilts")
+        self._check_angles()
 
     def __repr__(self) -> str:
         size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
@@ -98,7 +104,7 @@ class TiltSeries:
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
     def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
-        """Some rows (y) of all images; they may be constant."""
+        """Some rows (y) of all images; they may be constant. Of a series about two axes, all rows belong together."""
         return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
 
     def with_images(self, images: NDArray[Any], mask: NDArray[np.bool_] | None) -> TiltSeries:
@@ -120,8 +126,20 @@ class TiltSeries:
         part = self.with_images(images, mask)
         object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
         object.__setattr__(part, "beam", beam)
-        _check_angles(part.tilt_angles)
+        object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
+        part._check_angles()
         return part
+
+    @property
+    def rising(self) -> NDArray[np.int64]:
+        """Indices of the tilts by axis, then by rising angle; stable."""
+        axes = np.zeros(self.num_tilts) if self.axes is None else self.axes
+        return np.lexsort((self.tilt_angles, axes))
+
+    def _check_angles(self) -> None:
+        axes = np.zeros(self.num_tilts) if self.axes is None else self.axes
+        for axis in np.unique(axes):
+            _check_angles(self.tilt_angles[axes == axis])
 
 
 def _sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:
@@ -301,10 +319,9 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
 
 def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
     """Means of blocks of pixels, image by image; incomplete blocks are dropped, evenly at both edges."""
-    height, width = images.shape[1] // down, images.shape[2] // across
-    top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
-    whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
-    return np.stack([image.reshape(height, down, width, across).mean((1, 3)).astype(np.float32) for image in whole])
+    top, left = images.shape[1] % down // 2, images.shape[2] % across // 2
+    inner = (image[top:, left:].astype(np.float64) for image in images)
+    return np.stack([statistics.block_means(image, down, across).astype(np.float32) for image in inner])
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
@@ -361,10 +378,10 @@ def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
         warnings.warn(
-            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=4
+            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=5
         )
     if np.abs(angles).max() < 1.6:
         warnings.warn(
             f"all tilt angles are within ±{np.abs(angles).max():.2f}, as if in radians; give them in degrees",
-            stacklevel=4,
+            stacklevel=5,
         )
