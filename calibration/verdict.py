@@ -21,7 +21,7 @@ from calibration.detector.independence import contained_share, correlation_in_ti
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.repair import LEAST_SHARE, Repairs
-from calibration.detector.residual import by_own_signal
+from calibration.detector.residual import residual_of
 from calibration.detector.response import Response
 from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed, wavelet_compressed
@@ -97,7 +97,7 @@ def judge_calibration(
         repairs: violated assumptions that were modelled before the measurement.
     """
     shared = pairs[0].frames / max(pairs[0].frames - 1, 1)  # residuals from a mean that the frames of a burst share
-    pattern = pattern_of([by_own_signal(pair) for pair in pairs], inflation=correlation.inflation * np.sqrt(shared))
+    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation * np.sqrt(shared))
     reasons = [
         *_scene(repairs, correlation),
         *_independence(pairs),

@@ -25,10 +25,14 @@ def _modulo(axis: int, period: int) -> Groups:
     return lambda y, x, shape: (y, x)[axis] % period
 
 
-GROUPS: dict[str, Groups] = {
+AMPLIFIERS: dict[str, Groups] = {
     "left and right halves": lambda y, x, shape: (2 * x >= shape[1]).astype(int),
     "upper and lower halves": lambda y, x, shape: (2 * y >= shape[0]).astype(int),
     "quadrants": lambda y, x, shape: 2 * (2 * y >= shape[0]) + (2 * x >= shape[1]),
+}
+"""Parts of the field that may have amplifiers of their own: functions of row, column and frame shape."""
+
+MOSAICS: dict[str, Groups] = {
     "every second column": _modulo(1, 2),
     "every second row": _modulo(0, 2),
     "2 × 2 mosaic": lambda y, x, shape: 2 * (y % 2) + x % 2,
@@ -37,7 +41,7 @@ GROUPS: dict[str, Groups] = {
     "every fourth column": _modulo(1, 4),
     "every fourth row": _modulo(0, 4),
 }
-"""Classes of pixels that may have amplifiers or filters of their own; functions of row, column and frame shape."""
+"""Classes of pixels that repeat, and may have amplifiers or filters of their own."""
 
 
 @described(relative="of the noise variance", error="of the noise variance")
@@ -46,7 +50,7 @@ class Pattern:
     """Dependence of the noise variance on the place, at equal signal.
 
     Attributes:
-        name: ``"field"`` for a smooth dependence, else one of `GROUPS`; empty if there is none.
+        name: ``"field"`` for a smooth dependence, else one of `AMPLIFIERS` or `MOSAICS`; empty if there is none.
         relative: relative deviation (rms) of the variance; 0 if not significant.
         error: its standard error.
         factors: (C,) variance of each class over the mean.
@@ -66,54 +70,61 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         inflation: factor of the standard error of a variance due to correlation between pixels.
     """
     shape = residuals[0].mask.shape
-    total, number = np.zeros((2, *shape))
-    square = 0.0
+    total, number, known, fourth = np.zeros((4, *shape))
     for one in residuals:
         squares = (one.z**2 * one.mask).reshape(-1, *shape)
-        mean = float(squares.sum() / max(one.mask.sum() * len(squares), 1))
-        relative = np.where(one.mask, squares / max(mean, np.finfo(float).tiny) - 1, 0.0)
+        mean = max(float(squares.sum()) / max(float(one.mask.sum()) * len(squares), 1.0), np.finfo(float).tiny)
+        relative = np.where(one.mask, squares / mean - 1, 0.0)
         total, number = total + relative.sum(0), number + len(squares) * one.mask
-        square += float(np.sum(relative**2))
-    usual = inflation**2 * square / max(float(number.sum()), 1.0)  # variance of a relative square
-    found: list[tuple[str, float, float, int, tuple[float, ...]]] = [
-        (name, *_of_classes(total, number, group, usual)) for name, group in GROUPS.items()
-    ]
-    found.append(("field", *_of_field(total, number, usual)))
-    best = max(found, key=lambda one: one[1])
-    name, excess, deviation, freedom, factors = best
-    if excess < CHANCE:
-        return Pattern()
-    error = float(np.sqrt(usual / number.sum()) * np.sqrt(freedom))
-    return Pattern(name, deviation, error, factors)
+        fourth = fourth + inflation**2 * (relative**2).sum(0)
+        if one.expected is not None:
+            known = known + np.where(one.mask, one.expected / one.expected[one.mask].mean() - 1, 0.0) * len(squares)
+    found = [(name, *_of_classes(total, number, group, fourth)) for name, group in AMPLIFIERS.items()]
+    # only classes that are everywhere see the same scene, so that the line of variance may replace the levels
+    found += [(name, *_of_classes(total - known, number, group, fourth)) for name, group in MOSAICS.items()]
+    found.append(("field", *_of_field(total, number, fourth)))
+    name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
+    return Pattern(name, deviation, error, factors) if excess > CHANCE else Pattern()
 
 
-def _of_classes(
-    total: Image, number: Image, group: Groups, usual: float
-) -> tuple[float, float, int, tuple[float, ...]]:
-    """Return excess χ² in standard errors, relative deviation (rms), degrees of freedom, and the factor of each class."""
+Found = tuple[float, float, float, tuple[float, ...]]
+"""Excess of χ² in its standard errors, relative deviation (rms) and its standard error, factors of the classes."""
+
+NOTHING: Found = (0.0, 0.0, 0.0, ())
+
+
+def _of_classes(total: Image, number: Image, group: Groups, fourth: Image) -> Found:
+    """Compare the mean squares of classes; `fourth` is the sum of squared relative squares, the variance of `total`."""
     y, x = np.indices(total.shape)
     label = group(y, x, total.shape).ravel()
     count = np.bincount(label, number.ravel())
     if len(count) < 2 or count.min() < LEAST_PIXELS:
-        return 0.0, 0.0, 0, ()
+        return NOTHING
     mean = np.bincount(label, total.ravel()) / count
     mean -= np.average(mean, weights=count)
+    variance = np.bincount(label, fourth.ravel()) / count**2
     freedom = len(mean) - 1
-    squared = float(np.sum(count * mean**2)) / usual
-    deviation = np.sqrt(max(squared - freedom, 0.0) * usual / count.sum())
-    return (squared - freedom) / np.sqrt(2 * freedom), float(deviation), freedom, tuple(float(1 + one) for one in mean)
+    chi_squared = float(np.sum(mean**2 / np.maximum(variance, np.finfo(float).tiny))) * freedom / len(mean)
+    usual = float(np.average(variance, weights=count)) * freedom
+    deviation = np.sqrt(max(float(np.average(mean**2, weights=count)) - usual, 0.0))
+    factors = tuple(float(1 + one) for one in mean)
+    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), factors
 
 
-def _of_field(total: Image, number: Image, usual: float) -> tuple[float, float, int, tuple[float, ...]]:
-    """Return the same for a second-order polynomial of the position, without factors."""
+def _of_field(total: Image, number: Image, fourth: Image) -> Found:
+    """Fit a second-order polynomial of the position, with errors that allow for another scatter in each pixel (White)."""
+    if number.sum() < 10 * LEAST_PIXELS or min(total.shape) < 8:
+        return NOTHING
     y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(total.shape), total.shape, strict=True))
     weight = number.ravel()
-    if weight.sum() < 10 * LEAST_PIXELS or min(total.shape) < 8:
-        return 0.0, 0.0, 0, ()
     terms = np.stack([term.ravel() for term in (x, y, x * x, x * y, y * y)])
     terms -= (terms @ weight / weight.sum())[:, None]
-    moment = terms @ (total.ravel() - weight * total.sum() / weight.sum())
-    explained = float(moment @ np.linalg.solve(terms * weight @ terms.T, moment)) / usual
+    gram = np.linalg.inv(terms * weight @ terms.T)
+    coefficients = gram @ (terms @ (total.ravel() - weight * total.sum() / weight.sum()))
+    covariance = gram @ (terms * fourth.ravel() @ terms.T) @ gram
     freedom = len(terms)
-    deviation = np.sqrt(max(explained - freedom, 0.0) * usual / weight.sum())
-    return (explained - freedom) / np.sqrt(2 * freedom), float(deviation), freedom, ()
+    chi_squared = float(coefficients @ np.linalg.solve(covariance, coefficients))
+    shape = coefficients @ terms
+    usual = float(np.sum(weight * np.einsum("ip,ij,jp->p", terms, covariance, terms)) / weight.sum())
+    deviation = np.sqrt(max(float(np.average(shape**2, weights=weight)) - usual, 0.0))
+    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), ()

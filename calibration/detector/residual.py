@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -61,6 +61,8 @@ class Residual:
         share: share of the residual variance due to the noise of the signal.
         spread: (y, x) standard deviation at the level, counts.
         signal: (y, x) counts; None for frames without a scene.
+        expected: (y, x) squares expected from each pixel's own signal, which the pixels of a mosaic do not share; None if all are
+            equal.
     """
 
     z: Image
@@ -68,6 +70,7 @@ class Residual:
     share: float
     spread: Image
     signal: Image | None = None
+    expected: Image | None = None
 
 
 def residual_of(pair: AlignedPair) -> Residual:
@@ -88,15 +91,8 @@ def _residual_of(pair: AlignedPair) -> Residual:
     cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
-    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal)
-
-
-def by_own_signal(pair: AlignedPair) -> Residual:
-    """Return the residual over the noise expected at each pixel's own signal, which the pixels of a mosaic do not share."""
-    found = residual_of(pair)
-    least = 0.1 * float(np.mean(found.spread[pair.mask] ** 2))
-    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), least))
-    return replace(found, z=np.clip(found.z * found.spread / spread, -CUT, CUT), spread=spread)
+    expected = pair.total_variance(pair.signal) / spread**2
+    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal, expected)
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
