@@ -229,6 +229,8 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
     found = detector.posterior
     return {
         "gain": interval(figures.gain),
+        "gain_if_linear": interval(figures.linear),
+        "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
         "offset": interval(figures.offset),
         "read_noise": interval(figures.read_noise),
         "source": figures.source,

@@ -31,6 +31,8 @@ def load_tilt_series(
     mask_nan: bool,
     mapped: bool = False,
     channel: str | None = None,
+    pixel_size: float | None = None,
+    exclude_views: str = "",
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command.
 
@@ -45,6 +47,8 @@ def load_tilt_series(
         mask_nan=mask_nan,
         mapped=mapped,
         channel=channel,
+        pixel_size=pixel_size,
+        exclude_views=exclude_views,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)
@@ -64,6 +68,7 @@ def prepare(
     tilt_axis: float | None,
     refine_alignment: bool,
     alignment: Path | None,
+    alignment_binning: float | None,
     save_alignment: Path | None,
     second_axis: TiltSeries | None,
     keep_tilts: bool,
@@ -76,7 +81,7 @@ def prepare(
         tilt_series,
         tilt_axis=tilt_axis,
         refine_alignment=refine_alignment,
-        alignment=None if alignment is None else read_alignment(alignment, tilt_series),
+        alignment=None if alignment is None else read_alignment(alignment, tilt_series, binning=alignment_binning),
         second_axis=second_axis,
         keep_tilts=keep_tilts,
         device=device,

@@ -43,7 +43,17 @@ if TYPE_CHECKING:
 
 @option_groups(
     {
-        "Input": ("angles", "channel", "alignment", "mask", "mask_nan", "invert_contrast"),
+        "Input": (
+            "angles",
+            "channel",
+            "pixel_size",
+            "exclude_views",
+            "alignment",
+            "alignment_binning",
+            "mask",
+            "mask_nan",
+            "invert_contrast",
+        ),
         "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
         "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
@@ -70,11 +80,20 @@ def reconstruct(
         str | None,
         typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
     ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="Pixel size in Å, in place of that of the files.")] = None,
+    exclude_views: Annotated[
+        str, typer.Option(help="Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
+    ] = "",
     alignment: Annotated[
         Path | None,
         typer.Option(
-            help="Alignment to apply: a .json file of --save-alignment, also of another channel, or IMOD's .xf."
+            help="Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
+            "AreTomo's .aln or RELION's .star."
         ),
+    ] = None,
+    alignment_binning: Annotated[
+        float | None,
+        typer.Option(help="How many times smaller the images are than those that .xf, .aln or .star were made on."),
     ] = None,
     method: Annotated[
         str,
@@ -243,11 +262,13 @@ def reconstruct(
             invert_contrast=invert_contrast,
             mask_nan=mask_nan,
             channel=channel,
+            pixel_size=pixel_size,
         )
         tilt_series = read(
             tilts,
             angles=angles,
             mask=mask,
+            exclude_views=exclude_views,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with progress_shown(json_mode=json) as progress:
@@ -256,6 +277,7 @@ def reconstruct(
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
                 alignment=alignment,
+                alignment_binning=alignment_binning,
                 save_alignment=save_alignment,
                 second_axis=None if second_axis is None else read(second_axis, angles=second_angles, mask=None),
                 keep_tilts=keep_tilts,

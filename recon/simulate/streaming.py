@@ -15,6 +15,7 @@ from torch import nn
 
 from noiseflow.io import locked, output_folder, partial_folder
 from noiseflow.io.files import reserve
+from noiseflow.io.mapped import finish_mrc
 from noiseflow.io.ownership import signature
 from noiseflow.io.partials import link_target
 from noiseflow.progress import Progress
@@ -85,6 +86,8 @@ class Simulation:
             partial_folder(folder / "simulate") as partial,
         ):
             unit = _Writer(self, partial, progress).run()
+            for path in partial.glob("*.mrc"):
+                finish_mrc(path, stack=path.stem != "truth")
             for path in sorted(partial.iterdir()):
                 path.replace(link_target(folder / path.name))
         return unit
