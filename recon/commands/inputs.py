@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.commands.console import Output, StepReport
+from noiseflow.commands.console import Output
+from noiseflow.progress import Progress
 from recon.commands.options import parse_mode
 from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
 from recon.series.contrast import invert_contrast as inverted
@@ -73,7 +74,7 @@ def prepare(
     keep_tilts: bool,
     device: str,
     output: Output,
-    report: StepReport | None = None,
+    report: Progress | None = None,
 ) -> Prepared:
     """As `recon.prepare` with files of alignments, and print the alignment that was found."""
     prepared = prepare_series(

@@ -17,9 +17,9 @@ from noiseflow.commands.console import (
     OverwriteOption,
     SeedOption,
     choose_device,
-    step_report,
 )
 from noiseflow.commands.option_files import option_groups
+from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
     chosen_slices,
@@ -271,7 +271,7 @@ def reconstruct(
             exclude_views=exclude_views,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
-        with step_report(json_mode=json) as progress:
+        with progress_shown(json_mode=json) as progress:
             prepared = prepare(
                 tilt_series,
                 tilt_axis=tilt_axis,
@@ -307,7 +307,7 @@ def reconstruct(
             if slices_at_once is not None:
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 options |= {"keep": journal.keep, "forget": journal.forget}
-            with step_report(json_mode=json) as journal.report:
+            with progress_shown(json_mode=json) as journal.report:
                 outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc, guard=prepared.guard)
             verdict = targets.write(
                 output,
@@ -334,10 +334,6 @@ def _solve(
     from recon.methods import reconstruct
     from recon.report.page import even_odd
 
-    def progress(done: int, total: int, note: str) -> None:
-        if journal.report is not None:
-            journal.report("reconstructing", done, total, note)
-
     def halves() -> tuple[Volume, Volume]:
         even, odd = (
             reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
@@ -345,7 +341,7 @@ def _solve(
         )
         return even, odd
 
-    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
+    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": journal.report}
     outcome = reconstruct(tilt_series, grid, **options)
     return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
 
