@@ -413,3 +413,37 @@ def test_an_emi_file_needs_the_ser_file_of_its_pixels(tmp_path: Path) -> None:
     (tmp_path / "a.emi").write_bytes(bytes(100))
     with pytest.raises(ValueError, match=r"a_1\.ser"):
         io.read(tmp_path / "a.emi")
+
+
+def test_an_emi_file_opens_with_the_ser_file_of_its_pixels(tmp_path: Path) -> None:
+    from tests.noiseflow.io.test_microscope import write_ser
+
+    times, tags = "<DwellTimePath>1e-6</DwellTimePath>", "<ExperimentalDescription><Root/></ExperimentalDescription>"
+    info = f"<ObjectInfo><AcquireInfo>{times}</AcquireInfo>{tags}</ObjectInfo>"
+    (tmp_path / "a.emi").write_bytes(b"\0\0" + info.encode() + b"\0")
+    write_ser(tmp_path / "a_1.ser", STACK[0], 2e-10)
+    np.testing.assert_array_equal(io.read(tmp_path / "a.emi").data, STACK[0][::-1])
+
+
+def test_written_files_are_valid_and_say_whether_they_are_stacks_or_volumes(tmp_path: Path, run) -> None:
+    import mrcfile
+
+    from noiseflow.io.mapped import create_volume, finish_volume
+
+    run("simulate", tmp_path / "new", "--size", "16", "--tilts", "-60:60:20", "--noise", "none")
+    series = recon.read_tilt_series(tmp_path / "new" / "tilts.mrc", pixel_size=5.0)
+    recon.write_tilt_series(tmp_path / "stack.mrc", series)
+    recon.Volume(np.random.default_rng(0).random((4, 5, 6)), 5.0).write(tmp_path / "volume.mrc")
+    blocks = create_volume(tmp_path / "blocks.mrc", (4, 5, 6), (5.0, 5.0, 5.0))
+    blocks[:] = np.random.default_rng(0).random((4, 5, 6))
+    finish_volume(tmp_path / "blocks.mrc", blocks)
+    stacks = ["stack.mrc", *(f"new/{name}.mrc" for name in ("tilts", "clean", "validation", "test"))]
+    for name in [*stacks, "new/truth.mrc", "volume.mrc", "blocks.mrc"]:
+        assert mrcfile.validate(tmp_path / name), name
+        with mrcfile.open(tmp_path / name) as file:
+            assert file.is_image_stack() == (name in stacks)
+            found = [float(file.header[key]) for key in ("dmin", "dmax", "dmean", "rms")]
+            data = file.data.astype(np.float64)
+            np.testing.assert_allclose(found, [data.min(), data.max(), data.mean(), data.std()], rtol=1e-4, atol=1e-6)
+            if "new" not in name:
+                assert float(file.voxel_size.x) == float(file.voxel_size.z) == 5.0

@@ -97,7 +97,9 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return data
 
 
-def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None) -> None:
+def write(
+    path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None, stack: bool = False
+) -> None:
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
@@ -105,6 +107,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
             file is replaced only when the new one is complete.
         data: (y, x) or (z, y, x), array or tensor; ``.npy`` files may have more axes.
         voxel_size: Å along (z, y, x).
+        stack: the sections are images, not slices of a volume; MRC headers say so.
 
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
@@ -125,7 +128,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            stored = mrc.write(target, data, voxel_size)
+            stored = mrc.write(target, data, voxel_size, stack=stack)
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:

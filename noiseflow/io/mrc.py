@@ -68,7 +68,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
     return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles, _tilt_axis(header, extended))
 
 
-def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack: bool = False) -> NDArray[Any]:
     """Write 8- and 16-bit integers and float32 unchanged; float64 is rounded to float32, wider integers must fit exactly.
 
     Returns:
@@ -88,6 +88,8 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     stored = np.ascontiguousarray(_storable(data))
     with Sectionwise(path, "w+", overwrite=True) as mrc:
         mrc.set_data(stored)
+        if stack and stored.ndim == 3:
+            mrc.set_image_stack()
         mrc.add_label(signature())
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]

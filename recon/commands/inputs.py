@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.commands.console import Output, StepReport
+from noiseflow.commands.console import Output
+from noiseflow.progress import Progress
 from recon.commands.options import parse_mode
 from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
 from recon.series.channels import prepare_channels
@@ -76,7 +77,7 @@ def prepare(
     keep_tilts: bool,
     device: str,
     output: Output,
-    report: StepReport | None = None,
+    report: Progress | None = None,
 ) -> dict[str, Prepared]:
     """As `recon.prepare`, or `recon.prepare_channels`, with files of alignments, and print what was found."""
     series = align_on or next(iter(channels.values()))

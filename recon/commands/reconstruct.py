@@ -16,9 +16,9 @@ from noiseflow.commands.console import (
     OverwriteOption,
     SeedOption,
     choose_device,
-    step_report,
 )
 from noiseflow.commands.option_files import option_groups
+from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
     require_blocks,
@@ -281,6 +281,7 @@ def reconstruct(
     with ExitStack() as locks, warnings_as_lines(output) as warned:
         for target in targets.values():
             locks.enter_context(locked(target.volume))
+        fixed = load_noise_model(noise_model)
         read = partial(
             load_tilt_series,
             mode=mode,
@@ -293,7 +294,7 @@ def reconstruct(
         blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
         use: dict[str, Any] = {"angles": angles, "mask": mask, "exclude_views": exclude_views}
         series = {name: read(path, mapped=blocks or is_large(path), **use) for name, path in channels.items()}
-        with step_report(json_mode=json) as progress:
+        with progress_shown(json_mode=json) as progress:
             prepared = prepare(
                 series,
                 align_on=None if reference_channel is None else read(reference_channel, **use),
@@ -313,7 +314,7 @@ def reconstruct(
             output,
             options,
             chosen_device,
-            noise_model=(load_noise_model(noise_model), noise_model),
+            noise_model=(fixed, noise_model),
             thickness=thickness,
             reference=reference,
             fsc=fsc,

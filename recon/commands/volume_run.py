@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from noiseflow.commands.console import Output, step_report
+from noiseflow.commands.console import Output
+from noiseflow.progress import progress_shown
 from recon.commands.results import Targets
 from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
 from recon.joint.plan import describe
@@ -94,7 +95,7 @@ class VolumeRun:
             if slices_at_once is not None:
                 options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 options |= {"keep": journal.keep, "forget": journal.forget}
-            with step_report(json_mode=output.json_mode) as journal.report:
+            with progress_shown(json_mode=output.json_mode) as journal.report:
                 outcome, halves = _solve(series, grid, options, journal, fsc=self.fsc, guard=prepared.guard)
             result = targets.write(
                 output,
@@ -118,10 +119,6 @@ def _solve(
 ) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
     """The reconstruction, and those of the even and the odd tilts if requested."""
 
-    def progress(done: int, total: int, note: str) -> None:
-        if journal.report is not None:
-            journal.report("reconstructing", done, total, note)
-
     def halves() -> tuple[Volume, Volume]:
         even, odd = (
             reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
@@ -129,7 +126,7 @@ def _solve(
         )
         return even, odd
 
-    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
+    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": journal.report}
     outcome = reconstruct(tilt_series, grid, **options)
     return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
 

@@ -410,7 +410,7 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
     """
     path = Path(path)
     size = tilt_series.pixel_size
-    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
+    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size), stack=True)
     return write_angles(path.with_suffix(".rawtlt"), tilt_series.tilt_angles)
 
 
