@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,9 +14,9 @@ from noiseflow.commands.console import (
     OverwriteOption,
     SeedOption,
     choose_device,
-    progress_bar,
 )
 from noiseflow.commands.option_files import option_groups
+from noiseflow.progress import progress_shown
 
 if TYPE_CHECKING:
     from calibration.detector.models import ModelScore
@@ -108,15 +107,16 @@ def calibrate(
             "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
         )
     exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
-    findings = calibrate_exposures(
-        exposures,
-        dark=read_burst(dark, name="the dark frames", calibration=True) if dark else None,
-        flat=read_burst(flat, name="the flat frames", calibration=True) if flat else None,
-        kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
-        seed=seed,
-        device=chosen_device,
-        bar=partial(progress_bar, json_mode=json),
-    )
+    with progress_shown(json_mode=json) as progress:
+        findings = calibrate_exposures(
+            exposures,
+            dark=read_burst(dark, name="the dark frames", calibration=True) if dark else None,
+            flat=read_burst(flat, name="the flat frames", calibration=True) if flat else None,
+            kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
+            seed=seed,
+            device=chosen_device,
+            progress=progress,
+        )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
     model = saved_model(best.model, findings)
@@ -229,6 +229,8 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
     found = detector.posterior
     return {
         "gain": interval(figures.gain),
+        "gain_if_linear": interval(figures.linear),
+        "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
         "offset": interval(figures.offset),
         "read_noise": interval(figures.read_noise),
         "source": figures.source,

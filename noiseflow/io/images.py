@@ -18,6 +18,7 @@ from noiseflow.io.image_file import (
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
+    PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
     TIFF_SUFFIXES,
@@ -65,6 +66,8 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
+    if path.suffix.lower() in PACKED_SUFFIXES:
+        return _unpacked(path, member or channel)
     reader = _reader(path, member or wanted, mapped=mapped)
     try:
         named = path.suffix.lower() in _NAMED
@@ -94,7 +97,9 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return data
 
 
-def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None) -> None:
+def write(
+    path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None, stack: bool = False
+) -> None:
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
@@ -102,6 +107,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
             file is replaced only when the new one is complete.
         data: (y, x) or (z, y, x), array or tensor; ``.npy`` files may have more axes.
         voxel_size: Å along (z, y, x).
+        stack: the sections are images, not slices of a volume; MRC headers say so.
 
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
@@ -122,7 +128,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            stored = mrc.write(target, data, voxel_size)
+            stored = mrc.write(target, data, voxel_size, stack=stack)
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
@@ -155,6 +161,27 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix == PNG_SUFFIX:
         return png.read
     return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
+
+
+def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
+    """The image in a file that gzip or bzip2 packed, such as ``.mrc.gz``; it is unpacked to a temporary file first."""
+    import bz2
+    import gzip
+    import shutil
+    import tempfile
+
+    opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.stem
+        try:
+            with opener(path, "rb") as packed, plain.open("wb") as target:
+                shutil.copyfileobj(packed, target)
+            image = read(plain, channel=channel)
+        except (EOFError, gzip.BadGzipFile) as error:
+            raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(plain), str(path))) from error
+    return image
 
 
 def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:

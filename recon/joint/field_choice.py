@@ -9,12 +9,12 @@ from functools import partial
 
 from torch import nn
 
+from noiseflow.progress import Progress
 from recon.fields._names import AUTO
 from recon.fields._registry import field_kinds
 from recon.fields.fields import Field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
-from recon.joint.run import Progress
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
@@ -57,7 +57,7 @@ def choose_field(
         fit: the joint fit of the series.
         tilt_series, grid: data and grid of the whole volume.
         kinds: the fields by name.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
     """
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)

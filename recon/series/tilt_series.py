@@ -18,6 +18,8 @@ from noiseflow.io import mapped
 from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
+_SAME_SIZE = 0.01
+"""Relative difference of pixel sizes that rounding in headers explains."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class TiltSeries:
             orientation at zero tilt. See `recon.DualAxisProjector`.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
+        views: (tilt,) index of each image among the `num_views` of its file, if some of these were left out; else None.
+        num_views: number of images of the file, if some were left out.
 
     Raises:
         ValueError: `images` is not a stack or is constant, angles, mask or beam do not match it, or pixels or angles are not
@@ -57,6 +61,8 @@ class TiltSeries:
     beam: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
     axes: NDArray[np.float64] | None = None
+    views: NDArray[np.int64] | None = None
+    num_views: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -126,6 +132,8 @@ class TiltSeries:
         part = self.with_images(images, mask)
         object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
         object.__setattr__(part, "beam", beam)
+        object.__setattr__(part, "views", (np.arange(self.num_tilts) if self.views is None else self.views)[tilts])
+        object.__setattr__(part, "num_views", self.num_views or self.num_tilts)
         object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
         part._check_angles()
         return part
@@ -230,18 +238,22 @@ def read_tilt_series(
     mask_nan: bool = False,
     mapped: bool = False,
     channel: str | int | None = None,
+    pixel_size: float | None = None,
+    exclude_views: str = "",
 ) -> TiltSeries:
-    """Read a stack and its tilt angles.
+    """Read a stack and its tilt angles. Flat and dark fields in the file are applied; a warning says so.
 
     Args:
         path: the stack, in any format that `noiseflow.io.read` supports.
-        angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
-            ``.mdoc`` next to the stack, or else the angles in the stack file.
+        angles: a file that `noiseflow.io.read_tilts` reads; by default the ``.rawtlt``, ``.tlt`` or ``.mdoc`` next to the
+            stack, or else the angles in the stack file. For the rules that join images and angles, see `noiseflow.io.tilts_of`.
         mode: image formation.
         mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
         mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
         channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
+        pixel_size: Å, in place of that of the files.
+        exclude_views: images to leave out, numbered from 1 in the order of the file as in IMOD, such as ``1,5-8``.
 
     Raises:
         noiseflow.io.SeveralImages: there are several channels and none was chosen; a ValueError with their names.
@@ -259,21 +271,82 @@ def read_tilt_series(
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
         )
-    tilt_angles = io.tilt_angles_of(path, image_file) if angles is None else io.read_angles(angles)
-    images, mask = _masked(image_file.data, mask, mask_nan, str(path))
+    table, count = io.tilts_of(path, image_file, angles), len(image_file.data)
+    size = _pixel_size(pixel_size, image_file, table, path)
+    excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
+    views = np.setdiff1d(np.arange(count), sorted(excluded))
+    if len(views) < 2:
+        raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
+    if mask is not None and mask.shape == image_file.data.shape:
+        mask = mask[views]
+    images = _sections(image_file.data, evenly(views, count))
+    images, mask = _masked(flat_fielded(images, image_file, path), mask, mask_nan, str(path))
     io.require_contrast(images, path)
-    pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
     tilt_axis = io.tilt_axis_of(path, image_file)
-    if mask is None:
-        return TiltSeries(images, tilt_angles, pixel_size, mode, tilt_axis=tilt_axis)
-    empty = ~mask.any((1, 2))
-    if empty.any() and len(tilt_angles) == len(images):
-        named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
-        warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
-        return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(
-            np.flatnonzero(~empty)
+    series = TiltSeries(
+        images,
+        table.angles[views],
+        size,
+        mode,
+        mask,
+        tilt_axis=table.tilt_axis if tilt_axis is None else tilt_axis,
+        views=views if excluded else None,
+        num_views=count if excluded else None,
+    )
+    empty = np.zeros(len(images), np.bool_) if mask is None else ~mask.any((1, 2))
+    if not empty.any():
+        return series
+    named = ", ".join(f"{angle:g}°" for angle in series.tilt_angles[empty][:8])
+    warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
+    return series.select(np.flatnonzero(~empty))
+
+
+def _pixel_size(given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path) -> float | None:
+    """Å: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
+
+    Raises:
+        ValueError: pixels are not square, or the given size is not positive.
+    """
+    if given is not None:
+        if not 0 < given < np.inf:
+            raise ValueError(f"--pixel-size {given:g}: give a positive number of Å")
+        return given
+    if image.voxel_size is None:
+        return table.pixel_size
+    y, x = image.voxel_size[1:]
+    if abs(y / x - 1) > _SAME_SIZE:
+        raise ValueError(
+            f"{path} has pixels of {x:.5g} x {y:.5g} Å (x, y); square pixels are required: resample the images, or give the "
+            "correct size with --pixel-size if the header is wrong"
         )
-    return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis)
+    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= _SAME_SIZE:
+        return x
+    chosen = table.pixel_size if x == 1 else x
+    warnings.warn(
+        f"{path} states pixels of {x:.5g} Å, and the file of its angles {table.pixel_size:.5g} Å; {chosen:.5g} Å are used: "
+        "give --pixel-size if this is wrong",
+        stacklevel=3,
+    )
+    return chosen
+
+
+def flat_fielded(images: NDArray[Any], image_file: io.ImageFile, path: str | Path) -> NDArray[Any]:
+    """Images with the flat and dark fields of their file applied: (image − dark) / (flat − dark); NaN where that is unknown.
+
+    Args:
+        images: (tilt, y, x), raw.
+        image_file: the file with its fields; without them, the images are returned unchanged.
+        path: its name, for the warning that says what was applied.
+    """
+    flat, dark = image_file.flat, image_file.dark
+    if flat is None and dark is None:
+        return images
+    black = np.zeros(images.shape[1:]) if dark is None else dark
+    scale = np.ones(images.shape[1:]) if flat is None else np.where(flat > black, flat - black, np.nan)
+    names = [name for name, field in (("flat", flat), ("dark", dark)) if field is not None]
+    warnings.warn(f"the {' and '.join(names)} fields of {path} are applied to its images", stacklevel=3)
+    parts = (((image - black) / scale).astype(np.float32) for image in images)
+    return mapped.mapped_copy(parts, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
 
 
 def _masked(
@@ -337,7 +410,7 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
     """
     path = Path(path)
     size = tilt_series.pixel_size
-    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
+    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size), stack=True)
     return write_angles(path.with_suffix(".rawtlt"), tilt_series.tilt_angles)
 
 
