@@ -14,6 +14,7 @@ from torch import Tensor
 from recon.series.alignment import Alignment
 from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
+from recon.series.masks import plausible
 from recon.series.matching import Match, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
@@ -271,7 +272,7 @@ def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
 
 def _line_integrals(tilt_series: TiltSeries) -> Tensor:
     """Images as line integrals, of order one."""
-    lowered, _ = without_level(tilt_series)
+    lowered, _ = without_level(plausible(tilt_series))
     integrals = estimate_response(lowered).invert(torch.from_numpy(lowered.images)).detach()
     return integrals / integrals.std().clamp_min(1e-30)
 

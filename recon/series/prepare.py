@@ -16,6 +16,7 @@ from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
+from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.tilt_series import TiltSeries
@@ -104,7 +105,7 @@ def prepare(
     """
     if tilt_axis is not None and not abs(tilt_axis) <= 360:  # more than a full turn is a mistake
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
-    guard = Guard()
+    guard, tilt_series = Guard(), plausible(tilt_series)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:
