@@ -15,6 +15,7 @@ from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.verdict import BIAS, Grade, Reason, Verdict, frames_correlated, verdict_of
 from noiseflow.described import described
+from noiseflow.statistics import robust_deviation
 
 if TYPE_CHECKING:
     from torch import nn
@@ -332,9 +333,8 @@ def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
     for name in ("response", "offset"):
         if name in maps:
             values = maps[name]
-            middle = np.median(values)
-            spread = 1.4826 * np.median(np.abs(values - middle))
-            found |= np.abs(values - middle) > 8 * max(float(spread), np.finfo(float).tiny)
+            spread = max(robust_deviation(values), np.finfo(float).tiny)
+            found |= np.abs(values - np.median(values)) > 8 * spread
     if figures.dark is not None and figures.dark.frames >= LEAST_FRAMES:
         found |= maps["variance"] > 10 * np.median(maps["variance"])
     return np.asarray(found)

@@ -9,6 +9,7 @@ from .methods._registry import Method as Method
 from .methods._registry import reconstruct as reconstruct
 from .metrics.metrics import compare as compare
 from .metrics.metrics import fourier_shell_correlation as fourier_shell_correlation
+from .projection.dual_axis import DualAxisProjector as DualAxisProjector
 from .projection.image_formation import Linear as Linear
 from .projection.image_formation import Transmission as Transmission
 from .projection.projector import SliceProjector as SliceProjector

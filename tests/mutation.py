@@ -41,14 +41,14 @@ from tests.mutation_left_out import LEFT_OUT
 
 ROOT = Path(__file__).parents[1]
 TARGETS = {
-    "noiseflow/distributions/transforms.py": ["noiseflow/distributions/test_transforms.py"],
-    "noiseflow/distributions/normal.py": ["noiseflow/distributions/test_normal.py"],
-    "noiseflow/distributions/law.py": ["noiseflow/distributions/test_law.py"],
-    "noiseflow/distributions/digitised.py": [
+    "noiseflow/distributions/numerics/monotone_maps.py": ["noiseflow/distributions/test_transforms.py"],
+    "noiseflow/distributions/numerics/normal.py": ["noiseflow/distributions/test_normal.py"],
+    "noiseflow/distributions/noise_distribution.py": ["noiseflow/distributions/test_law.py"],
+    "noiseflow/distributions/wrappers/digitised.py": [
         "noiseflow/distributions/test_digitised.py",
         "noiseflow/models/test_digitisation.py",
     ],
-    "noiseflow/fitting/pixels.py": ["noiseflow/fitting/test_pixels.py"],
+    "noiseflow/fitting/pixel_split.py": ["noiseflow/fitting/test_pixels.py"],
     "noiseflow/fitting/observation_table.py": [
         "noiseflow/fitting/test_table_edges.py",
         "noiseflow/distributions/test_tabulated.py",
@@ -100,7 +100,7 @@ class Mutant:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Outcome:
     """What became of a mutant."""
 
     file: str
@@ -245,7 +245,7 @@ def survives(tests: list[str], mutant: Mutant | None, seconds: float) -> bool:
     return status == 0
 
 
-def judge(chosen: list[tuple[str, int]]) -> Iterator[Verdict]:
+def judge(chosen: list[tuple[str, int]]) -> Iterator[Outcome]:
     """Run every mutant, a file and an index, against its tests, after making sure that these pass as they are."""
     patience: dict[str, float] = {}
     for file, index in chosen:
@@ -256,7 +256,7 @@ def judge(chosen: list[tuple[str, int]]) -> Iterator[Verdict]:
                 raise SystemExit(f"the tests of {file} fail as they are")
             patience[file] = max(LEAST_SECONDS, PATIENCE * (_children_seconds() - before))
         killed = not survives(tests, changed, patience[file])
-        yield Verdict(file, changed.line, changed.before, changed.after, killed)
+        yield Outcome(file, changed.line, changed.before, changed.after, killed)
 
 
 def _children_seconds() -> float:
@@ -264,7 +264,7 @@ def _children_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def table(verdicts: list[Verdict]) -> str:
+def table(verdicts: list[Outcome]) -> str:
     """Markdown: a row for each file, then each survivor."""
     rows = ["| file | mutants | killed |", "|---|---|---|"]
     for file in TARGETS:

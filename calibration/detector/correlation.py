@@ -12,6 +12,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
+from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
@@ -180,7 +181,7 @@ def _period(residual: Residual) -> float:
     scene = np.zeros(residual.z.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
     for z, signal in ((residual.z, scene), (residual.z.T, scene.T)):
         own = maximum_filter1d(_lines(signal.mean(0)), 3)
-        for profile in ((z**2).mean(0), (z[:, 1:] * z[:, :-1]).mean(0)):
+        for profile in ((z**2).mean(0), neighbour_products(z).mean(0)):
             if len(profile) < LEAST_PROFILE:
                 continue
             relative = _lines(profile)

@@ -16,6 +16,7 @@ from calibration.detector.posterior import Interval
 from calibration.detector.residual import CUT, Residual
 from calibration.exposures.frames import Burst, Image
 from noiseflow.described import described
+from noiseflow.statistics import weighted_line
 
 LINEAR_RANGE = 0.7
 """Fraction of saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
@@ -202,13 +203,8 @@ def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, fl
         np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
     )
     spread = np.hypot(error, LEVEL_ERROR * np.abs(variance))
-    weight = 1 / spread**2
-    middle = float(np.average(mean, weights=weight))
-    information = float(np.sum(weight * (mean - middle) ** 2))
-    slope = float(np.sum(weight * (mean - middle) * variance)) / max(information, np.finfo(float).tiny)
-    intercept = float(np.average(variance, weights=weight)) - slope * middle
-    chi_squared = float(np.sum(weight * (variance - intercept - slope * mean) ** 2)) / max(len(points) - 2, 1)
-    return slope, float(np.sqrt(max(chi_squared, 1.0) / max(information, np.finfo(float).tiny))), intercept, chi_squared
+    line = weighted_line(mean, variance, 1 / spread**2)
+    return line.slope, line.slope_error * max(line.chi_squared, 1.0) ** 0.5, line.intercept, line.chi_squared
 
 
 def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> Interval | None:
@@ -221,11 +217,8 @@ def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> I
         return None
     mean = np.array([one.mean for one in known])
     third, error = (np.array([float(getattr(one, name) or 0.0) for one in known]) for name in ("third", "third_error"))
-    weight = 1 / np.maximum(error, np.finfo(float).tiny) ** 2
-    centred = mean - np.average(mean, weights=weight)
-    information = float(np.sum(weight * centred**2))
-    ratio = float(np.sum(weight * centred * third)) / information / slope**2
-    spread = 1 / np.sqrt(information) / slope**2
+    line = weighted_line(mean, third, 1 / np.maximum(error, np.finfo(float).tiny) ** 2)
+    ratio, spread = line.slope / slope**2, line.slope_error / slope**2
     if spread > 0.1:  # cannot distinguish the ratios 1 and 1.5 at three standard errors
         return None
     low, middle, high = (

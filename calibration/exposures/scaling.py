@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from noiseflow.described import described
+from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
@@ -127,7 +128,7 @@ def own_variance(
     weight = _inverse_square(
         fit_line(chosen, ((short - signal) ** 2)[whole]), chosen
     )  # the total variance is better known than that of the long exposure
-    line = _weighted_line(chosen, squares[whole], weight)
+    line = _line(chosen, squares[whole], weight)
     error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
     kept = float(
         np.var(warp(np.random.default_rng(0).standard_normal(long.shape))[whole])
@@ -154,16 +155,14 @@ def fit_line(signal: Image, squares: Image) -> VarianceLine:
     """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
     weight = np.ones_like(signal)
     for _ in range(3):
-        line = _weighted_line(signal, squares, weight)
+        line = _line(signal, squares, weight)
         weight = _inverse_square(line, signal)
     return line
 
 
-def _weighted_line(signal: Image, squares: Image, weight: Image) -> VarianceLine:
-    centre = signal.mean()
-    design = np.stack([np.ones_like(signal), signal - centre])
-    floor, rate = np.linalg.solve(design * weight @ design.T, design * weight @ squares)
-    return VarianceLine(float(floor - rate * centre), float(rate))
+def _line(signal: Image, squares: Image, weight: Image) -> VarianceLine:
+    line = weighted_line(signal, squares, weight)
+    return VarianceLine(line.intercept, line.slope)
 
 
 def _inverse_square(line: VarianceLine, signal: Image) -> Image:

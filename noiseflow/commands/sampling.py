@@ -46,7 +46,7 @@ def sample(
     import noiseflow
     from noiseflow import io
     from noiseflow.commands import sample_files
-    from noiseflow.models.around import as_noise_model
+    from noiseflow.models.wrapper import as_noise_model
 
     io.require_other(output, clean)
     io.check_output(output, overwrite=overwrite)

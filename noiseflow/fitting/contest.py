@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
-from noiseflow.fitting.judged_pixels import JudgedPixels
 from noiseflow.models.base import NoiseModelBase
 
 Progress = Callable[[int, str], None]

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.arrays import as_tensor, is_array, unmasked
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings, Progress
 from noiseflow.fitting.observation_table import TableKeeper
-from noiseflow.fitting.pixels import FitPixels
+from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
-from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.threads import few_threads, warn_if_spinning
 
 _log = logging.getLogger("noiseflow")
@@ -146,7 +146,7 @@ def fit(
     )
     if resume is not None:
         loop.load_state(resume)
-    schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
+    schedule = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     if loop.signal_optimiser is not None:
         warn_if_spinning()
         return loop.run(schedule, progress, checkpoint)

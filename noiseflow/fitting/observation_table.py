@@ -11,7 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.tabulated import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood, mean_error
+from noiseflow.distributions.numerics.table_axes import (
+    SIZES,
+    Columns,
+    RootScale,
+    Rows,
+    interpolate,
+    log_likelihood,
+    mean_error,
+)
 
 _MAX_LEVELS = 1024
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
+from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.contest import Contest, Progress, mean_and_error
-from noiseflow.fitting.judged_pixels import JudgedPixels
 from noiseflow.models import baselines, flow, mixture, physical, physics_flow
-from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ForeignModel, as_noise_model
 
 NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are

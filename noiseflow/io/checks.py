@@ -24,6 +24,68 @@ def number(text: str) -> float:
 class Unsupported(ValueError):
     """A valid file with contents that noiseflow cannot use; the message is appended to the file's name."""
 
+    def about(self, path: str | Path) -> ValueError:
+        """The error with the file's name."""
+        return ValueError(f"{path} {self}")
+
+
+class SeveralImages(Unsupported):
+    """A file holds several images or channels, and none of them was chosen.
+
+    Attributes:
+        names: their names.
+    """
+
+    def __init__(self, message: str, names: Sequence[str]) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
+
+    def about(self, path: str | Path) -> ValueError:
+        """The error with the file's name."""
+        return SeveralImages(f"{path} {self}", self.names)
+
+
+def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> int:
+    """Index of the image or channel with a name; `wanted` may also be its index from zero.
+
+    Raises:
+        Unsupported: there is no such image.
+        SeveralImages: none was named, and there are several.
+    """
+    if wanted is None and len(names) == 1:
+        return 0
+    if wanted is not None and wanted in names:
+        return list(names).index(wanted)
+    listed = ", ".join(f"'{name}'" for name in names[:12]) + (", …" if len(names) > 12 else "")
+    if wanted is None:
+        raise SeveralImages(f"holds several {kind}: {listed}; name one as FILE::NAME, or with --channel", names)
+    if wanted.isascii() and wanted.isdigit() and int(wanted) < len(names):
+        return int(wanted)
+    raise Unsupported(f"holds no '{wanted}'; available: {listed or 'nothing'}")
+
+
+def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
+    """Index of the array to read: the named one, or else the largest one, or that with the wanted index among the largest.
+
+    A single array with an axis of channels is chosen whatever is wanted, which may be one of its channels.
+
+    Raises:
+        Unsupported: the name does not exist, or there is no image.
+        SeveralImages: several images have the largest size.
+    """
+    images = [index for index, shape in enumerate(shapes) if len(shape) in (2, 3, 4)]
+    if not images:
+        raise Unsupported("holds no image or stack")
+    if wanted is not None and wanted in names:
+        return list(names).index(wanted)
+    sizes = [(len(shapes[index]), int(np.prod(shapes[index], dtype=float))) for index in images]
+    largest = [index for index, size in zip(images, sizes, strict=True) if size == max(sizes)]
+    if len(largest) == 1 and (wanted is None or len(shapes[largest[0]]) == 4):
+        return largest[0]
+    if wanted is None or wanted.isdigit():
+        return largest[choose([names[index] for index in largest], wanted)]
+    return choose(names, wanted)
+
 
 def as_array(data: Any) -> NDArray[Any]:
     """Convert an array, a list, or a tensor on any device to a NumPy array."""
@@ -88,7 +150,18 @@ def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
         raise FileNotFoundError(
             f"{kind} {path} {'is not a file' if path.exists() else 'does not exist'}; check the path"
         )
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    raw = path.read_bytes()
+    text = raw.decode(_encoding(raw[:64]), errors="replace")
     if "\0" in text:
         raise ValueError(f"{path} is not a text file; an {kind} holds {holds}")
     return text.splitlines()
+
+
+def _encoding(start: bytes) -> str:
+    """UTF-16 if a file begins with its mark, or if every second byte is zero, as some Windows programs write it."""
+    even, odd = start[::2], start[1::2]
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if odd and not any(odd) and all(even):
+        return "utf-16-le"
+    return "utf-16-be" if odd and all(odd) and not any(even) else "utf-8-sig"

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".rec", ".map"})
+MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".preali", ".rec", ".map"})
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
-HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".nxs"})
+HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".nxs"})
+PACKED_SUFFIXES = frozenset({".gz", ".bz2"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
 PNG_SUFFIX = ".png"
@@ -25,16 +26,24 @@ class ImageFile:
     """Contents of an image file.
 
     Attributes:
-        data: pixels in the data type of the file, (y, x) or (section, y, x).
+        data: pixels in the data type of the file, (y, x) or (section, y, x); readers may return (channel, section, y, x),
+            of which `read` chooses one channel.
         voxel_size: Å along (z, y, x), or None if the file does not state it.
         tilt_angles: (section,) degrees, or None if the file does not state them.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
+        channels: names of the channels, if the file holds several.
+        names: (section,) names of the files of a folder.
+        flat, dark: (y, x) mean exposures without a specimen and without a beam, if the file holds them; not applied.
     """
 
     data: NDArray[Any]
     voxel_size: VoxelSize | None = None
     tilt_angles: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
+    channels: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    flat: NDArray[np.float64] | None = None
+    dark: NDArray[np.float64] | None = None
 
     def __repr__(self) -> str:
         size = "unknown" if self.voxel_size is None else " x ".join(f"{edge:.5g}" for edge in self.voxel_size) + " Å"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import Unsupported, as_array
+from noiseflow.io.checks import Unsupported, as_array, choose
 from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 from noiseflow.io.image_file import (
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
+    PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
     TIFF_SUFFIXES,
@@ -32,36 +34,44 @@ _NO_IMAGES = {
     ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
+_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"}
+"""Suffixes of formats whose readers choose an image by its name."""
 
 
-def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
+def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = None) -> ImageFile:
     """Read an image, stack or volume.
 
     Args:
         path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, a grey ``.png`` image, or a folder
             of single images of these formats except PNG; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr``
-            and HDF5. ``FILE::NAME`` selects one image of a file that holds several.
+            and HDF5. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
         mapped: memory-map the pixels; changes to the array are not written to the file. Large stacks that cannot be mapped
             (compressed TIFF, HDF5, OME-Zarr) are read in pieces into a temporary file.
+        channel: name, or index from zero, of one image or channel of a file that holds several; as ``FILE::NAME``.
 
     Raises:
         FileNotFoundError: the file does not exist.
+        SeveralImages: the file holds several images or channels, and none of them was chosen; a ValueError.
         ValueError: the file is empty, truncated or of an unknown type, or does not hold a real-valued image.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
     from noiseflow.io.folder import read_folder
 
     name, _, member = str(path).partition("::")
+    wanted = None if channel is None else str(channel)
     path = Path(name)
     if path.is_dir() and path.suffix.lower() != ".zarr":
-        return read_folder(path, read)
+        return read_folder(path, partial(read, channel=channel))
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
-    reader = _reader(path, member or None, mapped=mapped)
+    if path.suffix.lower() in PACKED_SUFFIXES:
+        return _unpacked(path, member or channel)
+    reader = _reader(path, member or wanted, mapped=mapped)
     try:
-        image = reader(path)
+        named = path.suffix.lower() in _NAMED
+        image = _one_channel(reader(path), wanted if named and member else member or wanted, named=named)
     except PermissionError:
         raise
     except ModuleNotFoundError as error:
@@ -70,7 +80,7 @@ def read(path: str | Path, *, mapped: bool = False) -> ImageFile:
             f"install it with: {install_command('formats')}"
         ) from error
     except Unsupported as error:
-        raise ValueError(f"{path} {error}") from error
+        raise error.about(path) from error
     except Exception as error:  # each library raises its own errors for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
@@ -87,7 +97,9 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return data
 
 
-def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None) -> None:
+def write(
+    path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None, stack: bool = False
+) -> None:
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
@@ -95,6 +107,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
             file is replaced only when the new one is complete.
         data: (y, x) or (z, y, x), array or tensor; ``.npy`` files may have more axes.
         voxel_size: Å along (z, y, x).
+        stack: the sections are images, not slices of a volume; MRC headers say so.
 
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
@@ -115,7 +128,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            stored = mrc.write(target, data, voxel_size)
+            stored = mrc.write(target, data, voxel_size, stack=stack)
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
@@ -141,8 +154,6 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
         raise ValueError(
             f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}"
         )
-    if member is not None:
-        raise ValueError(f"{path}::{member}: a {suffix} file holds one image; remove ::{member}")
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
     if suffix in TIFF_SUFFIXES:
@@ -150,6 +161,37 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix == PNG_SUFFIX:
         return png.read
     return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
+
+
+def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
+    """The image in a file that gzip or bzip2 packed, such as ``.mrc.gz``; it is unpacked to a temporary file first."""
+    import bz2
+    import gzip
+    import shutil
+    import tempfile
+
+    opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.stem
+        try:
+            with opener(path, "rb") as packed, plain.open("wb") as target:
+                shutil.copyfileobj(packed, target)
+            image = read(plain, channel=channel)
+        except (EOFError, gzip.BadGzipFile) as error:
+            raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(plain), str(path))) from error
+    return image
+
+
+def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:
+    """The chosen channel of (channel, section, y, x); readers of formats with named images have chosen already."""
+    if image.data.ndim == 4:
+        names = image.channels or tuple(str(index) for index in range(len(image.data)))
+        return replace(image, data=image.data[choose(names, wanted, "channels")])
+    if wanted not in (None, "0") and not named:
+        raise Unsupported(f"holds one image; remove ::{wanted} or --channel {wanted}")
+    return image
 
 
 def _checked(image: ImageFile, path: Path) -> ImageFile:

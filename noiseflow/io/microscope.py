@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, require_room
+from noiseflow.io.checks import Unsupported, choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
 from noiseflow.io.tilt_axis import recorded_axis
@@ -38,11 +38,15 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         member: title of the image to read, if the file holds several.
     """
     plugin = _PLUGINS[path.suffix.lower()]
+    pixel_files = sorted(path.parent.glob(f"{path.stem}_*.ser")) if path.suffix.lower() == ".emi" else []
+    if path.suffix.lower() == ".emi" and not pixel_files:
+        raise Unsupported(f"holds no pixels: they are in {path.stem}_1.ser; put this file next to it, or give it")
     signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
     titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
     signal = signals[choose_member(titles, [signal["data"].shape for signal in signals], member)]
     lazy = signal["data"]
-    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED)
+    stored = sum(part.stat().st_size for part in (path, *pixel_files))
+    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED, size=stored)
     data = np.asarray(lazy.compute(scheduler="single-threaded") if hasattr(lazy, "compute") else lazy)
     data = data.astype(data.dtype.newbyteorder("="), copy=False)
     axes = [
@@ -55,28 +59,6 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         angles = stage_angles(path, len(data))
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)))
-
-
-def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
-    """Index of the array to read: the named one, or else the largest one.
-
-    Raises:
-        Unsupported: the name does not exist, there is no image, or several images have the largest size.
-    """
-    listed = ", ".join(f"'{name}'" for name in names[:12])
-    if wanted is not None:
-        if wanted not in names:
-            raise Unsupported(f"holds no '{wanted}'; available: {listed or 'nothing'}")
-        return names.index(wanted)
-    images = [index for index, shape in enumerate(shapes) if len(shape) in (2, 3)]
-    if not images:
-        raise Unsupported("holds no image or stack")
-    sizes = [(len(shapes[index]), int(np.prod(shapes[index], dtype=float))) for index in images]
-    largest = [index for index, size in zip(images, sizes, strict=True) if size == max(sizes)]
-    if len(largest) > 1:
-        listed = ", ".join(f"'{names[index]}'" for index in largest[:12])
-        raise Unsupported(f"holds several images: {listed}; name one as FILE::NAME")
-    return largest[0]
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:

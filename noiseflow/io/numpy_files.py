@@ -8,10 +8,9 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import require_room
+from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile
 from noiseflow.io.metadata import recorded_angles
-from noiseflow.io.microscope import choose_member
 from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

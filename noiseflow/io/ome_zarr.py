@@ -90,10 +90,17 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
     scale = next((t["scale"] for t in transforms if t.get("type") == "scale"), [0] * data.ndim)
     units = [in_angstrom(axis.get("unit")) or 0.0 for axis in first["axes"]]
     edges = [float(scale[index]) * units[index] for index in keep]
+    names = [str(first["axes"][index].get("name")).lower() for index in keep]
     data = data.reshape([data.shape[index] for index in keep])
-    if len(edges) not in (2, 3) or min(edges) <= 0:
-        return ImageFile(data)
-    return ImageFile(data, (edges[0], edges[-2], edges[-1]))
+    channels: tuple[str, ...] = ()
+    if data.ndim == 4 and "c" in names:
+        data, omero = np.moveaxis(data, names.index("c"), 0), attributes.get("ome", attributes).get("omero", {})
+        labels = tuple(str(channel.get("label", "")) for channel in omero.get("channels", ()))
+        channels = labels if len(set(labels)) == len(data) else ()
+        edges.pop(names.index("c"))
+    if len(edges) not in (2, 3) or min(edges[-2:]) <= 0:
+        return ImageFile(data, channels=channels)
+    return ImageFile(data, (edges[0] or edges[-1], edges[-2], edges[-1]), channels=channels)
 
 
 def _halved(data: NDArray[Any]) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 _IMAGEJ_TYPES = (np.uint8, np.uint16, np.float32)
 _OUTSIDE_OME = (np.float16, np.int64, np.uint64)
 _IMAGEJ_BYTES = 2**32 - 2**20
+_PRINTED = {2: 2.54e8, 3: 1e8}
+"""Å per ResolutionUnit: inch, centimetre."""
+_FINEST_PRINT = 2e5
+"""Å: programs set 72 to 1200 dots per inch, 21 µm and more, without knowing the scale; pixels of microscopes are smaller."""
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
@@ -34,9 +39,12 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
         require_room(series.nbytes, path, compressed=compressed)
         if "S" in series.axes:
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
-        data = _left_on_disk(path, series) if mapped and series.ndim == 3 else series.asarray()
-        voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
-    return ImageFile(data, voxel_size)
+        data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
+        if getattr(series.pages[0], "photometric", None) == 0:
+            data = _inverted(data, series.pages[0], path)
+        voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
+        data, channels = _channels_first(data, series.axes, _channel_names(tiff))
+    return ImageFile(data, voxel_size, channels=channels)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -83,6 +91,51 @@ def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
     return mapped_copy((page.asarray() for page in series.pages), series.shape, native, in_memory=IN_MEMORY)
 
 
+def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
+    """Pixels whose files count from white (MINISWHITE) as counts from black.
+
+    Raises:
+        Unsupported: white has no value, because the pixels are not unsigned integers.
+    """
+    if data.dtype.kind != "u":
+        raise Unsupported(
+            f"counts {data.dtype} pixels from white (MINISWHITE), which is defined for unsigned integers only"
+        )
+    warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
+    white = data.dtype.type(2 ** int(page.bitspersample) - 1)
+    return mapped_copy((white - part for part in data), data.shape, data.dtype, in_memory=IN_MEMORY)
+
+
+def _printed_size(tiff: TiffFile) -> VoxelSize | None:
+    """The pixel size by the tags for printers, if it is not one of a printer."""
+    tags: Any = tiff.pages.first.tags
+    unit = _PRINTED.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else None
+    rates = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
+    if unit is None or len(rates) < 2 or not all(numerator and denominator for numerator, denominator in rates):
+        return None
+    y, x = (unit * denominator / numerator for numerator, denominator in rates)
+    return (x, y, x) if max(y, x) < _FINEST_PRINT else None
+
+
+def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[NDArray[Any], tuple[str, ...]]:
+    """The array without axes of one pixel, channels first, and their names; a list of channels alone is a stack."""
+    keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
+    data, axes = data.reshape([data.shape[place] for place in keep]), "".join(axes[place] for place in keep)
+    if "C" not in axes or data.ndim < 4:
+        return data, ()
+    data = np.moveaxis(data, axes.index("C"), 0)
+    return data, tuple(names) if len(set(names)) == len(data) else ()
+
+
+def _channel_names(tiff: TiffFile) -> list[str]:
+    """Names of the channels in the metadata of OME, or the labels of the first images of an ImageJ hyperstack."""
+    if tiff.is_imagej:
+        metadata = tiff.imagej_metadata or {}
+        return [str(label) for label in metadata.get("Labels", ())[: int(metadata.get("channels", 0))]]
+    channels = _ome_pixels(tiff).get("Channel", [])
+    return [str(channel.get("Name", "")) for channel in (channels if isinstance(channels, list) else [channels])]
+
+
 def _pages(tiff: TiffFile) -> list[Any]:
     pages: dict[int, Any] = {}
     for page in tiff.pages:
@@ -104,13 +157,18 @@ def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
     return (unit * spacing if spacing > 0 else x, y, x)
 
 
-def _ome_voxel_size(tiff: TiffFile) -> VoxelSize | None:
+def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:
     import tifffile
 
     if not tiff.ome_metadata:
-        return None
+        return {}
     image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {})
-    pixels = (image[0] if isinstance(image, list) else image).get("Pixels", {})
+    pixels: dict[str, Any] = (image[0] if isinstance(image, list) else image).get("Pixels", {})
+    return pixels
+
+
+def _ome_voxel_size(tiff: TiffFile) -> VoxelSize | None:
+    pixels = _ome_pixels(tiff)
     edges = []
     for axis in "ZYX":
         unit = in_angstrom(pixels.get(f"PhysicalSize{axis}Unit", "µm"))

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
-from noiseflow.distributions.numerical import as_noise_distribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.judged import judged_pixels
+from noiseflow.metrics.evaluated_pixels import judged_pixels
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ModelAround
 
 
 class AtLevel(ModelAround):

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.textbook import GaussianDistribution as GaussianDistribution
-from noiseflow.distributions.textbook import PoissonDistribution as PoissonDistribution
-from noiseflow.distributions.textbook import SpreadPoissonDistribution
+from noiseflow.distributions.laws.textbook import GaussianDistribution as GaussianDistribution
+from noiseflow.distributions.laws.textbook import PoissonDistribution as PoissonDistribution
+from noiseflow.distributions.laws.textbook import SpreadPoissonDistribution
 from noiseflow.models.base import NoiseModelBase
 
 _NEAR_STEP = 0.2  # of the rounding step: a gain this close to the step may be the step itself, as in event counting

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.dead_time import DeadTimeDistribution
+from noiseflow.distributions.laws.dead_time import DeadTimeDistribution
 from noiseflow.models.base import NoiseModelBase
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.digitised import DigitisedDistribution as DigitisedDistribution
-from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
 

@@ -8,16 +8,15 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
 _NODES, _CELLS = 96, 4096
 _WIDTH = 0.0125  # width of a cell in standard deviations; the interpolation error is then 2e-5 nats
-_BELOW = (
-    0.25  # share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
-)
+# Share of the cells below the mean: 12.8 standard deviations, and 38 above it, where the tail is exponential
+_BELOW = 0.25
 _LEAST = 1e-14  # density per standard deviation below which rounding errors of the transform dominate
 _FITTED, _ITERATIONS = 16384, 60
 

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import LatentDistribution, normal_quadrature
-from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.transforms import Transform
+from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.layers import Layer as Layer
 from noiseflow.models.layers import affine_layer as affine_layer

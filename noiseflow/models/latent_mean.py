@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.tabulated import state_of
-from noiseflow.distributions.transforms import Transform
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.table_axes import state_of
 from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
 from noiseflow.models.physics_distribution import latent_nodes

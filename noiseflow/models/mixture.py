@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval, normal_quadrature
-from noiseflow.distributions.transforms import between_rows
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.monotone_maps import between_rows
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation

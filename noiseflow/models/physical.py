@@ -9,8 +9,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
-from noiseflow.distributions.poisson_gaussian import UnevenPoissonGaussian
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
+from noiseflow.distributions.laws.poisson_gaussian import UnevenPoissonGaussian
 from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3

@@ -8,17 +8,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import (
-    NoiseDistribution,
-    log_normal_cdf,
-    log_normal_interval,
-    normal_hazard,
-)
-from noiseflow.distributions.electrons import log_density, log_tail
-from noiseflow.distributions.normal import hazard_of
-from noiseflow.distributions.pixelwise import pixelwise
-from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.transforms import Transform
+from noiseflow.distributions.electrons.exact import log_density, log_tail
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.elementwise import pixelwise
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import hazard_of, log_normal_cdf, log_normal_interval, normal_hazard
 from noiseflow.models.flow import _inverse
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.transforms import Affine, Transform
+from noiseflow.distributions.numerics.monotone_maps import Affine, Transform
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow, affine_layer, spline_layer
 from noiseflow.models.latent_mean import LatentMean

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.arrays import floating
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround
 
 
 class WithMaps(ModelAround):

@@ -50,6 +50,8 @@ def compare(
     if comparison.expected is not None:
         reach = comparison.expected.in_words(second.voxel_size)
         output.line(f"resolution at 0.5 expected from its error bars: {reach}")
+    if comparison.orientation is not None:
+        output.line(comparison.orientation.in_words())
     page = None
     if report is not None:
         pictures = comparison_report(

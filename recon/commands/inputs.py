@@ -29,6 +29,9 @@ def load_tilt_series(
     mask: Path | None,
     mask_nan: bool,
     mapped: bool = False,
+    channel: str | None = None,
+    pixel_size: float | None = None,
+    exclude_views: str = "",
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command.
 
@@ -42,6 +45,9 @@ def load_tilt_series(
         mask=None if mask is None else _read_mask(mask),
         mask_nan=mask_nan,
         mapped=mapped,
+        channel=channel,
+        pixel_size=pixel_size,
+        exclude_views=exclude_views,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)
@@ -61,7 +67,9 @@ def prepare(
     tilt_axis: float | None,
     refine_alignment: bool,
     alignment: Path | None,
+    alignment_binning: float | None,
     save_alignment: Path | None,
+    second_axis: TiltSeries | None,
     keep_tilts: bool,
     device: str,
     output: Output,
@@ -72,13 +80,16 @@ def prepare(
         tilt_series,
         tilt_axis=tilt_axis,
         refine_alignment=refine_alignment,
-        alignment=None if alignment is None else read_alignment(alignment, tilt_series),
+        alignment=None if alignment is None else read_alignment(alignment, tilt_series, binning=alignment_binning),
+        second_axis=second_axis,
         keep_tilts=keep_tilts,
         device=device,
         progress=report,
     )
     if refine_alignment and prepared.alignment is not None:
         output.line(prepared.alignment.in_words())
+    if prepared.registration is not None:
+        output.line(prepared.registration.in_words())
     if save_alignment is not None:
         if prepared.alignment is None:
             raise ValueError("--save-alignment: there is no alignment; find it with --refine-alignment")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,7 +43,17 @@ if TYPE_CHECKING:
 
 @option_groups(
     {
-        "Input": ("angles", "transforms", "mask", "mask_nan", "invert_contrast"),
+        "Input": (
+            "angles",
+            "channel",
+            "pixel_size",
+            "exclude_views",
+            "alignment",
+            "alignment_binning",
+            "mask",
+            "mask_nan",
+            "invert_contrast",
+        ),
         "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
         "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
@@ -65,11 +76,24 @@ def reconstruct(
             help="Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."
         ),
     ] = None,
+    channel: Annotated[
+        str | None,
+        typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
+    ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="Pixel size in Å, in place of that of the files.")] = None,
+    exclude_views: Annotated[
+        str, typer.Option(help="Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
+    ] = "",
     alignment: Annotated[
         Path | None,
         typer.Option(
-            help="Alignment to apply: a .json file of --save-alignment, also of another channel, or IMOD's .xf."
+            help="Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
+            "AreTomo's .aln or RELION's .star."
         ),
+    ] = None,
+    alignment_binning: Annotated[
+        float | None,
+        typer.Option(help="How many times smaller the images are than those that .xf, .aln or .star were made on."),
     ] = None,
     method: Annotated[
         str,
@@ -140,6 +164,13 @@ def reconstruct(
             "--refine-alignment, a rough value."
         ),
     ] = None,
+    second_axis: Annotated[
+        Path | None,
+        typer.Option(
+            help="Tilt series of the same specimen about a second axis, about 90° from the first; one volume is fitted."
+        ),
+    ] = None,
+    second_angles: Annotated[Path | None, typer.Option(help="Tilt angles of --second-axis, as --angles.")] = None,
     keep_tilts: Annotated[
         bool, typer.Option("--keep-tilts", help="Keep tilts that are inconsistent with the others.")
     ] = False,
@@ -192,7 +223,7 @@ def reconstruct(
     from noiseflow.io.mapped import is_large
     from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
-    from recon.methods import find_method, settings_of
+    from recon.methods import find_method, require_two_axes, settings_of
     from recon.report.page import read_reference
     from recon.scale.cluster import client_of
     from recon.series.tilt_series import VolumeGrid
@@ -203,7 +234,7 @@ def reconstruct(
     if save_alignment is not None:
         check_alignment_file(save_alignment, alignment, tilts, overwrite=overwrite)
     for path in (out, *error_bar_paths(out).values(), shell_band_path(out)):
-        require_other(path, tilts, angles, alignment, mask, reference, noise_model)
+        require_other(path, tilts, angles, alignment, second_axis, second_angles, mask, reference, noise_model)
     if save_noise_model is not None:
         require_other(save_noise_model, noise_model, tilts)
     method, chosen_device = method_of(method, preset), choose_device(device)
@@ -211,6 +242,9 @@ def reconstruct(
     options |= {"regulariser": regulariser, "uncertainty": uncertainty}
     options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
     settings_of(**options)
+    if second_axis is not None:
+        blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
+        require_two_axes(find_method(method), blocks=blocks)
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler provides the workers; remove --workers")
     if workers is not None or scheduler is not None:
@@ -221,14 +255,20 @@ def reconstruct(
         raise ValueError(f"--save-noise-model: method {method} does not fit a noise model; use --method joint")
     with locked(out), warnings_as_lines(output) as warned:
         fixed = load_noise_model(noise_model)
-        tilt_series = load_tilt_series(
-            tilts,
-            angles=angles,
+        read = partial(
+            load_tilt_series,
             mode=mode,
             invert_tilt=invert_tilt,
             invert_contrast=invert_contrast,
-            mask=mask,
             mask_nan=mask_nan,
+            channel=channel,
+            pixel_size=pixel_size,
+        )
+        tilt_series = read(
+            tilts,
+            angles=angles,
+            mask=mask,
+            exclude_views=exclude_views,
             mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
         )
         with step_report(json_mode=json) as progress:
@@ -237,7 +277,9 @@ def reconstruct(
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
                 alignment=alignment,
+                alignment_binning=alignment_binning,
                 save_alignment=save_alignment,
+                second_axis=None if second_axis is None else read(second_axis, angles=second_angles, mask=None),
                 keep_tilts=keep_tilts,
                 device=chosen_device,
                 output=output,
@@ -249,7 +291,7 @@ def reconstruct(
         settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
         options |= {"noise_model": fixed, "device": chosen_device}
         journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
-        if slices_at_once is None:
+        if slices_at_once is None and second_axis is None:
             many = workers if scheduler is None else 2
             slices_at_once = chosen_slices(journal, tilt_series, grid, method, chosen_device, many)
         memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
@@ -272,7 +314,7 @@ def reconstruct(
                 tilt_series,
                 outcome,
                 seconds=time.perf_counter() - started,
-                inputs=files_read(tilts, angles, alignment, mask, noise_model, reference),
+                inputs=files_read(tilts, angles, alignment, second_axis, second_angles, mask, noise_model, reference),
                 seed=seed,
                 prepared=prepared,
                 halves=halves,
@@ -354,7 +396,7 @@ def _settings(
     import numpy as np
 
     digest = hashlib.blake2b(digest_size=16)
-    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam):
+    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam, tilt_series.axes):
         if array is not None:
             digest.update(f"{array.dtype}{array.shape}".encode())
             for part in array:

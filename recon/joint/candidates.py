@@ -18,7 +18,7 @@ from noiseflow import (
     SplineFlow,
     detect_digitisation,
 )
-from noiseflow.models.around import as_noise_model
+from noiseflow.models.wrapper import as_noise_model
 
 _CLIPPED = 0.02
 _FAR = 0.01  # noise relative to the contrast

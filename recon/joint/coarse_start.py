@@ -15,6 +15,8 @@ from noiseflow import Gaussian, fit
 from noiseflow.threads import num_threads
 from recon.fields.fields import Field, MultiresolutionField
 from recon.joint.signal_model import TomographySignal
+from recon.projection.base import Projector
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import attenuation_scale, rough_volume
@@ -114,11 +116,12 @@ class _BestResponse(nn.Module):
         return signal
 
 
-def _binned(
-    tilt_series: TiltSeries, grid: VolumeGrid, binning: int
-) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
+def _binned(tilt_series: TiltSeries, grid: VolumeGrid, binning: int) -> tuple[TiltSeries, NDArray[np.bool_], Projector]:
     """The binned series with a mask, and the projector of a grid with voxels of that size."""
     small = binned(tilt_series, binning, binning)
+    if tilt_series.axes is not None:  # incomplete bins shift the centre by less than half a bin
+        grid = VolumeGrid(-(-grid.depth // binning), *small.images.shape[1:])
+        return replace(small, beam=None), small.used, projector_of(small, grid)
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=-(-grid.depth // binning),

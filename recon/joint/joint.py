@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Gaussian
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from recon.fields.fields import Field, MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
@@ -29,36 +29,27 @@ from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
-from recon.projection.base import Projector
-from recon.projection.defocused_projector import with_defocus
+from recon.projection.base import Projector, from_rays
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
-from recon.projection.projector import SliceProjector, from_rays
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
-_WIDTH_OF_FIRST = (
-    128  # voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
-)
-_QUIET_FIRST = (
-    6.4  # four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
-)
-_HELD_OUT, _HELD_OUT_TO_CHOOSE = (
-    0.1,
-    0.2,
-)  # shares of the pixels; larger on a slab, which has few pixels to distinguish weights
-_SLAB, _SLAB_VOXELS = (
-    24,
-    16 * 96**2,
-)  # slices; more if they are small: this number of voxels suffices to distinguish weights
-_QUIET_SLAB = (
-    12  # for slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
-)
+# Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+_WIDTH_OF_FIRST = 128
+# Four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
+_QUIET_FIRST = 6.4
+# Shares of the pixels; larger on a slab, which has few pixels to distinguish weights
+_HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2
+# Slices; more if they are small: this number of voxels suffices to distinguish weights
+_SLAB, _SLAB_VOXELS = 24, 16 * 96**2
+# For slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
+_QUIET_SLAB = 12
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
-_WORTHWHILE = (
-    0.4  # largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
-)
+# Largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
+_WORTHWHILE = 0.4
 
 
 @dataclass(frozen=True)
@@ -190,14 +181,7 @@ class JointReconstructor:
 
     def projector(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Projector:
         """Line integrals through any slices of the grid."""
-        in_focus = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles,
-            depth=grid.depth,
-            width=grid.width,
-            detector_width=tilt_series.images.shape[2],
-            device=self.device,
-        )
-        return with_defocus(in_focus, self.defocus)
+        return projector_of(tilt_series, grid, self.device, self.defocus)
 
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]

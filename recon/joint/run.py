@@ -25,9 +25,8 @@ Progress = Callable[[int, int, str], None]
 
 _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
-_TOLERATED = (
-    0.003  # nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
-)
+# Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
+_TOLERATED = 0.003
 _TABULATED = 0.05  # nats per pixel
 
 

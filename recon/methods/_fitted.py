@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from noiseflow import AtLevel, Digitisation, Digitised
-from noiseflow.models.around import as_noise_model
 from noiseflow.models.at_level import at_level
+from noiseflow.models.wrapper import as_noise_model
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage

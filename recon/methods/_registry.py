@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from noiseflow.described import described
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
 from recon.fields.regularisers._registry import find_regulariser
@@ -98,6 +98,7 @@ MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], in
 SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
+_SECOND_AXIS = "second axis"
 _OF_FITS = ("weight", "regulariser", "defocus", "uncertainty")
 
 
@@ -227,7 +228,7 @@ def reconstruct(
         True
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
-    order = np.argsort(tilt_series.tilt_angles, kind="stable")
+    order = tilt_series.rising
     if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
         result = reconstruct(
             tilt_series.select(order),
@@ -240,6 +241,8 @@ def reconstruct(
         )
         return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
+    if tilt_series.axes is not None:
+        require_two_axes(found, blocks=slices_at_once is not None)
     run: _Run = partial(_at_once, found)
     if slices_at_once is not None:
         if slices_at_once < 1:
@@ -258,6 +261,22 @@ def reconstruct(
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+
+
+def require_two_axes(method: Method, *, blocks: bool) -> None:
+    """Check that a method reconstructs from two tilt axes.
+
+    Raises:
+        ValueError: it does not, or the volume is to be reconstructed in blocks of slices.
+    """
+    if not method.takes(_SECOND_AXIS):
+        able = [name for name in method_names() if find_method(name).takes(_SECOND_AXIS)]
+        raise ValueError(f"--second-axis: method {method.name} does not support it; use --method {', '.join(able)}")
+    if blocks:
+        raise ValueError(
+            "--second-axis: rays about the second axis cross all slices, so blocks are not possible; remove "
+            "--slices-at-once, --workers and --scheduler, or bin the images if memory does not suffice"
+        )
 
 
 def _of_distinct_tilts(

@@ -21,6 +21,7 @@ from recon.metrics.metrics import (
     matching_line,
     resolution,
 )
+from recon.metrics.orientation import OtherOrientation, better_orientation
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
 
@@ -45,6 +46,7 @@ class Comparison:
         frequency, correlation: (N,) Fourier shell correlation, cycles per voxel.
         crossings: threshold → frequency, cycles per voxel.
         expected: correlation with the truth that is expected from the error bars of the volume, if known.
+        orientation: a flip or an axis order of the volume that fits much better, if there is one.
     """
 
     volume: dict[str, Errors]
@@ -53,6 +55,7 @@ class Comparison:
     correlation: Array
     crossings: dict[float, float]
     expected: ShellBand | None = None
+    orientation: OtherOrientation | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-serialisable values."""
@@ -61,7 +64,8 @@ class Comparison:
         crossings = {f"fsc_{threshold:g}": value for threshold, value in self.crossings.items()}
         if self.expected is not None:
             errors |= {"fsc_expected": {"low": self.expected.low, "high": self.expected.high}}  # type: ignore[dict-item]
-        return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation}
+        other = None if self.orientation is None else asdict(self.orientation)
+        return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation, "better_orientation": other}
 
 
 def compare_volumes(
@@ -98,7 +102,8 @@ def compare_volumes(
     progress(NUM_STEPS, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
-    return Comparison(errors, projections, frequency, correlation, crossings)
+    orientation = better_orientation(first, second)
+    return Comparison(errors, projections, frequency, correlation, crossings, orientation=orientation)
 
 
 def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
@@ -122,9 +127,9 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
             raise ValueError(f"the {name} has shape {array.shape}; give a volume (z, y, x)")
     if first.shape != second.shape:
         sizes = [" x ".join(map(str, array.shape)) for array in (first, second)]
-        raise ValueError(
-            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one to the grid of the other"
-        )
+        other = better_orientation(first, second)
+        advice = "crop or resample one to the grid of the other" if other is None else other.in_words()
+        raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
             f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.projection.projector import SliceProjector
+from recon.projection.base import Projector
 
 
 def sirt(
     line_integrals: Given,
-    projector: SliceProjector,
+    projector: Projector,
     *,
     num_iterations: int = 100,
     start: Given | None = None,
@@ -42,7 +42,7 @@ def sirt(
     """
     A = projector
     y = as_tensor(line_integrals, like=A)
-    ones = torch.ones((A.depth, 1, A.width), dtype=y.dtype, device=y.device)
+    ones = torch.ones((A.depth, A.fixed_height or 1, A.width), dtype=y.dtype, device=y.device)
     R = _inverse(A(ones))
     weights = torch.ones_like(R) if used is None else as_tensor(used, like=A)
     R, C = R * weights, _inverse(A.T(weights))

@@ -13,9 +13,8 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
-_TILE = (
-    0.3  # share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
-)
+# Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
+_TILE = 0.3
 _BASE = 400 * 2**20
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
@@ -23,9 +22,8 @@ _STEP = 8  # slices: smaller differences in height do not affect the cost
 PLENTY = 4 * 2**30
 """Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
 time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
-_TALL = (
-    64  # slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
-)
+# Slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
+_TALL = 64
 
 
 def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:

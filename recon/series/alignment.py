@@ -99,6 +99,10 @@ class Alignment:
         size = None if self.pixel_size is None else self.pixel_size / factor
         return replace(self, shifts=self.shifts * factor, image_shape=shape, pixel_size=size)
 
+    def moved(self, moves: NDArray[np.float64]) -> Alignment:
+        """The alignment whose images are shifted: a position p (y, x) in them shows what was at p + `moves`, (tilt, 2)."""
+        return replace(self, shifts=self.shifts + np.einsum("tij,tj->ti", self._back, moves))
+
     def joined(self, tilt_series: TiltSeries) -> Alignment:
         """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
 

@@ -20,9 +20,8 @@ _FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
 _DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
 _MORE_COMPACT = 1.2  # volumes of one object with equally good axes differ by up to 1.1
 _CONVERGED = 90  # iterations of SIRT; after 30, the best axis is still wrong by more than a degree
-_SMOOTHED = (
-    2.0  # pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
-)
+# Pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
+_SMOOTHED = 2.0
 _SEEN = 0.95  # visible share of a row that is required for its sum
 
 

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.projection.base import Projector
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.masks import binned, used_values
 from recon.series.tilt_series import TiltSeries, filled
@@ -46,9 +46,9 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 
-def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
-    """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
-    bands = binned(tilt_series, min(4, tilt_series.images.shape[1]), 1)
+def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: Projector) -> Tensor:
+    """A few iterations of SIRT on bands of four slices, (z, y/4, x); of single slices, if they are not independent."""
+    bands = binned(tilt_series, 1 if projector.fixed_height else min(4, tilt_series.images.shape[1]), 1)
     images = torch.from_numpy(bands.images).to(projector.device)
     used = None if bands.mask is None else torch.from_numpy(bands.mask).to(images)
     with torch.no_grad():
@@ -62,9 +62,9 @@ def attenuation_scale(volume: Tensor) -> float:
 
 
 def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
-    """The `num_slices` neighbouring slices with the largest variation of the images."""
+    """The `num_slices` neighbouring slices with the largest variation of the images; all of a series about two axes."""
     height = tilt_series.images.shape[1]
-    if num_slices >= height:
+    if num_slices >= height or tilt_series.axes is not None:
         return slice(0, height)
     start = int(_variation(tilt_series, num_slices).argmax())
     return slice(start, start + num_slices)

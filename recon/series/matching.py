@@ -54,14 +54,21 @@ class Matcher:
         tilt_angles: (tilt,) degrees.
         binning: binning factor.
         used: (tilt, y, x) 1 for pixels to use, 0 for others; None for all.
+        size: width of the cube, binned pixels; that of the images if None.
     """
 
     def __init__(
-        self, images: Tensor, tilt_angles: NDArray[np.float64], binning: int, used: Tensor | None = None
+        self,
+        images: Tensor,
+        tilt_angles: NDArray[np.float64],
+        binning: int,
+        used: Tensor | None = None,
+        *,
+        size: int | None = None,
     ) -> None:
         self.images = _blurred(functional.avg_pool2d(images[:, None], binning))[:, 0]
         self.used = None if used is None else functional.avg_pool2d(used[:, None], binning)[:, 0]
-        self.binning, self.size = binning, max(self.images.shape[1:])
+        self.binning, self.size = binning, size or max(self.images.shape[1:])
         cut = torch.tensor([images.shape[1] % binning, images.shape[2] % binning], dtype=torch.float32)
         self._middle = (cut / 2).to(images.device)
         self.projector = SliceProjector(

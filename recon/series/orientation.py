@@ -33,8 +33,10 @@ class Orientation:
         """The flips that move the highest contrast to larger y, larger u and positive angles.
 
         Contrast is the squared deviation of used pixels from the mean. The result does not depend on an added constant, a scale,
-        the order of the tilts, or full turns of their angles.
+        the order of the tilts, or full turns of their angles. A series about two axes is not flipped.
         """
+        if tilt_series.axes is not None:
+            return cls()
         _, height, width = tilt_series.images.shape
         total, count = np.sum([(part.sum(), used.sum()) for part, used in _used(tilt_series)], axis=0)
         down, across = (np.arange(size) - (size - 1) / 2 for size in (height, width))

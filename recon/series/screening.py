@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 from torch import Tensor
 
 from noiseflow.described import described
+from noiseflow.statistics import robust_deviation
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
@@ -24,9 +25,8 @@ _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-_LEAST_DRIFT = (
-    0.04  # constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-)
+# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
+_LEAST_DRIFT = 0.04
 _FEWEST = 8
 _EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
@@ -108,7 +108,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
         beam, residual, predicted = _fit_beam(small, bad)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
-        spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
+        spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
         whole = max(float(used_values(small).var()), 1e-30)
         unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2), where=small.used) / whole

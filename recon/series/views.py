@@ -21,7 +21,7 @@ def in_order(tilt_series: TiltSeries) -> TiltSeries:
     if np.abs(angles).max() > 180:
         angles = (angles + 180) % 360 - 180
         tilt_series = replace(tilt_series, tilt_angles=angles)
-    order = np.argsort(angles, kind="stable")
+    order = tilt_series.rising
     return tilt_series if (np.diff(order) == 1).all() else tilt_series.select(order)
 
 

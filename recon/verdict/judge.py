@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from noiseflow.checks import Guard
 from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
+from recon.series.dual_axis import about, own_images
 from recon.series.first_guess import contrast_slab
 from recon.series.masks import coarse
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, evenly
 from recon.verdict import continuity, fits, pixels, tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -213,6 +214,8 @@ def judge(
             "that the volume was made from"
         )
     case, guard = Case(tilt_series, result, screening, alignment), Guard() if guard is None else guard
+    if tilt_series.axes is not None:
+        return _of_both_axes(case, guard)
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
     for name, check in CHECKS.items():
@@ -221,6 +224,39 @@ def judge(
         evidence |= part
         findings += found
     return verdict_of(findings, evidence, good=guard("summary", lambda: _good(case), otherwise=_NOTHING), guard=guard)
+
+
+def _of_both_axes(case: Case, guard: Guard) -> Verdict:
+    """The verdicts of both axes as one; each judges the tilts about it with the geometry of one axis."""
+    result, verdicts = case.result, list[Verdict]()
+    assert case.tilt_series.axes is not None
+    for second in (False, True):
+        images, volume = result.projections[(case.tilt_series.axes != 0) == second], result.volume.attenuation
+        if second:
+            images, volume = own_images(images), own_images(volume)
+        shown = _Shown(replace(result.volume, attenuation=volume), images, result.fit_result, result.noise_model)
+        screening, alignment = (None, None) if second else (case.screening, case.alignment)
+        verdicts.append(judge(about(case.tilt_series, second=second), shown, screening=screening, alignment=alignment))
+    evidence = dict(zip(("first axis", "second axis"), (verdict.evidence for verdict in verdicts), strict=True))
+    findings = [
+        replace(finding, sentence=f"{name}: {finding.sentence}")
+        for name, verdict in zip(evidence, verdicts, strict=True)
+        for finding in verdict.findings
+    ]
+    for name, verdict in zip(evidence, verdicts, strict=True):
+        guard.not_tested.update({f"{name}: {check}": why for check, why in verdict.not_tested.items()})
+    good = "; ".join(f"{name}: {verdict.reasons[0]}" for name, verdict in zip(evidence, verdicts, strict=True))
+    return verdict_of(findings, evidence, good=good, guard=guard)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """The part of a result about one axis."""
+
+    volume: Volume
+    projections: Array
+    fit_result: Any
+    noise_model: Any
 
 
 def _good(case: Case) -> str:

@@ -25,7 +25,7 @@ def preset_method(name: str, description: str) -> Method:
         choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
         return Reconstruction(volume, predicted, name, noise_model=state.noise_model, choices=choices)
 
-    return Method(name, description, run, learns_noise=True)
+    return Method(name, description, run, learns_noise=True, refuses=("second axis",))
 
 
 METHOD = preset_method(

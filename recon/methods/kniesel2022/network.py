@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from noiseflow.distributions.base import LatentDistribution
-from noiseflow.distributions.transforms import Radial
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.numerics.monotone_maps import Radial
 from noiseflow.models.base import NoiseModelBase
 
 _PARAMETER_RANGE = 10.0

@@ -20,14 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_cells import (
-    LEAST_READ_NOISE,
-    MOST_READ_NOISE,
-    cell_and_slopes,
-    is_narrow,
-    posterior_mode,
-)
-from noiseflow.distributions.electron_contour import (
+from noiseflow.distributions.electrons.contour import (
     contour_and_slopes,
     contour_log_interval,
     contour_log_mass,
@@ -37,9 +30,16 @@ from noiseflow.distributions.electron_contour import (
     saddle_point,
     tilted_rate,
 )
-from noiseflow.distributions.electron_peaks import is_near_peak, peaks_and_slopes
-from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
-from noiseflow.distributions.normal import log_normal_cdf, log_normal_interval
+from noiseflow.distributions.electrons.narrow_cells import (
+    LEAST_READ_NOISE,
+    MOST_READ_NOISE,
+    cell_and_slopes,
+    is_narrow,
+    posterior_mode,
+)
+from noiseflow.distributions.electrons.peaks import is_near_peak, peaks_and_slopes
+from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.numerics.normal import log_normal_cdf, log_normal_interval
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 RESOLVED = 1.5  # electrons: read noise below which the sum is used

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.law import NoiseDistribution
-from noiseflow.distributions.levels import Levels
-from noiseflow.distributions.numerical import as_noise_distribution
-from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.laws.discrete import DiscreteLevels
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
 _ROUNDINGS = 8  # rounding errors of the limit within which an observation counts as clipped
@@ -214,7 +214,7 @@ class DigitisedDistribution(NoiseDistribution):
     def support(self) -> constraints.Constraint:
         """The levels; without rounding, all values between the limits."""
         if self.step > 0:
-            return Levels(self.step, self._origin, self.low, self.high)
+            return DiscreteLevels(self.step, self._origin, self.low, self.high)
         return constraints.interval(self.low, self.high)  # type: ignore[no-untyped-call]
 
     def quadrature(self) -> tuple[Tensor, Tensor]:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from noiseflow.distributions.expectations import panels
-from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.levels import between, log_sum
-from noiseflow.distributions.pixels import is_traced
+from noiseflow.distributions.laws.discrete import between, log_sum
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.quadrature import panels
+from noiseflow.distributions.pixel_batch import is_traced
 
 _PANELS = 128  # of four nodes each, on a scale that is linear within one standard deviation and logarithmic beyond
 _REACH = 12.0  # ends of the scale: sinh(12) = 81 000 standard deviations

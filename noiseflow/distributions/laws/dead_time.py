@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.levels import Levels
-from noiseflow.distributions.textbook import PoissonDistribution
+from noiseflow.distributions.laws.discrete import DiscreteLevels
+from noiseflow.distributions.laws.textbook import PoissonDistribution
 
 
 class DeadTimeDistribution(PoissonDistribution):
@@ -110,7 +110,7 @@ class DeadTimeDistribution(PoissonDistribution):
     @property
     def support(self) -> constraints.Constraint:
         """Non-negative integers."""
-        return Levels(1.0, 0.0, 0.0, math.inf)
+        return DiscreteLevels(1.0, 0.0, 0.0, math.inf)
 
     @property
     def variance(self) -> Tensor:

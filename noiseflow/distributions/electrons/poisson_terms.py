@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_contour import poisson_normal_mode, positive_rate
+from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
 
 REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10, less than the quadrature error 3e-7
 

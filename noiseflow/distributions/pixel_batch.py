@@ -16,7 +16,7 @@ Kept = TypeVar("Kept")
 Taking = Callable[[Tensor, tuple[int, ...]], Tensor]
 
 
-class Pixels:
+class PixelBatch:
     """A batch of independent pixels.
 
     Attributes:
@@ -138,7 +138,7 @@ class Pixels:
         for name, value in vars(self).items():
             if isinstance(getattr(type(self), name, None), cached_property):
                 del other.__dict__[name]
-            elif isinstance(value, Pixels):
+            elif isinstance(value, PixelBatch):
                 setattr(other, name, value.mapped(take, shape))
             elif isinstance(value, Tensor) and self._is_per_pixel(name, value):
                 setattr(other, name, take(value, tuple(value.shape[size:])))
@@ -149,7 +149,7 @@ class Pixels:
         """Whether the distribution can be split into pixels. It cannot if a tensor may hold pixels along axes other than the
         leading ones."""
         for name, value in vars(self).items():
-            if isinstance(value, Pixels) and not value.splits:
+            if isinstance(value, PixelBatch) and not value.splits:
                 return False
             if isinstance(value, Tensor) and value.numel() > 1 and not self._is_per_pixel(name, value):
                 return self.per_pixel is not None
@@ -164,7 +164,7 @@ class Pixels:
         shape = " x ".join(map(str, self.batch_shape)) or "1"
         kind = str(self.dtype).removeprefix("torch.")
         inside = getattr(self, "base", None)
-        of = f", of {type(inside).__name__}" if isinstance(inside, Pixels) else ""
+        of = f", of {type(inside).__name__}" if isinstance(inside, PixelBatch) else ""
         return f"{type(self).__name__}({shape} pixels, {kind}, {self.device}{of})"
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.numerical import as_noise_distribution
-from noiseflow.distributions.picked import Signal, values_of
+from noiseflow.distributions.image_pixels import Signal, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.base import NoiseModelBase
 
 _HALF = (torch.float16, torch.bfloat16)

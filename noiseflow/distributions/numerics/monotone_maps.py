@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.pixels import broadcast_shapes
+from noiseflow.distributions.pixel_batch import broadcast_shapes
 
 
 class Transform(Protocol):

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from noiseflow.distributions.fingerprint import fingerprint
+from noiseflow.distributions.numerics.fingerprint import fingerprint
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1

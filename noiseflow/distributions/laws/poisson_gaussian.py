@@ -8,15 +8,15 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.electrons import (
+from noiseflow.distributions.electrons.exact import (
     RESOLVED,
     interval_and_slopes,
     log_both_tails,
     log_density,
     log_interval,
 )
-from noiseflow.distributions.pixelwise import pixelwise
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.elementwise import pixelwise
 
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.base import LatentDistribution, NoiseDistribution, bisect_quantile
-from noiseflow.distributions.levels import Levels, between, log_sum
+from noiseflow.distributions.laws.discrete import DiscreteLevels, between, log_sum
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 
 _NEAR = 1e-3  # of the level spacing: a value computed as gain·k + offset must count as k
 
@@ -136,7 +137,7 @@ class PoissonDistribution(NoiseDistribution):
     @property
     def support(self) -> constraints.Constraint:
         """Offset plus integer multiples of the gain."""
-        return Levels(float(self.gain), float(self.offset), float(self.offset), math.inf)
+        return DiscreteLevels(float(self.gain), float(self.offset), float(self.offset), math.inf)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         rate = self.rate.detach()

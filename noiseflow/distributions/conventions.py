@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from noiseflow.distributions import automatic
-from noiseflow.distributions.pixels import broadcast_shapes, is_traced
+from noiseflow.distributions.numerics import automatic_tables
+from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
 
 MOST = 2**18
 """Pixels evaluated at once. The graph of a flow has about a hundred float64 arrays of this size, 200 MB."""
@@ -153,19 +153,19 @@ def _draw(method: Method, name: str) -> Method:
 
 
 def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator | None) -> Tensor | None:
-    if shape.numel() < automatic.LARGE or torch.compiler.is_compiling() or self.source is None:
+    if shape.numel() < automatic_tables.LARGE or torch.compiler.is_compiling() or self.source is None:
         return None
     model, signal = self.source
-    if not (hasattr(self, "from_latent") and automatic.may_tabulate(model)):
+    if not (hasattr(self, "from_latent") and automatic_tables.may_tabulate(model)):
         return None
-    found = automatic.sample(model, signal.expand(shape), generator)
+    found = automatic_tables.sample(model, signal.expand(shape), generator)
     return None if found is None else self.cast(found)
 
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
-    if value.numel() >= automatic.LARGE and self.source is not None and not self.light:
-        found = automatic.automatic_log_prob(self.source[0], self.source[1], value)
+    if value.numel() >= automatic_tables.LARGE and self.source is not None and not self.light:
+        found = automatic_tables.automatic_log_prob(self.source[0], self.source[1], value)
         if found is not None:
             return found
     return _in_pieces(method, self, value)

@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.fingerprint import fingerprint
-from noiseflow.distributions.picked import needs_image
-from noiseflow.distributions.pixels import is_traced
-from noiseflow.distributions.tables import Table, Values
-from noiseflow.distributions.tabulated import RootScale
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.numerics.fingerprint import fingerprint
+from noiseflow.distributions.numerics.signal_table import Table, Values
+from noiseflow.distributions.numerics.table_axes import RootScale
+from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18
 """Smallest number of pixels for which a table is used, if no gradient is required."""
@@ -31,10 +31,8 @@ TOLERANCE = 1e-3
 _LATENT_LIMIT = 6.5  # one standard normal draw in 10¹⁰ lies beyond and is computed exactly
 _TAIL = 1e-6  # probability outside the columns on each side, under the model
 _SAMPLE = 2**14  # pixels on which a table is checked before all are looked up
-_FEW, _MANY = (
-    0.02,
-    0.3,
-)  # shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
+# Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
+_FEW, _MANY = 0.02, 0.3
 _KEPT = 4  # tables kept per model, for different data types, likelihood and quantiles
 
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()

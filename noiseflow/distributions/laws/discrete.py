@@ -12,7 +12,7 @@ from torch.distributions import constraints
 _FEW = 8  # up to this number of levels, probabilities are added one by one, which is exact even if they are tiny
 
 
-class Levels(constraints.Constraint):
+class DiscreteLevels(constraints.Constraint):
     """Constraint to levels: multiples of a step from an origin, between two limits, which are levels too.
 
     Args:
@@ -27,7 +27,7 @@ class Levels(constraints.Constraint):
         self.step, self.origin, self.lower_bound, self.upper_bound = step, origin, low, high
 
     def __repr__(self) -> str:
-        return f"Levels(step={self.step:g}, low={self.lower_bound:g}, high={self.upper_bound:g})"
+        return f"DiscreteLevels(step={self.step:g}, low={self.lower_bound:g}, high={self.upper_bound:g})"
 
     def check(self, value: Tensor) -> Tensor:
         """Which values are levels, boolean."""

@@ -19,16 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_contour import positive_rate
-from noiseflow.distributions.electron_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.electrons.contour import positive_rate
+from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷
 STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
-LEAST_READ_NOISE, MOST_READ_NOISE = (
-    0.05,
-    6.0,
-)  # electrons: exponents overflow below, the contour integral is cheaper above
+# Electrons: exponents overflow below, the contour integral is cheaper above
+LEAST_READ_NOISE, MOST_READ_NOISE = 0.05, 6.0
 
 
 @functools.cache

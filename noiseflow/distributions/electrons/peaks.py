@@ -12,13 +12,12 @@ import math
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electron_contour import positive_rate
-from noiseflow.distributions.electron_terms import REACH, log_poisson
+from noiseflow.distributions.electrons.contour import positive_rate
+from noiseflow.distributions.electrons.poisson_terms import REACH, log_poisson
 
 WIDEST = 3.0  # electrons: the sum then has at most two dozen terms
-_FARTHEST = (
-    30.0  # distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
-)
+# Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
+_FARTHEST = 30.0
 _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
 
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.law import NoiseDistribution
-from noiseflow.distributions.normal import log_normal_interval, normal_quadrature
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_quadrature
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _ROUNDINGS = 8

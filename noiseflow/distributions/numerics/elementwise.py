@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.pixels import broadcast_shapes, is_traced
+from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
 from noiseflow.kept_memory import kept_memory
 
 PIECE = 2**14

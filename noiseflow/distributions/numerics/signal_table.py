@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from noiseflow.distributions.tabulated import RootScale
+from noiseflow.distributions.numerics.table_axes import RootScale
 
 _CHUNK = 2**16  # pixels per lookup, so that intermediate arrays fit in the cache
 _MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature

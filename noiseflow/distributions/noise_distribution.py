@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from noiseflow.distributions.answers import answering
-from noiseflow.distributions.expectations import mode_of, panels
-from noiseflow.distributions.pixels import Pixels, Taking, broadcast_shapes
+from noiseflow.distributions.conventions import answering
+from noiseflow.distributions.numerics.quadrature import mode_of, panels
+from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_shapes
 
 # Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
 # deviations between them have 40 panels of four nodes each per standard deviation. At 100 electrons (standard deviation 10),
@@ -21,7 +21,7 @@ from noiseflow.distributions.pixels import Pixels, Taking, broadcast_shapes
 _PANELS, _TAIL = 512, 1e-10
 
 
-class NoiseDistribution(Pixels, Distribution):
+class NoiseDistribution(PixelBatch, Distribution):
     """p(observation | signal), one observation per pixel. ``batch_shape`` is the shape of the signal, ``event_shape`` is ().
 
     A subclass implements `log_prob`, `log_interval_prob`, `cdf`, `icdf` and `sample`, and `mean` and `variance` if they have a
