@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,9 +14,9 @@ from noiseflow.commands.console import (
     OverwriteOption,
     SeedOption,
     choose_device,
-    progress_bar,
 )
 from noiseflow.commands.option_files import option_groups
+from noiseflow.progress import progress_shown
 
 if TYPE_CHECKING:
     from calibration.detector.models import ModelScore
@@ -115,15 +114,16 @@ def calibrate(
         if long
         else read_burst(short, channel=channel)
     )
-    findings = calibrate_exposures(
-        exposures,
-        dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
-        flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
-        kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
-        seed=seed,
-        device=chosen_device,
-        bar=partial(progress_bar, json_mode=json),
-    )
+    with progress_shown(json_mode=json) as progress:
+        findings = calibrate_exposures(
+            exposures,
+            dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
+            flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
+            kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
+            seed=seed,
+            device=chosen_device,
+            progress=progress,
+        )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
     model = saved_model(best.model, findings)

@@ -24,7 +24,7 @@ from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
 if TYPE_CHECKING:
-    from noiseflow.commands.console import Progress
+    from noiseflow.progress import Progress
 
 EXCESS_NOISE = (
     "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only the "
@@ -107,7 +107,7 @@ def measure_detector(
         dark: frames taken without light; they determine offset and read noise directly.
         flat: frames of uniform illumination; they add one level.
         seed: random seed of the sampler.
-        progress: called with the number of steps of the sampler and a note.
+        progress: called with a task, steps of the sampler, at most how many, and a note.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.

@@ -44,10 +44,10 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, a grey ``.png`` image, or a folder
-            of single images of these formats except PNG; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr``
-            and HDF5, and the formats of cameras that `noiseflow.io.camera_formats` lists. ``FILE::NAME`` selects one image, or
-            one channel, of a file that holds several.
+        path: an MRC (``.mrc .mrcs .st .ali .preali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, also packed (``.gz``,
+            ``.bz2``), a grey ``.png`` image, or a folder of single images of these formats, PNG only if there are no others;
+            with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .emi .hspy .zarr`` and HDF5, and the formats of cameras that
+            `noiseflow.io.camera_formats` lists. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
         mapped: memory-map the pixels; changes to the array are not written to the file. Large stacks that cannot be mapped
             (compressed TIFF, HDF5, OME-Zarr) are read in pieces into a temporary file.
         channel: name, or index from zero, of one image or channel of a file that holds several; as ``FILE::NAME``.
