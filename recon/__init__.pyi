@@ -19,6 +19,7 @@ from .reconstruction import Reconstruction as Reconstruction
 from .series.alignment import Alignment as Alignment
 from .series.alignment_files import read_alignment as read_alignment
 from .series.alignment_files import write_alignment as write_alignment
+from .series.channels import prepare_channels as prepare_channels
 from .series.prepare import Prepared as Prepared
 from .series.prepare import prepare as prepare
 from .series.tilt_series import TiltSeries as TiltSeries

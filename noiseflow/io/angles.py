@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +117,8 @@ def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list
         found = _by_angle(table.angles, image.tilt_angles)
         if found is not None:
             return found
+    if table.sections is not None and sorted(table.sections) == list(range(count)):
+        return [int(row) for row in np.argsort(table.sections)]
     if len(table.angles) != count:
         raise ValueError(
             f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; give the angle file of "
@@ -228,8 +229,3 @@ def _compare(angles: NDArray[np.float64], inside: NDArray[np.float64] | None, an
         "the angle file is used",
         stacklevel=4,
     )
-
-
-def without(table: TiltTable, views: Sequence[int]) -> TiltTable:
-    """The table with further views (from 0) to leave out."""
-    return replace(table, excluded=tuple(sorted({*table.excluded, *views})))

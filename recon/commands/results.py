@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.result import error_bar_paths, shell_band_path
 from recon.verdict.judge import judge
-from recon.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class Targets:
         reference: Volume | None = None,
         warned: Sequence[str] = (),
         filled: Path | None = None,
-    ) -> Verdict:
-        """Write the requested files, print the results, and return the verdict. A volume that is already `filled`, in a
+    ) -> dict[str, Any]:
+        """Write the requested files, print the results, and return those for programs. A volume that is already `filled`, in a
         file of the same format next to its target, is renamed to it."""
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
@@ -117,7 +117,7 @@ class Targets:
         for line in verdict.lines():  # after the report, whose parts may fail
             output.line(line)
         fit = outcome.fit_result
-        output.result(
+        return (
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
@@ -127,7 +127,6 @@ class Targets:
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
-        return verdict
 
     def _remove_former(self, written: dict[str, Path], output: Output) -> None:
         """Remove error bars of the previous volume, which would be read as those of the new one."""

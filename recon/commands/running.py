@@ -87,7 +87,7 @@ def resume_command(context: typer.Context) -> str:
     for parameter in context.command.params:
         value, name = context.params.get(parameter.name or ""), max(parameter.opts, key=len)
         if parameter.param_type_name == "argument":
-            words.append(str(value))
+            words += map(str, value if isinstance(value, list | tuple) else [value])
         elif value is True and name != "--resume":
             words.append(name)
         elif not isinstance(value, bool | None) and value != parameter.default:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from noiseflow import Gaussian
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
+from noiseflow.progress import Progress
 from recon.fields.fields import Field, MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
@@ -24,7 +25,7 @@ from recon.joint.candidates import first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
-from recon.joint.run import Progress, RunFit, Runner, run_fit
+from recon.joint.run import RunFit, Runner, run_fit
 from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
@@ -152,7 +153,7 @@ class JointReconstructor:
             settled: result of `settle` for all slices.
             rows: position of these slices among all.
             projector: projector of the grid, if it exists already.
-            progress: called with completed steps, expected steps and a note.
+            progress: called with a task, completed and expected steps, and a note.
         """
         whole = self._model(settled.start, tilt_series, grid, rows=rows, settled=settled, projector=projector)
         # copies, so that a block does not change the start of the next one

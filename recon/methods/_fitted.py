@@ -13,10 +13,11 @@ from torch import nn
 from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.at_level import at_level
 from noiseflow.models.wrapper import as_noise_model
+from noiseflow.progress import Progress
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
-from recon.joint.run import Progress, run_fit
+from recon.joint.run import run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
@@ -107,7 +108,7 @@ class FittedBlock:
         settled: its choices for all slices.
         grid: grid of the whole volume.
         level: constant level that is subtracted from the images.
-        progress: called with completed steps, expected steps and a note; None on a remote worker.
+        progress: called with a task, completed and expected steps, and a note; None on a remote worker.
         near: a signal model whose projector can be reused; None on a remote worker.
         num_samples: number of posterior samples for error bars; 0 for none.
         run_stage: runs the sampling; remote workers do not save unfinished blocks.

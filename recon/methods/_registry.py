@@ -17,9 +17,10 @@ from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.plugins import load_plugin, plugins
+from noiseflow.progress import Progress
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.plan import FitStage
-from recon.joint.run import Progress, RunFit, run_fit
+from recon.joint.run import RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._names import GROUP, method_names
 from recon.projection.wbp import WINDOWS
@@ -48,7 +49,7 @@ class Settings:
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
         seed: seed of all random choices.
         device: torch device.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
         prefix: prefix of the names of fits, if one run makes several volumes.
         keep: function from the prefix to the folder for finished blocks, so that a run can resume; by default they are deleted
             when the volume is complete.

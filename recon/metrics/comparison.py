@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
-from noiseflow.commands.console import Progress
+from noiseflow.progress import Progress
 from noiseflow.report import Report, new_figure, show_image
 from recon.metrics.metrics import (
     SCALINGS,
@@ -74,7 +74,7 @@ def compare_volumes(
     *,
     tilt_angles: Array | None = None,
     mode: Mode = "linear",
-    progress: Progress = lambda done, note: None,
+    progress: Progress = lambda task, done, total, note: None,
 ) -> Comparison:
     """Compare a volume with its reference.
 
@@ -83,7 +83,7 @@ def compare_volumes(
         reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: type of the projections: line integrals (``linear``), or exp(−line integral) (``transmission``).
-        progress: called with the completed steps (of `NUM_STEPS`) and a note.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: shapes or voxel sizes differ, voxels are not finite, or the reference is constant.
@@ -92,14 +92,14 @@ def compare_volumes(
     first, second = volume.attenuation, reference.attenuation
     errors: dict[str, Errors] = {}
     for done, scaling in enumerate(SCALINGS):
-        progress(done + 1, f"volumes, {scaling}")
+        progress("comparing", done + 1, NUM_STEPS, f"volumes, {scaling}")
         errors[scaling] = compare(first, second, scaling=scaling)
     projections: dict[str, Errors] = {}
     if tilt_angles is not None:
-        progress(len(SCALINGS) + 1, "projections")
+        progress("comparing", len(SCALINGS) + 1, NUM_STEPS, "projections")
         images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
         projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
-    progress(NUM_STEPS, "shell correlation")
+    progress("comparing", NUM_STEPS, NUM_STEPS, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
     orientation = better_orientation(first, second)

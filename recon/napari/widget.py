@@ -11,7 +11,7 @@ from noiseflow import io
 from recon.napari.files import LayerData, error_bar_layer
 
 if TYPE_CHECKING:
-    from recon.joint.run import Progress
+    from noiseflow.progress import Progress
 
 _STEPS = 0  # the default number of the method
 _BUTTON = "Reconstruct"
@@ -48,7 +48,7 @@ def reconstruct_layers(
         num_steps: steps of the fit; 0 for the default of the method.
         invert_tilt: flip the sign of the angles.
         uncertainty: number of posterior samples for error bars; 0 for none.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: there are no tilt angles, or the series cannot be reconstructed with these settings.
@@ -144,9 +144,6 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
         steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         found: list[list[LayerData] | Exception] = []
 
-        def report(done: int, total: int, note: str) -> None:
-            steps.put(round(_SHARES * done / total))
-
         def fit() -> None:
             try:
                 found.append(
@@ -154,7 +151,7 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
                         images,
                         metadata,
                         num_steps=num_steps,
-                        progress=lambda done, total, note: steps.put(round(_SHARES * done / total)),
+                        progress=lambda task, done, total, note: steps.put(round(_SHARES * done / total)),
                         **options,
                     )
                 )

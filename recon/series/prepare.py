@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Guard
 from noiseflow.described import described
+from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
@@ -25,9 +26,6 @@ from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
 _ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
-
-Progress = Callable[[str, int, int, str], None]
-"""``progress(title, done, total, note)``."""
 
 
 @described()

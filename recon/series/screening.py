@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,12 @@ class Screening:
     def beam_drifts(self) -> bool:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
         return self.drift > _LEAST_DRIFT
+
+    def of(self, order: Sequence[int]) -> Screening:
+        """The screening of some of the tilts, by index."""
+        chosen = list(order)
+        found = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return Screening(**found)
 
     def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
         """The good tilts, or all if `keep`, with their beam if it drifts."""

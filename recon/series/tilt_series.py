@@ -455,8 +455,10 @@ def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
         warnings.warn(
             f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=5
         )
-    if np.abs(angles).max() < 1.6:
+    span = float(np.ptp(angles))
+    # ±90° is ±1.57 in radians; a half and a full turn lack at most one of ten or more steps
+    if np.abs(angles).max() < 1.6 or 0.9 * np.pi < span < 1.01 * np.pi or 0.9 < span / (2 * np.pi) < 1.01:
         warnings.warn(
-            f"all tilt angles are within ±{np.abs(angles).max():.2f}, as if in radians; give them in degrees",
+            f"the tilt angles span {span:.2f}, as if in radians; give them in degrees",
             stacklevel=5,
         )

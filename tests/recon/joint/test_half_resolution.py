@@ -170,7 +170,7 @@ def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
     fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16, slab=4)
     stopped = []
 
-    def stop(done, total, note):
+    def stop(task, done, total, note):
         if note.startswith("begin"):
             stopped.append(done)
             raise KeyboardInterrupt
