@@ -117,6 +117,8 @@ def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list
         found = _by_angle(table.angles, image.tilt_angles)
         if found is not None:
             return found
+    if table.sections is not None and sorted(table.sections) == list(range(count)):
+        return [int(row) for row in np.argsort(table.sections)]
     if len(table.angles) != count:
         raise ValueError(
             f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; give the angle file of "
