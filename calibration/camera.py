@@ -13,7 +13,16 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import BIAS, Grade, Reason, Verdict, frames_correlated, verdict_of
+from calibration.verdict import (
+    BIAS,
+    Grade,
+    Reason,
+    Verdict,
+    bent_response,
+    frames_correlated,
+    verdict_of,
+    with_pattern,
+)
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 
@@ -106,7 +115,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
             f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled or compressed. "
             "Use raw frames.",
         )
-    found += frames_correlated(figures.lag)
+    found += frames_correlated(figures.lag) + bent_response(figures.bend)
     if figures.chi_squared > LARGEST_CHI_SQUARED:
         text = f"the variance is not linear in the signal (χ² per degree of freedom {figures.chi_squared:.1f})"
         add(
@@ -144,6 +153,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
+    found = with_pattern(found, figures.pattern, correlation, figures.gain.median)
     return verdict_of([one for one in found if one.name != "not saturated"])
 
 
@@ -270,6 +280,11 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
             _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)"),
         ),
         ("excess-noise factor F²", _text(figures.excess_factor, "")),
+        (
+            "exponent of the response",
+            f"{figures.bend.exponent:.4g} ± {figures.bend.error:.2g}" if figures.bend.known else _value(None, ""),
+        ),
+        ("outliers of single frames", f"{figures.outliers}, excluded"),
         ("defective pixels", f"{int(camera.maps['defects'].sum())}"),
     ]
     return [(name, text.strip()) for name, text in rows]
@@ -304,6 +319,8 @@ def summary_of(camera: Camera) -> dict[str, Any]:
         for level in figures.levels
         if level.variance > 0
     ]
+    found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
+    found["outliers"] = figures.outliers
     found["defects"] = int(camera.maps["defects"].sum())
     return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.reasons], "camera": found}
 

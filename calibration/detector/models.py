@@ -16,8 +16,8 @@ from noiseflow.described import described
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from noiseflow.commands.console import Progress
     from noiseflow.metrics.evaluation import Evaluation
+    from noiseflow.progress import Progress
 
 KINDS: dict[str, str] = {
     "gaussian": "Gaussian",
@@ -189,7 +189,7 @@ def fit_models(
         detector: measured gain, offset and read noise for the Poisson-Gaussian model; None to fit them.
         seed: random seed.
         device: torch device for the fits.
-        progress: called with the number of models done and a note.
+        progress: called with a task, the number of models done and of all, and a note.
 
     Returns:
         One score per kind, simplest first, with the models on the CPU.
@@ -210,7 +210,7 @@ def fit_models(
     """
     models = _fitted(sorted(kinds or SIMPLE, key=_rank), pixels, detector, seed, device)
     if progress is not None:
-        progress(len(models), "simple models")
+        progress("Fitting noise models", len(models), len(KINDS), "simple models")
     losses = {name: _losses(model, pixels) for name, model in models.items()}
     best = min(losses, key=lambda name: float(losses[name].mean()))
     for more in (_special(pixels), FLEXIBLE):
@@ -219,7 +219,7 @@ def fit_models(
             losses |= {name: _losses(models[name], pixels) for name in more}
             best = min(losses, key=lambda name: float(losses[name].mean()))
     if progress is not None:
-        progress(len(KINDS), "all models")
+        progress("Fitting noise models", len(KINDS), len(KINDS), "all models")
     return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]
 
 

@@ -30,6 +30,7 @@ class MaskCounts:
     hot: int
     dead: int
     restless: int = 0
+    outliers: int = 0
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:

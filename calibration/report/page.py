@@ -11,6 +11,7 @@ from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, simplest_sufficient
 from calibration.detector.posterior import Interval
+from calibration.detector.response import Response
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
@@ -30,6 +31,11 @@ from noiseflow.report import Report, provenance
 
 LARGEST_MISALIGNMENT = 0.1
 """Largest registration error without visible residuals, pixels."""
+
+UNKNOWN_RESPONSE = (
+    "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
+    "from 0.85 to 1.15; add dark frames or --exposure-ratio to measure it."
+)
 
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
 
@@ -83,6 +89,9 @@ def verdict(scores: Sequence[ModelScore]) -> str:
 def describe_figures(figures: Figures) -> str:
     """Describe gain, offset and read noise with their 90 % intervals, and the method that gave them."""
     parts = [f"{name} {_interval(value, unit)}" for name, unit, value in _named(figures)]
+    if figures.linear is not None and figures.linear != figures.gain:
+        straight = _interval(figures.linear, "counts/e⁻")
+        parts[0] += f"; for a linear response {straight}"
     source = "posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
     corrected = f"; variance multiplied by {figures.factor:.3g} for pixel correlation" if figures.factor != 1 else ""
     per_count = f"1 count = {1 / figures.gain.median:.4g} e⁻"
@@ -113,7 +122,15 @@ def describe_detector(findings: Findings) -> str:
     text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
     if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
+    text += describe_response(detector.response) + " "
     return text + EXCESS_NOISE
+
+
+def describe_response(response: Response) -> str:
+    """Describe the exponent of the response to light."""
+    if not response.known:
+        return UNKNOWN_RESPONSE
+    return f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
 
 
 def describe_burst(burst: BurstReport) -> str:
@@ -127,7 +144,8 @@ def describe_burst(burst: BurstReport) -> str:
             else "the frames were compared without registration."
         )
     dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
-    return drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
+    text = drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
+    return text + (f" {burst.outliers} outliers of single frames were replaced." if burst.outliers else "")
 
 
 def describe_registration(pair: AlignedPair) -> str:
@@ -146,7 +164,9 @@ def describe_registration(pair: AlignedPair) -> str:
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
         f"{found.scale:.5f}, standard error {found.error_px:.3f} px, rms of the matches {found.rms_px:.2f} px; {ratio}. "
         f"Excluded: {counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
-        f"{counts.dead} dead" + (f", {counts.restless} in changing regions." if counts.restless else ".")
+        f"{counts.dead} dead"
+        + (f", {counts.outliers} at outliers of one exposure" if counts.outliers else "")
+        + (f", {counts.restless} in changing regions." if counts.restless else ".")
     )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings, Progress
+from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
@@ -23,6 +23,7 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
+from noiseflow.progress import Progress
 from noiseflow.threads import few_threads, warn_if_spinning
 
 _log = logging.getLogger("noiseflow")
@@ -84,7 +85,7 @@ def fit(
         train_noise: whether to train the noise model; otherwise it is not changed.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
-        progress: called with the number of completed steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
         checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C.
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.

@@ -14,12 +14,13 @@ from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
-from noiseflow.fitting.contest import Contest, Progress, mean_and_error
+from noiseflow.fitting.contest import Contest, mean_and_error
 from noiseflow.models import baselines, flow, mixture, physical, physics_flow
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
+from noiseflow.progress import Progress
 
 NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
@@ -160,7 +161,7 @@ def select(
         digitise: detect rounding and clipping; if False, candidates are not wrapped.
         refit: fit the chosen model again with the validation pixels included.
         seed: seed of all random choices.
-        progress: called with the number of completed fits and the name of the candidate.
+        progress: called with a task, the completed and expected fits, and the name of the candidate.
 
     Raises:
         ValueError: as `fit`; there are no candidates; or some pixels are impossible under all of them.

@@ -4,7 +4,9 @@ from .alignment import read_transforms as read_transforms
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
+from .angles import read_tilts as read_tilts
 from .angles import tilt_angles_of as tilt_angles_of
+from .angles import tilts_of as tilts_of
 from .checks import SeveralImages as SeveralImages
 from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
@@ -20,6 +22,8 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
+from .imod_commands import parse_views as parse_views
 from .lock import locked as locked
 from .partials import partial_folder as partial_folder
 from .tilt_axis import tilt_axis_of as tilt_axis_of
+from .tilt_table import TiltTable as TiltTable

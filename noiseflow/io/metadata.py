@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.tilt_table import LARGEST_ANGLE
+
 _ANGLE_NAME = re.compile(r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle", re.IGNORECASE)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
@@ -33,7 +35,7 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
         if _ANGLE_NAME.search(name):
             recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(values)
     for values in recorded.values():
-        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= 180
+        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= LARGEST_ANGLE
         if plausible and (count == 1 or np.ptp(values) > np.pi):  # otherwise radians, or a stage that did not move
             return np.array(values)
     return None

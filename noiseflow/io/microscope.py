@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import choose_member, require_room
+from noiseflow.io.checks import Unsupported, choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
 from noiseflow.io.tilt_axis import recorded_axis
@@ -38,11 +38,15 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         member: title of the image to read, if the file holds several.
     """
     plugin = _PLUGINS[path.suffix.lower()]
+    pixel_files = sorted(path.parent.glob(f"{path.stem}_*.ser")) if path.suffix.lower() == ".emi" else []
+    if path.suffix.lower() == ".emi" and not pixel_files:
+        raise Unsupported(f"holds no pixels: they are in {path.stem}_1.ser; put this file next to it, or give it")
     signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
     titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
     signal = signals[choose_member(titles, [signal["data"].shape for signal in signals], member)]
     lazy = signal["data"]
-    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED)
+    stored = sum(part.stat().st_size for part in (path, *pixel_files))
+    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED, size=stored)
     data = np.asarray(lazy.compute(scheduler="single-threaded") if hasattr(lazy, "compute") else lazy)
     data = data.astype(data.dtype.newbyteorder("="), copy=False)
     axes = [

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 _ANGSTROM = {
-    **dict.fromkeys(("å", "a", "angstrom", "angstroms", "ångström", "ångstrom"), 1.0),
+    **dict.fromkeys(("å", "a", "angstrom", "angstroms", r"\u00c5", "ångström", "ångstrom"), 1.0),
     **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),
     **dict.fromkeys(("nm", "nanometer", "nanometre"), 10.0),
     **dict.fromkeys(("µm", "μm", "um", "micron", "microns", "micrometer", "micrometre", r"\u00b5m", "µ", "μ"), 1e4),
     **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e7),
-    **dict.fromkeys(("cm", "centimeter"), 1e8),
+    **dict.fromkeys(("cm", "centimeter", "centimetre"), 1e8),
+    **dict.fromkeys(("inch", "in", '"'), 2.54e8),
     **dict.fromkeys(("m", "meter", "metre"), 1e10),
 }
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def simulate(
     num_bytes = 4 * size**2 * (size + num_images)
     io.check_folder(folder, num_bytes=num_bytes, holds=["truth.mrc", *holds], overwrite=overwrite)
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
-    with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
+    with progress_shown(json_mode=json) as progress:
         simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
     names = (*noisy, *stacks, "truth")

@@ -25,13 +25,11 @@ from noiseflow.installation import library_version
 from noiseflow.io import atomic_path, output_folder
 from noiseflow.io.ownership import is_own
 from noiseflow.io.partials import clear_all_leftovers
+from noiseflow.progress import Progress
 from recon.joint.stages import Stage
 from recon.joint.state_files import discard_states, is_state
 from recon.joint.state_files import read_state as read_state
 from recon.joint.state_files import write_state as write_state
-
-StepReport = Callable[[str, int, int, str], None]
-"""``report(title, done, total, note)`` after every step of every fit."""
 
 _FORMAT = "noiseflow checkpoint 2"
 _RUN_START = b'{\n "format": "noiseflow checkpoint '
@@ -69,7 +67,7 @@ class Journal:
         *,
         resume: bool = False,
         interval: float = 60.0,
-        report: StepReport | None = None,
+        report: Progress | None = None,
     ) -> None:
         self.folder, self.interval, self.report = Path(folder), interval, report
         self.settings, self._choices = json.loads(json.dumps(settings)), dict[str, Any]()
@@ -108,7 +106,7 @@ class Journal:
             "checkpoint": partial(self._write_current, name),
             "checkpoint_interval": self.interval,
             "digitise": False,
-            "progress": self._stopping(name, options),
+            "progress": self._stopping(name, options.get("progress")),
         }
         with self._working():
             result = fit(noise_model, signal, observation, **options)
@@ -125,7 +123,7 @@ class Journal:
 
     def run_stage(self, title: str, stage: Stage) -> None:
         """Take the remaining steps of a stage, with progress and checkpoints as for a fit."""
-        finished, report = self._finished(title), self.progress(title, stage.num_steps)
+        finished = self._finished(title)
         if not self._fresh and finished.exists():
             stage.load_state(read_state(finished))
             return
@@ -140,7 +138,7 @@ class Journal:
                     if time.perf_counter() - saved >= self.interval:
                         self._write_current(title, stage.state())
                         saved = time.perf_counter()
-                    report(stage.done, note)
+                    self._after_step(title, stage.done, stage.num_steps, note)
             except KeyboardInterrupt:
                 self._write_current(title, stage.state())
                 raise
@@ -154,31 +152,21 @@ class Journal:
         yield
         self.in_fit = False
 
-    def _stopping(self, name: str, options: dict[str, Any]) -> Callable[[int, str], None]:
+    def _stopping(self, name: str, own: Progress | None) -> Progress:
         """The progress callback of a fit, which also stops it if requested."""
-        total, own = options.get("num_steps", 500), options.get("progress")
-        if own is None:
-            return self.progress(name, total)
 
-        def report(done: int, note: str) -> None:
-            own(done, note)
-            self._stop_if_asked(name, done, total)
-
-        return report
-
-    def _stop_if_asked(self, title: str, done: int, total: int) -> None:
-        if self.stop_requested:
-            raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
-
-    def progress(self, title: str, total: int) -> Callable[[int, str], None]:
-        """A progress callback for one task, which also stops it if requested."""
-
-        def progress(done: int, note: str) -> None:
-            if self.report is not None:
-                self.report(title, done, total, note)
-            self._stop_if_asked(title, done, total)
+        def progress(task: str, done: int, total: int, note: str) -> None:
+            if own is not None:
+                own(task, done, total, note)
+            self._after_step(name, done, total, note, reported=own is not None)
 
         return progress
+
+    def _after_step(self, title: str, done: int, total: int, note: str, *, reported: bool = False) -> None:
+        if self.report is not None and not reported:
+            self.report(title, done, total, note)
+        if self.stop_requested:
+            raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
 
     def keep(self, prefix: str = "") -> Path:
         """The folder for finished blocks of a volume, named after the prefix of its fits; removed with the journal."""

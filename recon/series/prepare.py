@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Guard
 from noiseflow.described import described
+from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
 from recon.series.dual_axis import stacked
+from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.registration import Registration, register
 from recon.series.screening import Screening, require_specimen, screen
@@ -24,9 +26,6 @@ from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
 _ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
-
-Progress = Callable[[str, int, int, str], None]
-"""``progress(title, done, total, note)``."""
 
 
 @described()
@@ -134,7 +133,7 @@ def prepare(
             device=device,
             progress=progress,
         )
-    guard = Guard()
+    guard, tilt_series = Guard(), plausible(tilt_series)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:

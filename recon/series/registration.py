@@ -15,13 +15,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from noiseflow.described import described
+from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
 from recon.series.matching import Matcher
 from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int, str], None]
 # widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
 _SEARCHED, _WIDTHS = 24, (24, 48, 80)
 _ITERATIONS, _ROUNDS = 30, 6

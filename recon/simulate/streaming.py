@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,10 @@ from torch import nn
 
 from noiseflow.io import locked, output_folder, partial_folder
 from noiseflow.io.files import reserve
+from noiseflow.io.mapped import finish_mrc
 from noiseflow.io.ownership import signature
 from noiseflow.io.partials import link_target
+from noiseflow.progress import Progress
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
 from recon.series.dual_axis import own_images
@@ -25,7 +27,6 @@ from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import Acquisition, draw_noise, stored_type
 
 Array = NDArray[Any]
-Progress = Callable[[int, str], None]
 _BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
 
 
@@ -67,7 +68,7 @@ class Simulation:
         step = max(1, _BLOCK_VOXELS // self.size**2)
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
-    def write(self, folder: Path, progress: Progress = lambda done, note: None) -> float:
+    def write(self, folder: Path, progress: Progress = lambda task, done, total, note: None) -> float:
         """Write ``truth.mrc``, the clean stacks by name and the noisy ``tilts.mrc``, with their angles, to a folder.
 
         ``clean_second`` shows the volume turned in its plane by 90°, about a second tilt axis; its noisy stack is
@@ -85,6 +86,8 @@ class Simulation:
             partial_folder(folder / "simulate") as partial,
         ):
             unit = _Writer(self, partial, progress).run()
+            for path in partial.glob("*.mrc"):
+                finish_mrc(path, stack=path.stem != "truth")
             for path in sorted(partial.iterdir()):
                 path.replace(link_target(folder / path.name))
         return unit
@@ -156,7 +159,7 @@ class _Writer:
 
     def _step(self, note: str) -> None:
         self.done += 1
-        self.progress(self.done, note)
+        self.progress("simulate", self.done, self.simulation.num_steps, note)
 
 
 def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:

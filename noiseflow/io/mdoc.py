@@ -1,0 +1,58 @@
+"""SerialEM's ``.mdoc`` files: of a stack, of single images and of movies.
+
+Source: https://bio3d.colorado.edu/SerialEM/hlp/html/about_formats.htm
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from noiseflow.io.checks import number, text_lines
+from noiseflow.io.tilt_table import TiltTable
+
+_SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
+_ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
+
+
+def read(path: Path) -> TiltTable:
+    """Angles, image files and pixel size; sections of a stack are sorted by ``ZValue``, the others stay in order.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: a section has no angle although others have, or a value is not a number.
+    """
+    lines = text_lines(path, "angle file", holds="the sections of a series")
+    common: dict[str, str] = {}
+    sections: dict[tuple[float, int], dict[str, str]] = {}
+    current = common
+    for line in lines:
+        if header := _SECTION.fullmatch(line):
+            kind, value = header[1].lower(), header[2]
+            place = number(value) if kind == "zvalue" else 0.0
+            current = {} if kind != "image" else {"imagefile": value}
+            sections[place, 0 if kind == "zvalue" else len(sections)] = current
+        elif entry := _ENTRY.fullmatch(line):
+            current[entry[1].lower()] = entry[2]
+    found = [sections[place] for place in sorted(sections)]
+    told = [section for section in found if "tiltangle" in section]
+    if told and len(told) < len(found):
+        raise ValueError(
+            f"{path}: section {found.index({}) if {} in found else 'one'} has no TiltAngle; complete the file"
+        )
+    names = [section.get("subframepath") or section.get("imagefile") or "" for section in told]
+    spacings = [value for each in (common, *told) if (value := each.get("pixelspacing"))]
+    return TiltTable(
+        np.array([_number(section["tiltangle"], path) for section in told], dtype=np.float64),
+        tuple(names) if all(names) else (),
+        pixel_size=(_number(spacings[0], path) or None) if spacings else None,
+    )
+
+
+def _number(text: str, path: Path) -> float:
+    try:
+        return number(text.split()[0].replace(",", "."))
+    except (ValueError, IndexError):
+        raise ValueError(f"{path}: '{text[:40]}' is not an angle in degrees, or not a number") from None
