@@ -82,8 +82,8 @@ def _tilt_angles(signal: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> 
 
 
 def _velox_angles(path: Path, count: int) -> NDArray[np.float64] | None:
-    """Alpha tilt of the stage for every frame of a Velox EMD file, degrees, from the metadata of each (rosettasciio reads only the
-    first); None if their number differs from `count` or the stage did not move."""
+    """Alpha tilt of the stage for every frame of a Velox EMD file, degrees, from the metadata of each (rosettasciio reads only
+    the first); None if their number differs from `count` or the stage did not move."""
     import h5py
 
     with h5py.File(path, "r") as file:
