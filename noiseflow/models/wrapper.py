@@ -66,6 +66,14 @@ class ModelAround(NoiseModelBase):
         return self.model.starts_most_likely
 
     @property
+    def fits_directly(self) -> bool:
+        return self.model.fits_directly and not self.model.needs_image
+
+    @property
+    def costly(self) -> bool:
+        return self.model.costly
+
+    @property
     def learning_rate(self) -> float:
         return self.model.learning_rate
 
