@@ -14,6 +14,8 @@ from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
+_OTHER = re.compile(r"\s*\[\s*(?!t\s*=)\w+\s*=.*\]\s*", re.IGNORECASE)
+"""Sections that are no images, such as those of montages; titles (``[T = …]``) belong to no section."""
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
 
 
@@ -34,6 +36,8 @@ def read(path: Path) -> TiltTable:
             place = number(value) if kind == "zvalue" else 0.0
             current = {} if kind != "image" else {"imagefile": value}
             sections[place, 0 if kind == "zvalue" else len(sections)] = current
+        elif _OTHER.fullmatch(line):
+            current = {}
         elif entry := _ENTRY.fullmatch(line):
             current[entry[1].lower()] = entry[2]
     found = [sections[place] for place in sorted(sections)]
