@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -228,8 +227,3 @@ def _compare(angles: NDArray[np.float64], inside: NDArray[np.float64] | None, an
         "the angle file is used",
         stacklevel=4,
     )
-
-
-def without(table: TiltTable, views: Sequence[int]) -> TiltTable:
-    """The table with further views (from 0) to leave out."""
-    return replace(table, excluded=tuple(sorted({*table.excluded, *views})))
