@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
 from noiseflow.io.checks import Unsupported, as_array, choose
-from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 from noiseflow.io.image_file import (
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
@@ -25,6 +24,7 @@ from noiseflow.io.image_file import (
     ImageFile,
     VoxelSize,
 )
+from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from noiseflow.runs.states import read_state, write_state
 from recon.commands.options import method_of
-from recon.joint.checkpoint import read_state, write_state
 from recon.joint.stages import run_stage
 from recon.methods import method_names
 from recon.methods.kniesel2022.network import CoordinateDensity, PaperFlow, by_density
