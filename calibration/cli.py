@@ -68,6 +68,9 @@ def calibrate(
             help="Ratio of the long to the short exposure time, at the same detector setting; it determines the offset."
         ),
     ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Name or index of the channel or image to read of files that hold several.")
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder to write report.html to.")] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
@@ -96,7 +99,7 @@ def calibrate(
         for path in (map_path(output, name) for name in MAPS):
             check_output(path, overwrite=overwrite)
             require_other(path, *inputs)
-        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, output, report, seed, Output(json))
+        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, channel, output, report, seed, Output(json))
         return
     if flat_time or dark_time:
         raise ValueError(
@@ -106,12 +109,16 @@ def calibrate(
         raise ValueError(
             "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
         )
-    exposures = read_pairs(short, long, exposure_ratio=exposure_ratio) if long else read_burst(short)
+    exposures = (
+        read_pairs(short, long, exposure_ratio=exposure_ratio, channel=channel)
+        if long
+        else read_burst(short, channel=channel)
+    )
     with progress_shown(json_mode=json) as progress:
         findings = calibrate_exposures(
             exposures,
-            dark=read_burst(dark, name="the dark frames", calibration=True) if dark else None,
-            flat=read_burst(flat, name="the flat frames", calibration=True) if flat else None,
+            dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
+            flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
             kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
             seed=seed,
             device=chosen_device,
@@ -134,6 +141,7 @@ def _calibrate_camera(
     dark: list[Path],
     flat_time: list[float] | None,
     dark_time: list[float] | None,
+    channel: str | None,
     output: Path,
     report: Path | None,
     seed: int,
@@ -152,11 +160,13 @@ def _calibrate_camera(
     darks = []
     if dark:
         darks = (
-            read_levels(dark, name="the dark frames")
+            read_levels(dark, name="the dark frames", channel=channel)
             if dark_time
-            else [read_burst(dark, name="the dark frames", calibration=True)]
+            else [read_burst(dark, name="the dark frames", calibration=True, channel=channel)]
         )
-    camera = calibrate_camera(read_levels(flat), darks, flat_times=flat_time or None, dark_times=dark_time or None)
+    camera = calibrate_camera(
+        read_levels(flat, channel=channel), darks, flat_times=flat_time or None, dark_times=dark_time or None
+    )
     page = None if report is None else write_camera_report(report, camera, inputs=[*flat, *dark], seed=seed)
     found = summary_of(camera)
     noiseflow.save(

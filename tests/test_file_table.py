@@ -98,6 +98,16 @@ def folder_of(kind: str) -> Callable[[Path], Path]:
     return write
 
 
+def png_images(folder: Path) -> Path:
+    from PIL import Image
+
+    folder = folder / "series"
+    folder.mkdir()
+    for angle, image in zip(ANGLES, COUNTS, strict=True):
+        Image.fromarray(image).save(folder / f"tilt_{angle:+.1f}.png")
+    return folder
+
+
 def imod_bytes(folder: Path) -> Path:
     extra = np.zeros(84, "u1")
     extra[40:48] = np.array([1146047817, 1], "<i4").view("u1")
@@ -189,6 +199,7 @@ MORE: dict[str, Callable[[Path], Path]] = {
     "NXtomo": nxtomo,
     "Data Exchange": data_exchange,
     "HDF5 with maps": maps,
+    "PNG images": png_images,
     "images, one mdoc": folder_of("one mdoc"),
     "images, one mdoc each": folder_of("each"),
     "movies, one mdoc": folder_of("movies, one mdoc"),

@@ -447,3 +447,23 @@ def test_written_files_are_valid_and_say_whether_they_are_stacks_or_volumes(tmp_
             np.testing.assert_allclose(found, [data.min(), data.max(), data.mean(), data.std()], rtol=1e-4, atol=1e-6)
             if "new" not in name:
                 assert float(file.voxel_size.x) == float(file.voxel_size.z) == 5.0
+
+
+def test_dark_frames_of_aretomo_are_excluded_and_sections_put_in_order(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 30, 40)).astype(np.float32)
+    io.write(tmp_path / "a.mrc", stack)
+    (tmp_path / "a.aln").write_text(ARETOMO)
+    series = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert series.tilt_angles.tolist() == [-29, 1, 31]
+    np.testing.assert_array_equal(series.images, stack[:3])
+    star = (
+        "data_\nloop_\n_rlnMicrographName #1\n_rlnTomoYTilt #2\n000003@a.mrc 30\n1@a.mrc -30\n2@a.mrc 0\n4@a.mrc 60\n"
+    )
+    (tmp_path / "a.star").write_text(star)
+    assert recon.read_tilt_series(tmp_path / "a.mrc").tilt_angles.tolist() == [-30, 0, 30, 60]
+
+
+@pytest.mark.parametrize("stop", [np.pi / 2, np.pi, 2 * np.pi])
+def test_angles_that_look_like_radians_are_pointed_out(stop: float) -> None:
+    with pytest.warns(UserWarning, match="radians"):
+        recon.TiltSeries(np.random.default_rng(0).random((20, 8, 9)), np.linspace(0, stop, 20, endpoint=False))

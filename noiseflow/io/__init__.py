@@ -8,7 +8,6 @@ from noiseflow.runs.outputs import output_folder as output_folder
 from noiseflow.runs.outputs import require_other as require_other
 from noiseflow.runs.partials import partial_folder as partial_folder
 
-from .alignment import read_transforms as read_transforms
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
@@ -25,6 +24,7 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
-from .imod_commands import parse_views as parse_views
+from .imod import parse_views as parse_views
+from .imod import read_transforms as read_transforms
 from .tilt_axis import tilt_axis_of as tilt_axis_of
 from .tilt_table import TiltTable as TiltTable

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import angles
-from noiseflow.io.image_file import SUFFIXES, ImageFile
+from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile
 from noiseflow.io.tilt_table import TiltTable
 
 _NUMBER = re.compile(r"([-+]*)(\d+(?:\.\d+)?)")
@@ -118,7 +118,8 @@ def files_of(path: str | Path) -> list[Path]:
         return [path]
     if path.suffix.lower() == ".zarr":
         return sorted(file for file in path.rglob("*") if file.is_file())
-    files = [f for f in path.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    plain = [f for f in path.iterdir() if f.is_file() and not f.name.startswith(".")]
+    files = [f for f in plain if f.suffix.lower() in SUFFIXES] or [f for f in plain if f.suffix.lower() == PNG_SUFFIX]
     suffixes = Counter(file.suffix.lower() for file in files).most_common(1)
     return [path / name for name in natural_sorted(f.name for f in files if f.suffix.lower() == suffixes[0][0])]
 

@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".preali", ".rec", ".map"})
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+TIFF_LIKE_SUFFIXES = frozenset({".lsm", ".stk"})
+CAMERA_SUFFIXES = frozenset(
+    {".fits", ".fit", ".fts", ".spe", ".raw", ".bin", ".mat", ".nd2", ".czi", ".oib", ".oif", ".lif", ".sif"}
+)
 MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
 HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".nxs"})
 PACKED_SUFFIXES = frozenset({".gz", ".bz2"})
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
-SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES
+SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | TIFF_LIKE_SUFFIXES | CAMERA_SUFFIXES
 PNG_SUFFIX = ".png"
 """Suffix of PNG files, read as single images. Not in `SUFFIXES`, because PNG files next to data are usually previews."""
 
@@ -32,6 +36,7 @@ class ImageFile:
         tilt_angles: (section,) degrees, or None if the file does not state them.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
         channels: names of the channels, if the file holds several.
+        named: whether the file held several images, of which this one was chosen.
         names: (section,) names of the files of a folder.
         flat, dark: (y, x) mean exposures without a specimen and without a beam, if the file holds them; not applied.
     """
@@ -41,6 +46,7 @@ class ImageFile:
     tilt_angles: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
     channels: tuple[str, ...] = ()
+    named: bool = False
     names: tuple[str, ...] = ()
     flat: NDArray[np.float64] | None = None
     dark: NDArray[np.float64] | None = None

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from noiseflow.installation import install_command
 from noiseflow.io.checks import Unsupported, as_array, choose
 from noiseflow.io.image_file import (
+    CAMERA_SUFFIXES,
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
     PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
+    TIFF_LIKE_SUFFIXES,
     TIFF_SUFFIXES,
     ImageFile,
     VoxelSize,
@@ -34,7 +36,7 @@ _NO_IMAGES = {
     ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
-_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"}
+_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"} | CAMERA_SUFFIXES
 """Suffixes of formats whose readers choose an image by its name."""
 
 
@@ -42,9 +44,10 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, a grey ``.png`` image, or a folder
-            of single images of these formats except PNG; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr``
-            and HDF5. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
+        path: an MRC (``.mrc .mrcs .st .ali .preali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, also packed (``.gz``,
+            ``.bz2``), a grey ``.png`` image, or a folder of single images of these formats, PNG only if there are no others;
+            with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .emi .hspy .zarr`` and HDF5, and the formats of cameras that
+            `noiseflow.io.camera_formats` lists. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
         mapped: memory-map the pixels; changes to the array are not written to the file. Large stacks that cannot be mapped
             (compressed TIFF, HDF5, OME-Zarr) are read in pieces into a temporary file.
         channel: name, or index from zero, of one image or channel of a file that holds several; as ``FILE::NAME``.
@@ -70,14 +73,16 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         return _unpacked(path, member or channel)
     reader = _reader(path, member or wanted, mapped=mapped)
     try:
-        named = path.suffix.lower() in _NAMED
-        image = _one_channel(reader(path), wanted if named and member else member or wanted, named=named)
+        image = reader(path)
+        named = image.named or path.suffix.lower() in _NAMED
+        image = _one_channel(image, wanted if named and member else member or wanted, named=named)
     except PermissionError:
         raise
     except ModuleNotFoundError as error:
+        extra = "camera-formats" if path.suffix.lower() in CAMERA_SUFFIXES else "formats"
         raise ModuleNotFoundError(
             f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            f"install it with: {install_command('formats')}"
+            f"install it with: {install_command(extra)}"
         ) from error
     except Unsupported as error:
         raise error.about(path) from error
@@ -137,7 +142,7 @@ def write(
 
 
 def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
+    from noiseflow.io import camera_formats, hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
 
     suffix = path.suffix.lower()
     if suffix in MICROSCOPE_SUFFIXES:
@@ -152,12 +157,15 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
         )
     if suffix not in SUFFIXES | {PNG_SUFFIX}:
         raise ValueError(
-            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}"
+            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}; of any other "
+            f"image, {camera_formats.EXPORT}"
         )
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
-    if suffix in TIFF_SUFFIXES:
-        return partial(tiff.read, mapped=mapped)
+    if suffix in TIFF_SUFFIXES | TIFF_LIKE_SUFFIXES:
+        return partial(tiff.read, mapped=mapped, member=member)
+    if suffix in CAMERA_SUFFIXES:
+        return partial(camera_formats.read, member=member)
     if suffix == PNG_SUFFIX:
         return png.read
     return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)

@@ -40,10 +40,12 @@ def read(path: Path) -> TiltTable:
     sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
     axes = _numbers(table, _AXES, path)
     size = None if sizes is None else float(sizes[0])
-    names = next((tuple(table[name]) for name in _NAMES if name in table), ())
+    names = next((table[name] for name in _NAMES if name in table), [])
+    sections = [int(number) for name in names if (number := name.partition("@")[0]).isdigit() and "@" in name]
     return TiltTable(
         angles,
-        tuple(name.rpartition("@")[2] for name in names) if len({n.rpartition("@")[2] for n in names}) > 1 else (),
+        () if sections else tuple(names),
+        np.array(sections, dtype=np.int64) - 1 if sections and len(sections) == len(names) else None,
         transforms=None if size is None else _transforms(table, size, path),
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),

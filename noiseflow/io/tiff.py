@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, exactly_as, require_room
+from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.units import in_angstrom
+from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
@@ -27,15 +27,21 @@ _FINEST_PRINT = 2e5
 """Å: programs set 72 to 1200 dots per inch, 21 µm and more, without knowing the scale; pixels of microscopes are smaller."""
 
 
-def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the first series of a TIFF file. If `mapped`, memory-map it, or a temporary copy if it is compressed."""
+def read(path: Path, *, mapped: bool = False, member: str | None = None) -> ImageFile:
+    """Read the largest series, such as a position, of a TIFF file.
+
+    Args:
+        path: the file.
+        mapped: memory-map the pixels, or a temporary copy if the file is compressed.
+        member: name or index of the series, if several have the largest size.
+    """
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
         pages = _pages(tiff)
         compressed = any(getattr(page, "compression", 1) != 1 for page in pages)
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
-        series = tiff.series[0]
+        series, several = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
         if "S" in series.axes:
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
@@ -44,7 +50,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
             data = _inverted(data, series.pages[0], path)
         voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
         data, channels = _channels_first(data, series.axes, _channel_names(tiff))
-    return ImageFile(data, voxel_size, channels=channels)
+    return ImageFile(data, voxel_size, channels=channels, named=several)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -78,6 +84,16 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata, software=signature())
     return data
+
+
+def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
+    """The chosen series, and whether there were others of its size to choose from."""
+    most = max(one.size for one in tiff.series)
+    largest = [one for one in tiff.series if one.size == most]
+    names = [one.name or str(index) for index, one in enumerate(largest)]
+    names = names if len(set(names)) == len(names) else [str(index) for index in range(len(names))]
+    several = len(largest) > 1
+    return largest[choose(names, member, "positions") if several else 0], several
 
 
 def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:

@@ -103,11 +103,11 @@ class Alignment:
         """The alignment whose images are shifted: a position p (y, x) in them shows what was at p + `moves`, (tilt, 2)."""
         return replace(self, shifts=self.shifts + np.einsum("tij,tj->ti", self._back, moves))
 
-    def joined(self, tilt_series: TiltSeries) -> Alignment:
-        """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
+    def order_of(self, tilt_series: TiltSeries) -> list[int]:
+        """For each tilt of a series, the index of the tilt of this alignment with the same angle; full turns do not matter.
 
         Raises:
-            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
+            ValueError: a tilt of the series is not in the alignment.
         """
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
@@ -126,8 +126,23 @@ class Alignment:
                 f"{self.tilt_angles.min():g}° to {self.tilt_angles.max():g}°, and the series has {len(angles)}; give the "
                 "alignment of these tilts, or --exclude-views"
             )
+        return order
+
+    def joined(self, tilt_series: TiltSeries) -> Alignment:
+        """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
+
+        Raises:
+            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
+        """
+        order = self.order_of(tilt_series)
         stretches, refined = (None if each is None else each[order] for each in (self.stretches, self.refined_angles))
-        here = replace(self, shifts=self.shifts[order], tilt_angles=angles, stretches=stretches, refined_angles=refined)
+        here = replace(
+            self,
+            shifts=self.shifts[order],
+            tilt_angles=tilt_series.tilt_angles,
+            stretches=stretches,
+            refined_angles=refined,
+        )
         return here.scaled(self._factor(tilt_series))
 
     def _factor(self, tilt_series: TiltSeries) -> float:

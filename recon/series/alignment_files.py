@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
+_AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
 
 
@@ -106,6 +108,7 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     table = _xf_with_angles(path, tilt_series) if path.suffix.lower() == ".xf" else io.read_tilts(path)
     if table.transforms is None:
         raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
+    table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
     known: dict[str, Any] = {"image_shape": table.image_shape, "pixel_size": table.pixel_size}
     if binning is not None:
         if not 0 < binning < np.inf:
@@ -126,6 +129,11 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     table = table.rows([rows[int(views[tilt])] for tilt in used])
     refined = None if np.isnan(table.angles).any() else table.angles
     raw = tilt_series.tilt_angles[used]
+    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > _AS_WRITTEN:
+        warnings.warn(
+            f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
+            stacklevel=3,
+        )
     return Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
 
 
