@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
 from noiseflow.io.checks import SeveralImages, Unsupported, as_array, choose
-from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
 from noiseflow.io.image_file import (
     CAMERA_SUFFIXES,
     HDF5_SUFFIXES,
@@ -28,6 +27,7 @@ from noiseflow.io.image_file import (
     VoxelSize,
     numbered,
 )
+from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.ownership import signature
 from noiseflow.io.tilt_axis import axis_in_titles
+from noiseflow.runs.ownership import signature
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}

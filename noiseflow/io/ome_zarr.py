@@ -17,7 +17,7 @@ from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
 from noiseflow.io.metadata import in_angstrom
-from noiseflow.io.ownership import MARK
+from noiseflow.runs.ownership import MARK
 
 _SMALLEST_EDGE = 64
 _CHUNK = 128

@@ -13,7 +13,7 @@ from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom
-from noiseflow.io.ownership import signature
+from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from tifffile import TiffFile

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.io.ownership import signature
+from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
 
