@@ -62,6 +62,7 @@ class PaperField(CoordinateNetwork):
     """
 
     relative_rate = 0.005
+    step_cost = 500.0  # 72 times the products of the sine network
 
     def __init__(
         self,
