@@ -62,7 +62,8 @@ class PaperField(CoordinateNetwork):
     """
 
     relative_rate = 0.005
-    step_cost = 500.0  # 72 times the products of the sine network
+    # 72 times the products of the sine network
+    step_cost = 500.0
 
     def __init__(
         self,

@@ -116,6 +116,17 @@ class CoordinateNetwork(Field):
                 optimiser.step()
         optimiser.zero_grad()
 
+    @property
+    def has_coarser(self) -> bool:
+        return True
+
+    def coarser(self) -> Field | None:
+        """The same network on half as many voxels along each axis."""
+        half = [(size + 1) // 2 for size in (self.depth, self.height, self.width)]
+        field = type(self)(half, scale=2 * float(self.scale), **self.config()).to(self.scale.device)
+        field.network = self.network
+        return field
+
     def units(self) -> Tensor:
         everywhere = torch.arange(self.depth * self.width * self.height, device=self.scale.device)
         return self.of_voxels(everywhere).view(self.depth, self.width, self.height)
