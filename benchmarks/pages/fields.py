@@ -19,13 +19,13 @@ import torch
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.scenes import Results, Scene, make_scene
+from benchmarks.scenes import EMPTY, Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
 from recon.fields._registry import field_kinds
-from recon.joint.field_choice import choose_field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
+from recon.methods import reconstruct
 
 _FULL = "-59.5:57.5:1.5"
 SCENES: dict[str, dict[str, Any]] = {
@@ -42,14 +42,15 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 _SIZE = 48
 _WEIGHT = 0.4  # near the best of all scenes
-_EMPTY = "empty volume"
-KINDS = (_EMPTY, "grids", "gaussians", "network", "auto")
+_CLASSICAL = ("wbp", "sirt")
+KINDS = (EMPTY, *_CLASSICAL, "grids", "gaussians", "network")
 _HEAD = f"""# Fields
 
-PSNR of volume / projections (at angles between the tilts), dB, affinely matched, for volumes made of grids, of Gaussians, or
-of a sine network (`--field`). Scenes of {_SIZE}³ with the true noise and a weight of {_WEIGHT:g}, one fit each: differences below
-0.2 dB are scatter. The first column is the score of an empty volume, which a method has to exceed. `auto` names the field with
-the highest likelihood of held-out pixels on the slab, and how far the others are behind, in nats per pixel.
+PSNR of volume / projections (at angles between the tilts), dB, affinely matched, for the classical methods, and for volumes made
+of grids, of Gaussians, or of a sine network (`--field`), from many tilts and from few. Scenes of {_SIZE}³ with the true noise and a weight of {_WEIGHT:g}, one fit each: differences below
+0.2 dB are scatter. The first column is the score of an empty volume, which a method has to exceed. The last column
+names the field that predicts held-out pixels best, as `--field auto` takes it on the slab, and how far the others are behind,
+in nats per pixel.
 
 Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."""
 _NOT_RUN = """## Not measured
@@ -66,12 +67,10 @@ def scene_of(name: str) -> Scene:
 
 def measure(scene: Scene, kind: str) -> Row:
     """One row: scores, parameters, steps and held-out likelihood."""
-    if kind == _EMPTY:
+    if kind == EMPTY:
         return _scores(scene, np.zeros_like(scene.truth))
-    fit = JointReconstructor(weight=_WEIGHT, noise_model=lambda: scene.noise_model)
-    if kind == "auto":
-        choice = choose_field(fit, scene.noisy, scene.grid, field_kinds("auto"))
-        return {"chosen": choice.name, "tried": choice.tried, "slices": choice.slices}
+    if kind in _CLASSICAL:
+        return _scores(scene, reconstruct(scene.noisy, scene.grid, method=kind).volume.attenuation)
     make = next(iter(field_kinds(kind).values()))
     result = JointReconstructor(weight=_WEIGHT, noise_model=lambda: scene.noise_model, make_field=make)(scene.noisy)
     assert result.field is not None
@@ -88,15 +87,17 @@ def _scores(scene: Scene, volume: Any) -> Row:
 
 def page(content: dict[str, Any]) -> str:
     """The page as Markdown."""
-    cells, kinds = content["cells"], KINDS[:-1]
-    lines = [_HEAD, "", f"| scene | {' | '.join(kinds)} | auto |", "|---" * (len(kinds) + 2) + "|"]
+    cells = content["cells"]
+    lines = [_HEAD, "", f"| scene | {' | '.join(KINDS)} | preferred |", "|---" * (len(KINDS) + 2) + "|"]
     for name in SCENES:
-        row = [_text(cells.get(f"{name}/{kind}")) for kind in kinds]
-        if any(row):
-            lines.append(f"| {name} | {' | '.join(row)} | {_choice(cells.get(f'{name}/auto'))} |")
-    counts = {kind: next((cells[key] for key in cells if key.endswith(f"/{kind}")), None) for kind in kinds[1:]}
+        rows = {kind: cells.get(f"{name}/{kind}") for kind in KINDS}
+        if any(rows.values()):
+            lines.append(f"| {name} | {' | '.join(map(_text, rows.values()))} | {_preferred(rows)} |")
+    counts = {kind: next((cells[key] for key in cells if key.endswith(f"/{kind}")), None) for kind in KINDS}
     lines += ["", "| field | parameters | steps |", "|---|---|---|"]
-    lines += [f"| {kind} | {row['parameters']} | {row['steps']} |" for kind, row in counts.items() if row]
+    lines += [
+        f"| {kind} | {row['parameters']} | {row['steps']} |" for kind, row in counts.items() if row and "steps" in row
+    ]
     return "\n".join([*lines, "", _NOT_RUN, "", measured_on([content]), ""])
 
 
@@ -104,12 +105,13 @@ def _text(row: Row | None) -> str:
     return "" if row is None else f"{row['volume']:.2f} / {row['projections']:.2f}"
 
 
-def _choice(row: Row | None) -> str:
-    if row is None:
+def _preferred(rows: dict[str, Row]) -> str:
+    """The field with the lowest held-out negative log-likelihood, and how far the others are above it."""
+    nll = {kind: row["held-out"] for kind, row in rows.items() if row and "held-out" in row}
+    if len(nll) < 2:
         return ""
-    lowest = row["tried"][row["chosen"]]
-    rest = ", ".join(f"{name} {nll - lowest:+.4f}" for name, nll in row["tried"].items() if name != row["chosen"])
-    return f"{row['chosen']} ({rest})"
+    first = min(nll, key=lambda kind: nll[kind])
+    return f"{first} ({', '.join(f'{kind} {nll[kind] - nll[first]:+.4f}' for kind in nll if kind != first)})"
 
 
 def main() -> None:
