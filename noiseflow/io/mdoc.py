@@ -5,15 +5,19 @@ Source: https://bio3d.colorado.edu/SerialEM/hlp/html/about_formats.htm
 
 from __future__ import annotations
 
+import contextlib
 import re
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
+_TIMES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S")
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
 
 
@@ -48,7 +52,27 @@ def read(path: Path) -> TiltTable:
         np.array([_number(section["tiltangle"], path) for section in told], dtype=np.float64),
         tuple(names) if all(names) else (),
         pixel_size=(_number(spacings[0], path) or None) if spacings else None,
+        acquired=_acquired(told),
     )
+
+
+def _acquired(sections: list[dict[str, str]]) -> NDArray[np.float64] | None:
+    """The dose before each image, or else its time; None if a section has neither, or all are equal."""
+    for name, read in (("priorrecorddose", number), ("datetime", _seconds)):
+        try:
+            found = np.array([read(section[name]) for section in sections], dtype=np.float64)
+        except (KeyError, ValueError):
+            continue
+        if len(np.unique(found)) > 1:
+            return found
+    return None
+
+
+def _seconds(text: str) -> float:
+    for form in _TIMES:
+        with contextlib.suppress(ValueError):
+            return datetime.strptime(text.strip(), form).replace(tzinfo=UTC).timestamp()
+    raise ValueError(text)
 
 
 def _number(text: str, path: Path) -> float:
