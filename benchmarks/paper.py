@@ -27,7 +27,7 @@ PUBLISHED: dict[str, tuple[float, float, float, float, float]] = {
 """2D PSNR (dB), 100·MSE and 10·DSSIM, 3D PSNR and 100·MSE, as printed, except that MSE and DSSIM of the last five rows are
 exchanged: in print their columns are swapped (10·log10 of the printed DSSIM/100 is the printed PSNR)."""
 
-METHODS = (EMPTY, *PUBLISHED, "oracle")
+METHODS = (*PUBLISHED, "oracle", EMPTY)
 _CLEAN = 0.02  # initial weight of the search for data without noise
 CLEAN_STEPS = 4 * STEPS  # without noise a fit improves for much longer
 

@@ -46,11 +46,11 @@ _CLASSICAL = ("wbp", "sirt")
 KINDS = (EMPTY, *_CLASSICAL, "grids", "gaussians", "network")
 _HEAD = f"""# Fields
 
-PSNR of volume / projections (at angles between the tilts), dB, affinely matched, for the classical methods, and for volumes made
-of grids, of Gaussians, or of a sine network (`--field`), from many tilts and from few. Scenes of {_SIZE}³ with the true noise and a weight of {_WEIGHT:g}, one fit each: differences below
-0.2 dB are scatter. The first column is the score of an empty volume, which a method has to exceed. The last column
-names the field that predicts held-out pixels best, as `--field auto` takes it on the slab, and how far the others are behind,
-in nats per pixel.
+PSNR of volume / projections (at angles between the tilts), dB, affinely matched, for the classical methods, and for volumes
+made of grids, of Gaussians, or of a sine network (`--field`), from many tilts and from few. Scenes of {_SIZE}³ with the true
+noise and a weight of {_WEIGHT:g}, one fit each: differences below 0.2 dB are scatter. The first column is the score of an empty
+volume, which a method has to exceed. The last column names the field that predicts held-out pixels best, as `--field auto`
+takes it on the slab, and how far the others are behind, in nats per pixel.
 
 Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."""
 _NOT_RUN = """## Not measured

@@ -167,7 +167,7 @@ class _Splatting(torch.autograd.Function):
     def forward(ctx: Any, exponents: Tensor, nearest: Tensor, radius: Tensor, shape: tuple[int, int, int]) -> Tensor:
         margin = int(radius.max())
         padded = exponents.new_zeros([size + 2 * margin for size in shape])
-        for chosen, monomials, places in _windows(nearest, radius, padded.shape, margin):
+        for chosen, monomials, places in _windows(nearest, radius, padded, margin):
             values = torch.exp_(exponents[chosen] @ monomials)
             padded.view(-1).index_add_(0, places.view(-1), values.view(-1))
         ctx.save_for_backward(exponents, nearest, radius)
@@ -179,7 +179,7 @@ class _Splatting(torch.autograd.Function):
         exponents, nearest, radius = ctx.saved_tensors
         margin, found = ctx.margin, torch.empty_like(exponents)
         padded = functional.pad(gradient, [margin] * 6)
-        for chosen, monomials, places in _windows(nearest, radius, padded.shape, margin):
+        for chosen, monomials, places in _windows(nearest, radius, padded, margin):
             values = torch.exp_(exponents[chosen] @ monomials)
             values.mul_(padded.view(-1)[places])
             found[chosen] = values @ monomials.T
@@ -192,17 +192,15 @@ def _inner(padded: Tensor, margin: int) -> Tensor:
     return padded
 
 
-def _windows(
-    nearest: Tensor, radius: Tensor, shape: Sequence[int], margin: int
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def _windows(nearest: Tensor, radius: Tensor, padded: Tensor, margin: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Some Gaussians with windows of equal size: their indices (n,), the monomials (10, K) of the offsets, and the flat places
-    (n, K) in a grid of this shape whose first voxel is at −margin."""
-    strides = nearest.new_tensor([shape[1] * shape[2], shape[2], 1])
+    (n, K) in the padded grid, whose first voxel is at −margin."""
+    strides = nearest.new_tensor(padded.stride())
     base = ((nearest + margin) * strides).sum(-1)
     for size in torch.unique(radius).tolist():
         span = torch.arange(-size, size + 1, device=nearest.device)
         offsets = torch.stack(torch.meshgrid(span, span, span, indexing="ij"), -1).view(-1, 3)
-        monomials = _monomials(offsets.to(torch.get_default_dtype()))
+        monomials = _monomials(offsets.to(padded.dtype))
         across = (offsets * strides).sum(-1)
         for chosen in torch.split((radius == size).nonzero()[:, 0], max(1, _VALUES_TOGETHER // len(offsets))):
             yield chosen, monomials, base[chosen, None] + across
