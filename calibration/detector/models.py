@@ -46,7 +46,11 @@ FLEXIBLE = ("mixture", "flow", "spline", "physics-flow")
 """Models with thousands of parameters."""
 
 NUM_STEPS = 200
-"""Number of optimisation steps per model."""
+"""Number of optimisation steps per flexible model."""
+
+FEW_STEPS = {"gaussian": 0, "poisson": 0, "poisson-gaussian": 20, "signal-gaussian": 60}
+"""Number of optimisation steps of simple models, which start at or near their maximum; more steps change the likelihood by less
+than 5e-4 nats."""
 
 MOST_PIXELS = 32_768
 """Largest number of pixels for the fits, equal to that of the selector."""
@@ -303,6 +307,7 @@ def _fitted(
     import torch
 
     import noiseflow
+    from noiseflow.fitting.fit import fit
     from noiseflow.fitting.selection import select
 
     torch.manual_seed(seed)
@@ -320,6 +325,12 @@ def _fitted(
     candidates = {
         name: getattr(noiseflow, KINDS[name])(**options[name]).to(device) for name in names if name not in found
     }
+    for name in [name for name in candidates if name in FEW_STEPS]:
+        few = candidates.pop(name)
+        few = noiseflow.Digitised(few, *digitisation) if digitisation.found else few
+        generator = torch.Generator().manual_seed(seed)
+        fit(few, signal, observation, num_steps=FEW_STEPS[name], digitise=False, generator=generator)
+        found[name] = few
     if candidates:
         selection = select(signal, observation, candidates=candidates, num_steps=NUM_STEPS, seed=seed)
         found |= {one.name: one.model for one in selection.candidates}
