@@ -15,6 +15,7 @@ from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
+from recon.series.masks import plausible
 from recon.series.matching import Match, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
@@ -270,7 +271,7 @@ def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
 
 def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     """Images as line integrals, of order one."""
-    lowered, _ = without_level(tilt_series)
+    lowered, _ = without_level(plausible(tilt_series))
     integrals = estimate_response(lowered).invert(torch.from_numpy(lowered.images)).detach()
     return integrals / integrals.std().clamp_min(1e-30)
 

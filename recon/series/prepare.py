@@ -18,6 +18,7 @@ from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
 from recon.series.dual_axis import stacked
+from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.registration import Registration, register
 from recon.series.screening import Screening, require_specimen, screen
@@ -132,7 +133,7 @@ def prepare(
             device=device,
             progress=progress,
         )
-    guard = Guard()
+    guard, tilt_series = Guard(), plausible(tilt_series)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:

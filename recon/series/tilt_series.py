@@ -84,6 +84,8 @@ class TiltSeries:
             )
         if self.beam is not None and (self.beam.shape != self.tilt_angles.shape or not (self.beam > 0).all()):
             raise ValueError(f"beam needs one positive number for each of the {len(self.images)} tilts")
+        if self.mask is not None and not self.mask.any():
+            raise ValueError("the mask excludes every pixel; it must be True for pixels to use")
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
@@ -371,6 +373,7 @@ def _masked(
     if bad and not mask_nan:
         raise ValueError(f"{name} has {bad} NaN or infinite pixels, the first at {first}; exclude them with --mask-nan")
     if use.all():
+        warnings.warn(f"the mask of {name} excludes no pixel; pixels to exclude must be 0 in a mask file", stacklevel=3)
         return images, None
     if not use.any():
         raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
@@ -390,11 +393,10 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
     return np.asarray(image[tuple(nearest)])
 
 
-def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of pixels, image by image; incomplete blocks are dropped, evenly at both edges."""
-    top, left = images.shape[1] % down // 2, images.shape[2] % across // 2
-    inner = (image[top:, left:].astype(np.float64) for image in images)
-    return np.stack([statistics.block_means(image, down, across).astype(np.float32) for image in inner])
+def block_mean(image: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
+    """Means of blocks of pixels of an image (y, u); incomplete blocks are dropped, evenly at both edges."""
+    inner = image[image.shape[0] % down // 2 :, image.shape[1] % across // 2 :].astype(np.float64)
+    return statistics.block_means(inner, down, across).astype(np.float32)
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:

@@ -15,8 +15,9 @@ from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
 from recon.series.dual_axis import about, own_images
 from recon.series.first_guess import contrast_slab
+from recon.series.masks import coarse
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, block_means, evenly
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, evenly
 from recon.verdict import continuity, fits, pixels, tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -92,17 +93,21 @@ class Case:
         """Predictions of held-out gaps of tilts."""
         return Geometry(self.coarse)
 
+    def _integrals(self, images: Array) -> tuple[Array, Array]:
+        """Coarse line integrals and mask of any images of the series."""
+        tilts = evenly(self.coarse.tilts, len(images))
+        return line_integrals(self.series.select(self.coarse.tilts), images[tilts], self.coarse.binning)
+
     @cached_property
     def gap(self) -> Unexplained:
         """Unexplained structure of held-out gaps."""
-        return unexplained(self.coarse.images, self.geometry.errors)
+        return unexplained(self.coarse.centred_on_all, self.geometry.errors)
 
     @cached_property
     def own_gap(self) -> Unexplained:
         """The same for the projections of the volume, which are consistent with each other."""
-        some = self.series.select(self.coarse.tilts)
-        own = line_integrals(some, self.expected[evenly(self.coarse.tilts, len(self.expected))], self.coarse.binning)
-        return unexplained(own, self.geometry.fit.errors(own))
+        own, used = self._integrals(self.expected)
+        return unexplained((own - own[used].mean()) * used, self.geometry.fit.errors(own, used))
 
 
 def _of_pixels(check: Callable[[TiltSeries, Array, Residuals], Part]) -> Callable[[Case], Part]:
@@ -112,8 +117,7 @@ def _of_pixels(check: Callable[[TiltSeries, Array, Residuals], Part]) -> Callabl
 def _contrast(case: Case) -> Part:
     """Whether a coarse non-negative volume explains the images better with inverted contrast."""
     tilt_series = case.series
-    height, width = tilt_series.images.shape[1:]
-    small = replace(tilt_series, images=block_means(tilt_series.images, -(-height // 16), -(-width // 32)), mask=None)
+    small = coarse(tilt_series, height=16, width=32)
     as_given, swapped = explained(small), explained(invert_contrast(small))
     evidence = {"contrast": {"as given": as_given, "swapped": swapped}}
     if swapped < as_given + _CONTRAST:
