@@ -16,7 +16,8 @@ from benchmarks.network import WIDTHS, fit_network
 from benchmarks.scenes import Cell, Results, Scene, make_scene
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
-from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.voxels import VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace
 from recon.joint.run import RunFit, run_fit

@@ -1,6 +1,5 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
-from .alignment import read_transforms as read_transforms
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
@@ -22,7 +21,8 @@ from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
-from .imod_commands import parse_views as parse_views
+from .imod import parse_views as parse_views
+from .imod import read_transforms as read_transforms
 from .lock import locked as locked
 from .partials import partial_folder as partial_folder
 from .tilt_axis import tilt_axis_of as tilt_axis_of

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text, aretomo, imod_commands, mdoc, star
+from noiseflow.io import angle_text, aretomo, imod, mdoc, star
 from noiseflow.io.image_file import ImageFile
 from noiseflow.io.tilt_table import LARGEST_ANGLE as LARGEST_ANGLE
 from noiseflow.io.tilt_table import TiltTable
@@ -20,7 +20,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".star": star.read,
     ".tomostar": star.read,
     ".aln": aretomo.read,
-    ".com": imod_commands.read,
+    ".com": imod.read,
 }
 """Readers by suffix; other files are lists of angles."""
 
@@ -105,7 +105,7 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
     else:
         table = read_tilts(file)
         table = table.rows(_joined(table, image, file, Path(stack)))
-    return table if angles is not None else imod_commands.adjusted(table, Path(stack), bare_stem(Path(stack)))
+    return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
 
 def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list[int]:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.metadata import in_degrees, recorded_angles
-from noiseflow.io.units import in_angstrom
+from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
 
 _FLATS = re.compile(r"/(data_white|data_flat|flats?|flat_?fields?|white)$", re.IGNORECASE)
 _DARKS = re.compile(r"/(data_dark|darks?|dark_?fields?)$", re.IGNORECASE)

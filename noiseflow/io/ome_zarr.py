@@ -16,8 +16,8 @@ from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
+from noiseflow.io.metadata import in_angstrom
 from noiseflow.io.ownership import MARK
-from noiseflow.io.units import in_angstrom
 
 _SMALLEST_EDGE = 64
 _CHUNK = 128

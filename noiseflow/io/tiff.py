@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.metadata import in_angstrom
 from noiseflow.io.ownership import signature
-from noiseflow.io.units import in_angstrom
 
 if TYPE_CHECKING:
     from tifffile import TiffFile

@@ -78,8 +78,11 @@ class VolumeRun:
         slices_at_once, method = self.slices_at_once, self.options["method"]
         if slices_at_once is None and series.axes is None:
             many = self.workers if self.scheduler is None else 2
-            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many)
-        memory = memory_line(series, grid, method, self.device, slices_at_once, self.workers or 1)
+            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=options["field"])
+        targets.check(series, slices_at_once)
+        memory = memory_line(
+            series, grid, method, self.device, slices_at_once, self.workers or 1, field=options["field"]
+        )
         output.line(memory)
         disk = disk_line(series, grid, slices_at_once, error_bars=options["uncertainty"] > 0, halves=self.fsc)
         if slices_at_once is not None or self.dry_run:
