@@ -192,12 +192,14 @@ def _calibrate_camera(
 
 def summary(findings: Findings) -> dict[str, Any]:
     """Return the findings as plain values: ``verdict``, ``reasons``, ``detector``, ``registration``, ``models``, ``burst``."""
+    from calibration.detector.models import foremost
+
     found: dict[str, Any] = {
         "verdict": findings.verdict.grade,
         "reasons": [vars(reason) for reason in findings.verdict.reasons],
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
-        "models": {score.name: _figures(score) for score in findings.scores},
+        "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
     }
     if findings.burst is not None:
         found["burst"] = vars(findings.burst)
@@ -279,8 +281,15 @@ def _registration(pair: AlignedPair) -> dict[str, Any]:
     return values | scaling | {"structured_share": structured_share(pair), "masked": vars(pair.counts)}
 
 
-def _figures(score: ModelScore) -> dict[str, Any]:
-    judged, overall = score.evaluation, score.evaluation.overall
+def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
     likelihood = {name: getattr(score, name) for name in ("nll", "nll_error", "excess", "excess_error")}
+    if not compared:
+        return likelihood
+    judged, overall = score.evaluation, score.evaluation.overall
     by_signal = {"jsd_by_signal": judged.mean_jsd, "jsd_by_signal_floor": judged.mean_jsd_floor}
-    return likelihood | vars(overall) | by_signal | {"ks": judged.ks, "ks_floor": judged.ks_floor}
+    return (
+        likelihood
+        | vars(overall)
+        | by_signal
+        | {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
+    )
