@@ -309,9 +309,9 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
 
 
 def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
-    """Return the simplest sufficient model and the likeliest one; the histograms of the others need no comparison."""
+    """Return the simplest sufficient model, the likeliest one and that of the measured detector, whose histograms are compared."""
     chosen = simplest_sufficient(scores)
-    return [score for score in scores if score is chosen or score.excess == 0]
+    return [score for score in scores if score is chosen or score.excess == 0 or score.name == "poisson-gaussian"]
 
 
 def heavy_tailed(model: nn.Module, pixels: Pixels) -> bool:
