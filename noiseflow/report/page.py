@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from noiseflow.described import printable
 from noiseflow.io import atomic_path, check_output
-from noiseflow.io.ownership import signature
 from noiseflow.report.charts import themed_svg
+from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -29,6 +29,7 @@ from recon.verdict.image_findings import image_findings
 from recon.verdict.limits import cliff, saturation
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharpness_findings
+from recon.verdict.size_findings import size_findings
 from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
@@ -174,6 +175,7 @@ CHECKS: dict[str, Callable[[Case], Part]] = {
     "tilts unlike the others": lambda case: tilts.foreign(case.coarse, case.geometry.errors),
     "single tilts": lambda case: continuity.single_tilts(case.coarse, case.geometry.single_errors()),
     "breaks": lambda case: continuity.breaks(case.coarse),
+    "size of the specimen": lambda case: size_findings(case.series),
     "excluded tilts": lambda case: tilts.screened(case.screening),
     **{name: _of_pixels(check) for name, check in PIXELS.items()},
     "sharpness": lambda case: sharpness_findings(case.series, case.residuals),
