@@ -309,7 +309,7 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
 
 
 def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
-    """Return the simplest sufficient model, the likeliest one and that of the measured detector, whose histograms are compared."""
+    """Return the models whose histograms are compared: the simplest sufficient one, the likeliest one, the Poisson-Gaussian."""
     chosen = simplest_sufficient(scores)
     return [score for score in scores if score is chosen or score.excess == 0 or score.name == "poisson-gaussian"]
 
