@@ -183,8 +183,16 @@ def file_stem(name: str) -> str:
 
 
 def angle_file_of(stack: str | Path) -> Path | None:
-    """The angle file that `tilts_of` uses; None if there is none."""
-    return next((candidate for candidate in candidates(stack) if _is_table(candidate)), None)
+    """The angle file that `tilts_of` uses; None if there is none. Suffixes may be in capitals."""
+    found: dict[Path, dict[str, Path]] = {}
+    for candidate in candidates(stack):
+        folder = candidate.parent
+        if folder not in found:
+            found[folder] = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        file = candidate if candidate.is_file() else found[folder].get(candidate.name.lower())
+        if file is not None and _is_table(file):
+            return file
+    return None
 
 
 def _is_table(file: Path) -> bool:

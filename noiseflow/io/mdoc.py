@@ -17,6 +17,8 @@ from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
+_OTHER = re.compile(r"\s*\[\s*(?!t\s*=)\w+\s*=.*\]\s*", re.IGNORECASE)
+"""Sections that are no images, such as those of montages; titles (``[T = …]``) belong to no section."""
 _TIMES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S")
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
 
@@ -35,17 +37,18 @@ def read(path: Path) -> TiltTable:
     for line in lines:
         if header := _SECTION.fullmatch(line):
             kind, value = header[1].lower(), header[2]
-            place = number(value) if kind == "zvalue" else 0.0
+            place = _number(value, path) if kind == "zvalue" else 0.0
             current = {} if kind != "image" else {"imagefile": value}
             sections[place, 0 if kind == "zvalue" else len(sections)] = current
+        elif _OTHER.fullmatch(line):
+            current = {}
         elif entry := _ENTRY.fullmatch(line):
             current[entry[1].lower()] = entry[2]
     found = [sections[place] for place in sorted(sections)]
     told = [section for section in found if "tiltangle" in section]
     if told and len(told) < len(found):
-        raise ValueError(
-            f"{path}: section {found.index({}) if {} in found else 'one'} has no TiltAngle; complete the file"
-        )
+        bare = next(count for count, section in enumerate(found) if "tiltangle" not in section)
+        raise ValueError(f"{path}: section {bare} has no TiltAngle, although others have; complete the file")
     names = [section.get("subframepath") or section.get("imagefile") or "" for section in told]
     spacings = [value for each in (common, *told) if (value := each.get("pixelspacing"))]
     return TiltTable(

@@ -280,7 +280,7 @@ def read_tilt_series(
     size = _pixel_size(pixel_size, image_file, table, path)
     excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
     views = np.setdiff1d(np.arange(count), sorted(excluded))
-    if len(views) < 2:
+    if excluded and len(views) < 2:
         raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
     if mask is not None and mask.shape == image_file.data.shape:
         mask = mask[views]
