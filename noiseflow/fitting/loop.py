@@ -20,9 +20,9 @@ from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.progress import Progress
 from noiseflow.threads import few_threads
 
-Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
@@ -134,7 +134,7 @@ class FitLoop:
                 if not joint and self._never_improves(schedule):
                     break
                 if progress is not None:
-                    progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
+                    progress("fit", step, num_steps, f"held-out NLL {self.result.held_out_nll:.4f}")
         except KeyboardInterrupt:
             if checkpoint is not None:
                 checkpoint(self.state())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -16,13 +16,11 @@ from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.fitting.selection import simplest_sufficient
 from noiseflow.models.wrapper import as_noise_model
+from noiseflow.progress import Progress
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
 from recon.joint.weight import WeightChoice, choose_weight
-
-Progress = Callable[[int, int, str], None]
-"""``progress(steps done, steps expected, note)``."""
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
@@ -71,7 +69,7 @@ class Runner:
         run_fit: runs every fit.
         prefix: prefix of the names of fits.
         expected: expected steps of the whole plan.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
 
     Attributes:
         weight_choice: the compared weights, after the comparison.
@@ -242,10 +240,10 @@ class Runner:
     ) -> FitResult:
         begun = self._done
 
-        def report(step: int, note: str) -> None:
+        def report(_: str, step: int, __: int, note: str) -> None:
             self._done = begun + step
             if self.progress is not None:
-                self.progress(self._done, max(self._expected, self._done), f"{name}, {note}")
+                self.progress("reconstructing", self._done, max(self._expected, self._done), f"{name}, {note}")
 
         options |= {"mask": task.use, "held_out": task.held_out, "generator": self.generator, "batch_size": _BATCH}
         result = self.run_fit(

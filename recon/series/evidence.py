@@ -12,7 +12,7 @@ from torch import Tensor
 
 from recon.projection.defocused_projector import gaussian_matrix
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
-from recon.series.views import view_numbers
+from recon.series.views import Directions, view_numbers
 
 _GAP = 15.0  # degrees; closer neighbours predict each other for any axis
 _FEWEST_GAPS = 5  # three between the outer two, the smallest number with a spread
@@ -91,14 +91,16 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
     which smooth the noise least and fit it best, would be preferred. The outer gaps are held out like the others, but are not
     counted, because they are extrapolated.
     """
-    angles = np.asarray(matcher.projector.tilt_angles)
-    gaps, view = _gaps(angles), _View.of(matcher, found)
-    unexplained, unchanged = np.zeros((2, len(angles)))
+    directions = Directions.of(np.asarray(matcher.projector.tilt_angles))
+    gaps, view = _gaps(directions.angles), _View.of(matcher, found)
+    mirrored = torch.from_numpy(directions.mirrored).to(view.images.device)[:, None, None]
+    facing = torch.where(mirrored, view.images.flip(2), view.images)
+    unexplained, unchanged = np.zeros((2, len(gaps)))
     for fold in range(_FOLDS):
         out = gaps % _FOLDS == fold
-        across = torch.from_numpy(_interpolation(angles, out)).to(view.images)
+        across = torch.tensordot(torch.from_numpy(_interpolation(directions.angles, out)).to(facing), facing, 1)
         unexplained[out] = view.errors(view.predicted_without(out))[out]
-        unchanged[out] = view.errors(torch.tensordot(across, view.images, 1))[out]
+        unchanged[out] = view.errors(torch.where(mirrored, across.flip(2), across))[out]
     conserved = _unconserved(view.images, view.seen)
     return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, gaps)
 

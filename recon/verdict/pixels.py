@@ -109,15 +109,11 @@ def streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, A
     return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
 
-def borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def borders(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Borders of single images with a constant value, unlike the adjacent pixels, as left by an alignment."""
-    if tilt_series.mask is not None:  # borders are masked
-        return {}, []
     span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
-    sides = [
-        images.transpose(0, 2, 1),
-        images.transpose(0, 2, 1)[:, ::-1],
-    ]  # (tilt, lines from the side, pixels along it)
+    seen = np.where(residuals.used, images, np.nan)  # what is masked was filled on purpose
+    sides = seen.transpose(0, 2, 1), seen.transpose(0, 2, 1)[:, ::-1]  # (tilt, lines from the side, pixels along it)
     filled = np.mean([_filled(side, span) for side in sides], axis=0)
     share = float((filled > 0).mean())
     evidence = {"filled borders": share}

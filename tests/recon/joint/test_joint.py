@@ -8,7 +8,7 @@ import torch
 
 import noiseflow
 from benchmarks import needle as benchmark_needle
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.joint.candidates import Readings, noise_candidates
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import total_steps
@@ -40,7 +40,7 @@ def small_signal_model(weight=1.0):
 def test_progress_counts_up_to_the_steps_that_are_expected(scene):
     seen = []
     fit = JointReconstructor(weight=0.4, noise_model=noiseflow.Gaussian, num_steps=40)
-    fit(scene[2], progress=lambda done, total, note: seen.append((done, total)))
+    fit(scene[2], progress=lambda task, done, total, note: seen.append((done, total)))
     done, total = zip(*seen, strict=True)
     assert list(done) == sorted(done)
     assert done[-1] == total[-1] == total_steps(fit.plan(scene[2])[0])
