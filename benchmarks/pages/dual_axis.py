@@ -113,7 +113,7 @@ def tables(content: dict[str, Any]) -> str:
         cells = [content["cells"][f"{phantom}, {noise}/{way}"] for way in WAYS]
         figures = [
             f"{cell[name]:.{digits}f}"
-            for name, digits in (("psnr", 2), ("wedge", 2), ("measured", 2))
+            for name, digits in (("psnr", 2), ("wedge", 3), ("measured", 3))
             for cell in cells
         ]
         rows.append([phantom, noise, *figures])
