@@ -178,7 +178,7 @@ class JointReconstructor:
         part, model = self._slabs(start, tilt_series, grid)
         facts, rows, _ = self._facts(part, model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
+        return plan(facts, num_steps=self._steps(model), schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -317,7 +317,7 @@ class JointReconstructor:
         candidates: list[nn.Module],
         progress: Progress | None,
     ) -> PlannedRun:
-        stages = plan(facts, num_steps=self.num_steps, schedule=self.schedule)
+        stages = plan(facts, num_steps=self._steps(tasks["whole"].signal_model), schedule=self.schedule)
         runner = Runner(
             tasks,
             models,
@@ -330,6 +330,9 @@ class JointReconstructor:
             progress=progress,
         )
         return PlannedRun(facts, stages, runner)
+
+    def _steps(self, whole: TomographySignal) -> int | None:
+        return whole.field.num_steps if self.num_steps is None else self.num_steps
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
