@@ -174,7 +174,7 @@ def left_in_residuals(case: Case) -> Effect:
 def tolerable_residual(case: Case) -> float:
     """The same beyond the contrast that a regulariser takes, accepted only if the noise is stronger than the contrast."""
     noisy = case.residuals.noise > case.residuals.contrast
-    missing = max(0.0, case.distortions["brightness"].offset.value) if noisy else 0.0
+    missing = max(0.0, case.residuals.missing) if noisy else 0.0
     return 0.06 + (missing / (1 + missing)) ** 2
 
 

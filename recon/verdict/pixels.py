@@ -94,7 +94,7 @@ def dead_pixels(residuals: Residuals) -> Effect:
     cause, only pixels that differ from their surroundings count."""
     images = residuals.images
     ends = float(images.min()), float(images.max())
-    constant = (images.max(0) == images.min(0)) & residuals.used.any(0)
+    constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
     dead = constant & ~np.isin(images[0], ends)
     span, mean = _span(images), images.mean(0)
     for end in ends:

@@ -43,7 +43,8 @@ def normalised(tilt_series: TiltSeries) -> Effect:
     values = [image[use].astype(np.float64) for image, use in zip(tilt_series.images, tilt_series.used, strict=True)]
     moments = np.array([(each.mean(), each.std()) for each in values])
     ends = np.array([np.quantile(each, (0.01, 0.99)) for each in values])
-    for pairs, scale in ((moments, moments[:, 1].mean()), (ends, np.ptp(ends, axis=1).mean())):
+    counts = all(np.array_equal(each, np.round(each)) for each in values)  # whose quantiles are equal without scaling
+    for pairs, scale in ((moments, moments[:, 1].mean()), (ends, 0.0 if counts else np.ptp(ends, axis=1).mean())):
         if np.ptp(pairs, axis=0).max() < 1e-3 * scale:
             return Effect(1.0)
     return Effect(0.0)
