@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow.arguments import as_mask, in_single
 from noiseflow.arrays import as_tensor
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
@@ -54,17 +55,15 @@ class JudgedPixels:
             raise ValueError(
                 f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
             )
-        use = _flat(mask, observation, "mask")
-        use = torch.ones(observation.numel(), dtype=torch.bool) if use is None else use.bool().cpu()
+        use = as_mask(mask, observation).cpu()
         block = _flat(blocks, observation, "blocks")
         group = _lines(observation.shape, models) if block is None else block.cpu()
-        if isinstance(held_out, float | int):
+        if np.ndim(held_out) == 0:
             # NumPy's generator, not torch's: the split must not depend on noise sampled with the same seed
             draw = _drawn(group, observation.numel(), seed)
-            judge, again = draw < held_out, draw < min(held_out, _JUDGING_AGAIN)
+            judge, again = draw < float(held_out), draw < min(float(held_out), _JUDGING_AGAIN)
         else:
-            chosen = _flat(held_out, observation, "held_out")
-            judge = torch.zeros_like(use) if chosen is None else chosen.bool().cpu()
+            judge = as_mask(held_out, observation, "held_out").cpu()
             again = judge & (_drawn(group, observation.numel(), seed) < 0.5)
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
             raise ValueError(
@@ -72,7 +71,7 @@ class JudgedPixels:
             )
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
         block = None if block is None else block.to(observation.device)
-        return JudgedPixels(signal.float(), observation.float(), use, judge, again, block)
+        return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 
     @property
     def num_judging(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
@@ -173,15 +174,16 @@ def select(
         >>> noiseflow.select(signal, observation, candidates=candidates, num_steps=60).chosen.name
         'Gaussian'
     """
+    check(held_out=held_out, num_steps=num_steps, seed=seed)
     models = dict(default_candidates() if candidates is None else candidates)
     if not models:
         raise ValueError("there are no candidates; give noise models by name, simplest first")
     wrapped = {name: as_noise_model(model) for name, model in models.items()}
     (signal, observation), kept = unmasked(signal, observation)
-    mask = kept if mask is None else mask if kept is None else as_tensor(mask).reshape(-1).bool().cpu() & kept
-    pixels = JudgedPixels.of(
-        as_tensor(signal), as_tensor(observation), list(wrapped.values()), mask, held_out, blocks, seed
-    )
+    signal, observation = real(signal, "signal"), real(observation, "observation")
+    use = as_mask(mask, observation)
+    use = use if kept is None else use & kept.to(use.device)
+    pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
     found = Digitisation()
     if digitise:
         found = detect_digitisation(as_tensor(observation).detach().reshape(-1)[pixels.use].cpu().numpy())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text, aretomo, imod_commands, mdoc, star
+from noiseflow.io import angle_text, aretomo, imod, mdoc, star
 from noiseflow.io.image_file import ImageFile
 from noiseflow.io.tilt_table import LARGEST_ANGLE as LARGEST_ANGLE
 from noiseflow.io.tilt_table import TiltTable
@@ -20,7 +20,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".star": star.read,
     ".tomostar": star.read,
     ".aln": aretomo.read,
-    ".com": imod_commands.read,
+    ".com": imod.read,
 }
 """Readers by suffix; other files are lists of angles."""
 
@@ -105,7 +105,7 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
     else:
         table = read_tilts(file)
         table = table.rows(_joined(table, image, file, Path(stack)))
-    return table if angles is not None else imod_commands.adjusted(table, Path(stack), bare_stem(Path(stack)))
+    return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
 
 def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list[int]:
@@ -183,8 +183,16 @@ def file_stem(name: str) -> str:
 
 
 def angle_file_of(stack: str | Path) -> Path | None:
-    """The angle file that `tilts_of` uses; None if there is none."""
-    return next((candidate for candidate in candidates(stack) if _is_table(candidate)), None)
+    """The angle file that `tilts_of` uses; None if there is none. Suffixes may be in capitals."""
+    found: dict[Path, dict[str, Path]] = {}
+    for candidate in candidates(stack):
+        folder = candidate.parent
+        if folder not in found:
+            found[folder] = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        file = candidate if candidate.is_file() else found[folder].get(candidate.name.lower())
+        if file is not None and _is_table(file):
+            return file
+    return None
 
 
 def _is_table(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Tilt angles in the metadata of any file: as many numbers as sections, under a matching name."""
+"""Units in file formats, and tilt angles in the metadata of any file: as many numbers as sections, under a matching name."""
 
 from __future__ import annotations
 
@@ -11,11 +11,31 @@ from numpy.typing import NDArray
 
 from noiseflow.io.tilt_table import LARGEST_ANGLE
 
-_ANGLE_NAME = re.compile(r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle", re.IGNORECASE)
+_ANGLE_NAME = re.compile(
+    r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE
+)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
+    **dict.fromkeys(("mrad", "milliradian", "milliradians"), 0.18 / np.pi),
 }
+
+
+_ANGSTROM = {
+    **dict.fromkeys(("å", "a", "angstrom", "angstroms", r"\u00c5", "ångström", "ångstrom"), 1.0),
+    **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),
+    **dict.fromkeys(("nm", "nanometer", "nanometre"), 10.0),
+    **dict.fromkeys(("µm", "μm", "um", "micron", "microns", "micrometer", "micrometre", r"\u00b5m", "µ", "μ"), 1e4),
+    **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e7),
+    **dict.fromkeys(("cm", "centimeter", "centimetre"), 1e8),
+    **dict.fromkeys(("inch", "in", '"'), 2.54e8),
+    **dict.fromkeys(("m", "meter", "metre"), 1e10),
+}
+
+
+def in_angstrom(unit: object) -> float | None:
+    """Å per unit, by its name or symbol; None if it is not a unit of length."""
+    return _ANGSTROM.get(str(unit).strip().lower())
 
 
 def in_degrees(unit: object) -> float | None:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow.arguments import check_precision, real
 from noiseflow.arrays import floating, is_lazy, unmasked
 
 MOST_LAZY = 10**7
@@ -30,11 +31,13 @@ def judged_pixels(
         most: largest number of pixels taken from Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, or there are no pixels.
+        ValueError: shapes differ, pixels are complex or not finite, there are no pixels, or their precision does not resolve
+            the noise.
     """
     if is_lazy(signal) or is_lazy(observation):
         return _of_blocks(signal, observation, skip_non_finite, np.random.default_rng(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
+    signal, observation = real(signal, "signal"), real(observation, "observation")
     signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)
     if kept is not None and signal.shape == observation.shape:
         signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
@@ -48,13 +51,14 @@ def judged_pixels(
 def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple[Tensor, Tensor]:
     finite = torch.isfinite(signal) & torch.isfinite(observation)
     if bool(finite.all()):
+        check_precision(signal, observation)
         return signal, observation
     if not (skip_non_finite and bool(finite.any())):
         raise ValueError(
             f"{int((~finite).sum())} of {finite.numel()} pixels of signal or observation are NaN or infinite; "
             "replace them, or exclude them with skip_non_finite=True"
         )
-    return signal[finite], observation[finite]
+    return _finite(signal[finite], observation[finite], False)
 
 
 def _of_blocks(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
@@ -35,6 +36,7 @@ class AtLevel(ModelAround):
 
     def __init__(self, model: nn.Module, level: float = 0.0) -> None:
         super().__init__(model)
+        check(level=level)
         if self.model.needs_image or self.model.describes_single_readings:
             raise ValueError(
                 "AtLevel must be the innermost model: put rounding, clipping and image terms around AtLevel(model, level)"

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.distributions.laws.textbook import GaussianDistribution as GaussianDistribution
 from noiseflow.distributions.laws.textbook import PoissonDistribution as PoissonDistribution
 from noiseflow.distributions.laws.textbook import SpreadPoissonDistribution
@@ -32,6 +33,7 @@ class Gaussian(NoiseModelBase):
 
     def __init__(self, scale: float = 0.1) -> None:
         super().__init__()
+        check(scale=scale)
         self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
 
     def forward(self, signal: Tensor) -> GaussianDistribution:
@@ -67,6 +69,7 @@ class Poisson(NoiseModelBase):
 
     def __init__(self, gain: float = 1.0, offset: float = 0.0, *, spread: bool = False) -> None:
         super().__init__()
+        check(gain=gain, offset=offset)
         self.spread = spread
         self.log_gain = nn.Parameter(torch.tensor(math.log(gain)))
         self.offset = nn.Parameter(torch.tensor(float(offset)))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import normal_quadrature
@@ -47,8 +48,7 @@ class ScanNoise(ModelAround):
 
     def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
         super().__init__(model)
-        if not scale > 0:
-            raise ValueError(f"scale is {scale}; the standard deviation of the offsets must be positive")
+        check(scale=scale)
         if along not in ("row", "column"):
             raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
         if self.model.shared_axis is not None:

@@ -24,6 +24,8 @@ from recon.commands.running import (
     require_blocks,
     warnings_as_lines,
 )
+from recon.fields._names import DEFAULT as FIELD
+from recon.fields._names import field_names
 from recon.fields.regularisers._names import DEFAULT, regulariser_names
 from recon.methods._names import method_names
 
@@ -44,10 +46,10 @@ from recon.methods._names import method_names
             "mask_nan",
             "invert_contrast",
         ),
-        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
-        "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus", "defocus_kernel"),
+        "Method": ("preset", "field", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
-        "Output": ("save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
+        "Output": ("voxel_size", "save_field", "save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
         "Advanced": ("resume", "checkpoint_interval", "dry_run"),
     }
 )
@@ -115,6 +117,13 @@ def reconstruct(
         str | None,
         typer.Option(help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {DEFAULT} by default."),
     ] = None,
+    field: Annotated[
+        str | None,
+        typer.Option(
+            help=f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
+            f"{FIELD} by default."
+        ),
+    ] = None,
     uncertainty: Annotated[
         int,
         typer.Option(
@@ -141,6 +150,15 @@ def reconstruct(
     ] = None,
     save_noise_model: Annotated[
         Path | None, typer.Option(help="File for the learnt noise model (.safetensors).")
+    ] = None,
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(
+            help="Voxel size of the written volume, Å; the field is evaluated between pixels. Those by default."
+        ),
+    ] = None,
+    save_field: Annotated[
+        Path | None, typer.Option(help="File for the fitted field (.safetensors), for `noiseflow export`.")
     ] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
     invert_contrast: Annotated[
@@ -186,6 +204,13 @@ def reconstruct(
             "ignored below a quarter of a pixel."
         ),
     ] = 0.0,
+    defocus_kernel: Annotated[
+        str,
+        typer.Option(
+            help="What the blur depends on: depth of each voxel; or image: distance of the pixel from the tilt axis times "
+            "tan(tilt), as in Kniesel et al. 2022."
+        ),
+    ] = "depth",
     slices_at_once: Annotated[
         int | None,
         typer.Option(min=1, help="Reconstruct in blocks of this many slices; chosen automatically for large volumes."),
@@ -230,7 +255,8 @@ def reconstruct(
     from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.commands.volume_run import VolumeRun
-    from recon.methods import find_method, require_two_axes, settings_of
+    from recon.methods import find_method, settings_of
+    from recon.methods._registry import require_setting, require_two_axes
     from recon.uncertainty.result import error_bar_paths, shell_band_path
 
     output = Output(json)
@@ -251,22 +277,26 @@ def reconstruct(
             named(out, name),
             report=report if report is None or not name else report / file_name(name),
             noise_model=None if save_noise_model is None else named(save_noise_model, name),
+            field=None if save_field is None else named(save_field, name),
+            voxel_size=voxel_size,
             overwrite=overwrite,
             error_bars=uncertainty > 0,
         )
         for name in channels
     }
     for target in targets.values():
-        volume, model = target.volume, target.noise_model
+        volume = target.volume
         for path in (volume, *error_bar_paths(volume).values(), shell_band_path(volume)):
             require_other(path, *inputs, noise_model)
-        if model is not None:
-            require_other(model, noise_model, *channels.values())
+        for beside in (path for path in (target.noise_model, target.field) if path is not None):
+            require_other(beside, noise_model, *channels.values())
     method, chosen_device = method_of(method, preset), choose_device(device)
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
-    options |= {"regulariser": regulariser, "uncertainty": uncertainty}
-    options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
+    options |= {"regulariser": regulariser, "field": field, "uncertainty": uncertainty}
+    options |= {"window": window, "denoiser": denoiser, "defocus": defocus, "defocus_kernel": defocus_kernel}
     settings_of(**options)
+    if voxel_size is not None or save_field is not None:
+        require_setting(method, "voxel-size" if save_field is None else "save-field")
     if second_axis is not None:
         blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
         require_two_axes(find_method(method), blocks=blocks)

@@ -16,6 +16,7 @@ from noiseflow.commands.console import Output
 from noiseflow.progress import progress_shown
 from recon.commands.results import Targets
 from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
+from recon.fields._registry import field_kinds
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
@@ -78,8 +79,11 @@ class VolumeRun:
         slices_at_once, method = self.slices_at_once, self.options["method"]
         if slices_at_once is None and series.axes is None:
             many = self.workers if self.scheduler is None else 2
-            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many)
-        memory = memory_line(series, grid, method, self.device, slices_at_once, self.workers or 1)
+            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=options["field"])
+        targets.check(series, slices_at_once)
+        memory = memory_line(
+            series, grid, method, self.device, slices_at_once, self.workers or 1, field=options["field"]
+        )
         output.line(memory)
         disk = disk_line(series, grid, slices_at_once, error_bars=options["uncertainty"] > 0, halves=self.fsc)
         if slices_at_once is not None or self.dry_run:
@@ -155,7 +159,8 @@ def _show_plan(
         made = {name: value for name, value in options.items() if name != "method"}
         stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
         fitted = None if slices_at_once is None else fitted_slices(grid.height, slices_at_once)
-        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted)
+        dearest = max(kind.step_cost for kind in field_kinds(options["field"]).values())
+        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted, dearest)
         output.line(f"slab: {slab} of {grid.height} slices")
         output.line(describe(stages))
         output.line(f"expected: about {seconds:.0f} s on this machine")

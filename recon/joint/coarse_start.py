@@ -13,7 +13,8 @@ from torch.nn import functional
 
 from noiseflow import Gaussian, fit
 from noiseflow.threads import num_threads
-from recon.fields.fields import Field, MultiresolutionField
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.signal_model import TomographySignal
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of

@@ -16,7 +16,8 @@ from noiseflow import Gaussian
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
 from noiseflow.progress import Progress
-from recon.fields.fields import Field, MultiresolutionField
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers._names import DEFAULT
@@ -30,7 +31,7 @@ from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
-from recon.projection.base import Projector, from_rays
+from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
@@ -73,6 +74,8 @@ class JointReconstructor:
             voxels wide (only without defocus).
         defocus: blur to model, pixels per voxel out of the focal plane, see
             `recon.projection.defocused_projector.DefocusedProjector`.
+        defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
+            `recon.projection.defocused_projector.ImageDefocusedProjector`.
         slab: number of slices of the slab; by default 24, or more if slices are small.
         schedule: numbers of steps and learning rates.
         seed: seed of all random choices.
@@ -101,6 +104,7 @@ class JointReconstructor:
     skip_vacuum: bool = True
     coarse_to_fine: bool = True
     defocus: float = 0.0
+    defocus_kernel: str = "depth"
     slab: int | None = None
     schedule: Schedule = field(default_factory=Schedule)
     seed: int = 0
@@ -174,7 +178,7 @@ class JointReconstructor:
         part, model = self._slabs(start, tilt_series, grid)
         facts, rows, _ = self._facts(part, model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
+        return plan(facts, num_steps=self._steps(model), schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -182,7 +186,7 @@ class JointReconstructor:
 
     def projector(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Projector:
         """Line integrals through any slices of the grid."""
-        return projector_of(tilt_series, grid, self.device, self.defocus)
+        return projector_of(tilt_series, grid, self.device, self.defocus, self.defocus_kernel)
 
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]
@@ -197,7 +201,7 @@ class JointReconstructor:
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
         """The slices with the highest and the lowest contrast, and their signal model."""
-        num_slices = self._num_slices(grid)
+        num_slices = self.num_slices(grid)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
         rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
@@ -241,6 +245,7 @@ class JointReconstructor:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             made = self.make_field(grid.shape, scale=scale).to(self.device)
+        made.voxel_size = grid.voxel_size
         rate = learning_rate(rough, made)
         rough = rough if rows is None else start.rows(rows).to(self.device)
         made.start_from(rough)
@@ -267,7 +272,7 @@ class JointReconstructor:
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and noise < _QUIET
         described = quiet and given is None  # by a noise model that is fitted after the volume
-        rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
+        rows = contrast_slab(tilt_series, self.num_slices(whole.field, quiet=quiet))
         facts = Facts(
             choose_noise=given is None and not described,
             learn_noise=given is None or learns(given),
@@ -312,7 +317,7 @@ class JointReconstructor:
         candidates: list[nn.Module],
         progress: Progress | None,
     ) -> PlannedRun:
-        stages = plan(facts, num_steps=self.num_steps, schedule=self.schedule)
+        stages = plan(facts, num_steps=self._steps(tasks["whole"].signal_model), schedule=self.schedule)
         runner = Runner(
             tasks,
             models,
@@ -325,6 +330,9 @@ class JointReconstructor:
             progress=progress,
         )
         return PlannedRun(facts, stages, runner)
+
+    def _steps(self, whole: TomographySignal) -> int | None:
+        return whole.field.num_steps if self.num_steps is None else self.num_steps
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -355,7 +363,7 @@ class JointReconstructor:
     def _halvings(self, model: TomographySignal) -> int:
         return HalfResolution.times(model) if self.coarse_to_fine else 0
 
-    def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
+    def num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
         """Number of slices of the slab. Small slices need more to distinguish weights, and gaps of tilts need twice as many
         voxels. Quiet series, with long trial fits, use no more than that."""
         if self.slab is not None:
@@ -369,11 +377,9 @@ class JointReconstructor:
         """Fit the volume with the choices made."""
         result, model = run.fit_whole(), run.runner.tasks["whole"].signal_model
         noise_model = run.noise_model
-        with torch.no_grad():
-            volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
-            shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
-            images = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-        found = Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
+        model.field.occupied = None if model.occupancy is None else model.occupancy.mask
+        volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
+        found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.models.base import Described
@@ -13,7 +15,7 @@ from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers.base import Regulariser
 from recon.fields.regularisers.total_variation import TotalVariation
-from recon.projection.base import Projector, from_columns
+from recon.projection.base import Projector, from_columns, from_rays
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.tiles import Tiles
 
@@ -131,6 +133,12 @@ class TomographySignal(Described):
             values = self._evaluate()
             columns = values if self.occupancy is None else self.tiles.lattice(values)
             return from_columns(columns, self.field.depth).contiguous()
+
+    @torch.no_grad()
+    def images(self) -> NDArray[np.float32]:
+        """The signal of all pixels as images (tilt, y, u)."""
+        rays = self.signal().view(-1, self.field.height)
+        return np.ascontiguousarray(from_rays(rays, self.projector.num_tilts).cpu().numpy())
 
     def forward(self, pixels: Tensor) -> Tensor:
         """The signal of some pixels. Without gradients, all pixels are projected once per state of the parameters. The graph is

@@ -133,7 +133,11 @@ class _Product(torch.autograd.Function):
 
 
 def projector_of(
-    tilt_series: TiltSeries, grid: VolumeGrid, device: torch.device | str = "cpu", defocus: float = 0.0
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    device: torch.device | str = "cpu",
+    defocus: float = 0.0,
+    kernel: str = "depth",
 ) -> Projector:
     """Line integrals through a grid along the rays of a series, about one axis or two.
 
@@ -145,7 +149,7 @@ def projector_of(
         in_focus = SliceProjector(
             tilt_angles=tilt_series.tilt_angles, depth=grid.depth, width=grid.width, detector_width=width, device=device
         )
-        return with_defocus(in_focus, defocus)
+        return with_defocus(in_focus, defocus, kernel)
     if defocus:
         raise ValueError("--defocus is for one tilt axis; remove it, or reconstruct each axis alone")
     if (height, width) != grid.shape[1:]:

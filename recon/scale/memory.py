@@ -26,13 +26,14 @@ time in four blocks, 48 s as a whole), so that 512³ leaves memory for other pro
 _TALL = 64
 
 
-def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
+def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True, more: int = 0) -> int:
     """Peak memory of a reconstruction, bytes, within about 20 % (measured for 48³ to 1000³ voxels).
 
     Args:
         tilt_series: the images.
         grid: the voxel grid.
         fitted: whether a field is fitted, with optimiser moments and best state; otherwise SIRT or back-projection.
+        more: bytes of the method or field that depend neither on the grid nor on the images.
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
@@ -40,7 +41,7 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     volume = depth * height * width
     tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
     matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
-    return int(_BASE + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
+    return int(_BASE + more + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
 
 
 def choose_slices(
@@ -49,6 +50,7 @@ def choose_slices(
     available: int,
     *,
     fitted: bool = True,
+    more: int = 0,
     workers: int = 1,
     plenty: float = math.inf,
 ) -> int | None:
@@ -58,7 +60,7 @@ def choose_slices(
         tilt_series: the images.
         grid: grid of the whole volume.
         available: available memory, bytes.
-        fitted: as in `needed_memory`.
+        fitted, more: as in `needed_memory`.
         workers: number of simultaneous blocks.
         plenty: largest memory of a whole volume, bytes, even if more is available.
 
@@ -66,12 +68,12 @@ def choose_slices(
         MemoryError: even a few slices do not fit.
     """
     room = int(_MOST * available / workers)
-    if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted) <= min(room, plenty):
+    if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted, more=more) <= min(room, plenty):
         return None
     most = min(_TALL, -(-grid.height // workers))
     heights = range(most - most % _STEP or most, 0, -_STEP)
     needed = {
-        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted)
+        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted, more=more)
         for slices in heights
     }
     for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):

@@ -229,6 +229,9 @@ class Alignment:
         )
         if self.residual is not None:
             words += f"; {1 - self.residual:.1%} of held-out gaps of tilts explained"
+        if self.stretches is not None:
+            sizes = np.sqrt(np.abs(np.linalg.det(self.stretches)))
+            words += f"; size of the specimen from {sizes.min():.3f} to {sizes.max():.3f}"
         if self.margin is not None:
             words += f", {1 - self.evidence[1].residual:.1%} at {self.evidence[1].axis:.1f}°"
         return words
@@ -239,6 +242,9 @@ class Alignment:
         if self.residual is not None:
             found["axis offset (pixels)"] = f"{self.axis_offset:.2f}"
             found["largest shift (pixels)"] = f"{np.abs(self.shifts).max():.2f}"
+        if self.stretches is not None:
+            sizes = np.sqrt(np.abs(np.linalg.det(self.stretches)))
+            found["size of the specimen"] = f"{sizes.min():.3f} to {sizes.max():.3f}"
         return found
 
     def as_dict(self) -> dict[str, Any]:

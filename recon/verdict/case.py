@@ -15,6 +15,7 @@ from recon.series.contrast import explained, invert_contrast
 from recon.series.first_guess import contrast_slab
 from recon.series.masks import coarse
 from recon.series.screening import Screening
+from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -164,6 +165,14 @@ def cut_off(case: Case) -> Effect:
         return Effect(0.0)
     layers = np.abs(volume[:, :: max(1, height // 64)]).mean((1, 2), dtype=np.float64)
     return Effect(float(max(layers[0], layers[-1]) / max(float(layers.mean()), 1e-30)))
+
+
+def changing_size(case: Case) -> Effect:
+    """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
+    if case.tilt_series.num_tilts < FEWEST_TILTS:
+        raise NotTested(f"needs {FEWEST_TILTS} tilts")
+    found = estimate_shrinkage(case.series)
+    return Effect(found.change if found.found else 0.0, found.error, found.order)
 
 
 def left_in_residuals(case: Case) -> Effect:

@@ -19,6 +19,8 @@ _STEP = 0.1
 _BLOCK = 8
 # equally populated bins of the signal: finer than smooth misfit
 _SIGNALS = 16
+# probability of a line of equal counts
+_CHANCE = 1e-3
 # pixels below a cliff: fewer are no histogram
 _FEWEST = 60
 
@@ -127,8 +129,11 @@ def borders(residuals: Residuals) -> Effect:
 
 
 def _filled(lines: Array, span: float) -> Array:
-    """(tilt,) number of leading lines with a constant value that differs clearly from the next line."""
+    """(tilt,) number of leading lines with a constant value that differs clearly from the next line, and that counts in an image
+    mostly without electrons would not have by chance."""
     flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
+    alike = (lines == lines[:, :1, :1]).mean((1, 2))  # of the pixels
+    flat &= (alike ** lines.shape[2] < _CHANCE)[:, None]
     count = np.argmin(flat, axis=1)
     after = lines[np.arange(len(lines)), count].mean(1)
     return np.where(np.abs(after - lines[:, 0, 0]) > _STEP * span, count, 0)

@@ -177,6 +177,10 @@ DISTORTIONS: tuple[Row, ...] = (
     Row("other tilt axes", "axis", "distortion", lambda case: fits.other_axis(case.alignment), "", 1.0,
         "another tilt axis explains the images nearly as well, {what} standard errors behind",
         "give the direction with --tilt-axis", local=True),
+    # of the size: moves the edge of a specimen of 48 pixels by a third of a pixel; the shape is right
+    Row("size of the specimen", "specimen", "distortion", cases.changing_size, "of the size", 0.03,
+        "the specimen changes its size by {value:+.1%} over the series ({what} order)",
+        "give --refine-alignment, which corrects it, or use the tilts that were taken first", local=True),
     Row("shifts across the axis", "alignment", "distortion", of("shift across", "spread"), "pixels", PIXELS,
         "the images are shifted across the axis relative to the volume, by at least {value:.2f} pixels rms", ALIGN),
     Row("shifts along the axis", "alignment", "distortion", of("shift along y", "spread"), "pixels", PIXELS,

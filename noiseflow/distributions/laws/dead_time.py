@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.laws.discrete import DiscreteLevels
-from noiseflow.distributions.laws.textbook import PoissonDistribution
+from noiseflow.distributions.laws.textbook import PoissonDistribution, gamma_mass
 
 
 class DeadTimeDistribution(PoissonDistribution):
@@ -45,8 +45,7 @@ class DeadTimeDistribution(PoissonDistribution):
         left = 1 - count * dead_time
         argument = (events * left).clamp(min=0)
         shape = count.clamp(min=1) + 0 * argument.detach()
-        incomplete = torch.special.gammainc if early else torch.special.gammaincc
-        near, far = incomplete(shape, argument), incomplete(shape + 1, argument)
+        near, far = (gamma_mass(each, argument, upper=not early) for each in (shape, shape + 1))
         waiting = count / events.clamp(min=1e-300)
         found = left * near - waiting * far if early else waiting * far - left * near
         at_once = left if early else torch.zeros_like(left)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_quadrature
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf, normal_quadrature
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _ROUNDINGS = 8
@@ -33,8 +33,7 @@ class LatentDistribution(NoiseDistribution):
         return ladj - 0.5 * latent * latent - _LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
-        probability: Tensor = torch.special.ndtr(self.to_latent(value)[0])
-        return probability
+        return normal_cdf(self.to_latent(value)[0])
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)

@@ -16,7 +16,7 @@ from noiseflow.distributions.electrons.exact import (
     log_interval,
 )
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.elementwise import pixelwise
+from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
@@ -25,12 +25,14 @@ def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) ->
     return residual, ((signal - offset).clamp(min=0) / gain).expand_as(residual)
 
 
+@compilable
 def _log_density(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
     return log_density(*in_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
 
 
+@compilable
 def _log_interval(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
@@ -75,12 +77,14 @@ def _interval_and_slopes(
     return value, (of_low, of_high, of_rate - of_low - of_high, of_gain, -of_rate, of_noise)
 
 
+@compilable
 def _log_below(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
     return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[0]
 
 
+@compilable
 def _log_above(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
@@ -166,17 +170,17 @@ class UnevenPoissonGaussian(PoissonGaussianDistribution):
     per_pixel: ClassVar[tuple[str, ...]] = ("signal", "read_noise")
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return pixelwise(_by_read_noise(_log_density), value, *self.law)
+        return pixelwise(_UNEVEN[_log_density], value, *self.law)
 
     def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        below, above = (pixelwise(_by_read_noise(part), value, *self.law) for part in (_log_below, _log_above))
+        below, above = (pixelwise(_UNEVEN[part], value, *self.law) for part in (_log_below, _log_above))
         return below, above
 
     def cdf(self, value: Tensor) -> Tensor:
-        return pixelwise(_by_read_noise(_log_below), value, *self.law).exp()
+        return pixelwise(_UNEVEN[_log_below], value, *self.law).exp()
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return pixelwise(_by_read_noise(_log_interval), low, high, *self.law)
+        return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
 
 
 def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -194,4 +198,8 @@ def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
         found = torch.zeros_like(inputs[-1], dtype=parts[0].dtype)
         return found.masked_scatter(resolved, parts[0]).masked_scatter(~resolved, parts[1])
 
+    parted.__name__ = f"{function.__name__}_by_read_noise"
     return parted
+
+
+_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _log_below, _log_above)}

@@ -35,6 +35,9 @@ def pixelwise(function: Function, *inputs: Tensor, with_slopes: Callable[..., An
     Returns:
         The values, float64; NaN where an input is NaN.
     """
+    if torch.compiler.is_compiling():
+        named: Tensor = _whole(function.__name__, list(inputs))
+        return named
     several = [each for each in inputs if each.ndim]
     shape = broadcast_shapes(*(each.shape for each in several)) if several else torch.Size()
     full = [each.expand(shape) if each.ndim else each for each in inputs]
@@ -47,6 +50,58 @@ def pixelwise(function: Function, *inputs: Tensor, with_slopes: Callable[..., An
         with torch.no_grad():
             found = _by_pieces(lambda *part: (with_slopes(*part, slopes=False)[0],), full, [True])[0]
     return found
+
+
+_NAMED: dict[str, Function] = {}
+
+
+def compilable(function: Function) -> Function:
+    """Decorator for functions that `pixelwise` may apply inside ``torch.compile``, where they become single operators."""
+    _NAMED[function.__name__] = function
+    return function
+
+
+@torch.library.custom_op("noiseflow::pixelwise", mutates_args=())
+def _whole(name: str, inputs: list[Tensor]) -> Tensor:
+    """`pixelwise` as one operator: the compiler does not look inside."""
+    with torch.no_grad():
+        return pixelwise(_NAMED[name], *inputs)
+
+
+@_whole.register_fake
+def _(name: str, inputs: list[Tensor]) -> Tensor:
+    shape = broadcast_shapes(*(each.shape for each in inputs))
+    return torch.empty(shape, dtype=torch.float64, device=inputs[0].device)
+
+
+@torch.library.custom_op("noiseflow::pixelwise_slopes", mutates_args=())
+def _whole_slopes(name: str, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:
+    full = _expanded(inputs)
+    needed = [True] * len(inputs)
+    # torch switches autograd off inside operators
+    with torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False):
+        found = _vector_product(_NAMED[name], gradient.contiguous(), full, needed)
+    return [
+        torch.zeros_like(each) if slope is None else slope.sum_to_size(each.shape).to(each.dtype).clone()
+        for slope, each in zip(found, inputs, strict=True)
+    ]
+
+
+@_whole_slopes.register_fake
+def _(name: str, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:
+    return [torch.empty_like(each) for each in inputs]
+
+
+def _keep_whole(ctx: Any, inputs: tuple[str, list[Tensor]], output: Tensor) -> None:
+    ctx.name = inputs[0]
+    ctx.save_for_backward(*inputs[1])
+
+
+def _whole_backward(ctx: Any, gradient: Tensor) -> tuple[None, list[Tensor]]:
+    return None, _whole_slopes(ctx.name, list(ctx.saved_tensors), gradient)
+
+
+_whole.register_autograd(_whole_backward, setup_context=_keep_whole)
 
 
 class _Value(torch.autograd.Function):

@@ -51,23 +51,34 @@ def _log_wide_interval(low: Tensor, high: Tensor) -> Tensor:
     """log[Φ(high) − Φ(low)] for low < high ≤ −low: log Φ(high) + log[1 − Φ(low)/Φ(high)]."""
     unbounded = torch.isneginf(low)
     low = torch.where(unbounded, -torch.ones_like(low) - high.detach().abs(), low)
-    ratio: Tensor = _LogRatio.apply(low, high)  # type: ignore[no-untyped-call]
+    ratio: Tensor = applied(_LogRatio, _LogRatioForward, low, high)
     ratio = torch.where(unbounded | (ratio >= 0), -torch.ones_like(ratio), ratio)
     rest = torch.log(-torch.expm1(ratio))
     whole: Tensor = log_normal_cdf(high)
     return whole + torch.where(unbounded, torch.zeros_like(rest), rest)
 
 
+def normal_cdf(x: Tensor) -> Tensor:
+    """Φ(x), accurate to rounding in the lower tail; that of torch is 0 below −5.5 in single precision."""
+    return 0.5 * torch.erfc(x * -math.sqrt(0.5))
+
+
 def log_normal_cdf(x: Tensor) -> Tensor:
     """log Φ(x), with a gradient that is accurate far into both tails; that of torch fails below about −10⁸."""
-    found: Tensor = _LogCdf.apply(x)  # type: ignore[no-untyped-call]
+    found: Tensor = applied(_LogCdf, _LogCdfForward, x)
+    return found
+
+
+def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Tensor:
+    """Apply a function; ``torch.compile`` does not support forward-mode derivatives of custom functions."""
+    found: Tensor = (kind if torch.compiler.is_compiling() else with_jvp).apply(*inputs)
     return found
 
 
 def normal_hazard(x: Tensor) -> Tensor:
     """φ(x)/Φ(x), the derivative of log Φ(x)."""
     left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
-    right = torch.exp(-0.5 * x * x - _LOG_SQRT_2PI) / torch.special.ndtr(x.clamp(min=0))
+    right = torch.exp(-0.5 * x * x - _LOG_SQRT_2PI) / normal_cdf(x.clamp(min=0))
     return torch.where(x <= 0, left, right)
 
 
@@ -89,6 +100,10 @@ class _Hazard(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         return gradient * _hazard_slope(*ctx.saved_tensors)
 
+
+class _HazardForward(_Hazard):
+    """As `_Hazard`, with forward-mode derivatives."""
+
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor) -> Tensor:
         return tangent * _hazard_slope(*ctx.saved_tensors)
@@ -103,7 +118,7 @@ def _hazard_slope(x: Tensor) -> Tensor:
 
 def hazard_of(x: Tensor) -> Tensor:
     """`normal_hazard`, differentiable."""
-    found: Tensor = _Hazard.apply(x)  # type: ignore[no-untyped-call]
+    found: Tensor = applied(_Hazard, _HazardForward, x)
     return found
 
 
@@ -124,6 +139,10 @@ class _LogCdf(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
         return gradient * hazard_of(x)
+
+
+class _LogCdfForward(_LogCdf):
+    """As `_LogCdf`, with forward-mode derivatives."""
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor) -> Tensor:
@@ -152,6 +171,10 @@ class _LogRatio(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         low, high = ctx.saved_tensors
         return gradient * hazard_of(low), -gradient * hazard_of(high)
+
+
+class _LogRatioForward(_LogRatio):
+    """As `_LogRatio`, with forward-mode derivatives."""
 
     @staticmethod
     def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> Tensor:

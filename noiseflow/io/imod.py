@@ -1,4 +1,4 @@
-"""IMOD's command files: angle offset and excluded views of ``tilt.com``.
+"""IMOD's files: transforms (``.xf``), and the angle offset and excluded views of ``tilt.com``.
 
 Source: https://bio3d.colorado.edu/imod/doc/man/tilt.html
 """
@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noiseflow.io import angle_text
 from noiseflow.io.checks import number, text_lines
@@ -40,8 +41,11 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
     path = stack.with_name("tilt.com")
     if path.is_file() and stack.is_file():
         entries = _entries(path)
-        projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or ""
-        if Path(projections).stem.removesuffix("_ali") == stem:
+        older = next(
+            (name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), ""
+        )  # a line of its own, without keyword
+        projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or older
+        if Path(projections).stem.lower().removesuffix("_ali") == stem.lower():
             return _applied(table, entries, path)
     turned = stack.with_name(f"{stem}.xtilt")
     if turned.is_file() and not stack.is_dir():
@@ -66,7 +70,7 @@ def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable
     return replace(table, angles=table.angles + offset, excluded=tuple(sorted({*table.excluded, *excluded})))
 
 
-def _warn_of_x(angles: np.ndarray[tuple[int], np.dtype[np.float64]], path: Path) -> None:
+def _warn_of_x(angles: NDArray[np.float64], path: Path) -> None:
     if np.abs(angles).max(initial=0.0) > _FLAT:
         varies = "" if np.ptp(angles) <= _FLAT else ", different for each view: the images do not share one axis"
         warnings.warn(
@@ -112,3 +116,34 @@ def parse_views(text: str, count: int, source: object = "views") -> list[int]:
             )
         found.update(range(int(first) - 1, int(last)))
     return sorted(found)
+
+
+def read_transforms(path: str | Path) -> NDArray[np.float64]:
+    """Read an IMOD ``.xf`` file.
+
+    Args:
+        path: text file, one line ``A11 A12 A21 A22 DX DY`` per section.
+
+    Returns:
+        (section, 2, 3): the matrix A and the shift in pixels, in the order (x, y) of IMOD.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: a line does not hold six numbers, a matrix is not invertible, or the file is empty.
+    """
+    path = Path(path)
+    rows = []
+    for count, line in enumerate(text_lines(path, "alignment file", holds="six numbers per line"), 1):
+        if not line.strip():
+            continue
+        try:
+            a11, a12, a21, a22, dx, dy = map(number, line.split())
+        except ValueError:
+            raise ValueError(f"{path} line {count}: six numbers A11 A12 A21 A22 DX DY are needed") from None
+        row = np.array([[a11, a12, dx], [a21, a22, dy]])
+        if not np.isfinite(row).all() or abs(np.linalg.det(row[:, :2])) < 1e-6:
+            raise ValueError(f"{path} line {count}: this transform is not invertible; check the alignment file")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path} holds no transforms; one line of six numbers per section is required")
+    return np.stack(rows)
