@@ -175,6 +175,13 @@ def changing_size(case: Case) -> Effect:
     return Effect(found.change if found.found else 0.0, found.error, found.order)
 
 
+def too_smooth(case: Case) -> Effect:
+    """Coefficient of the fine structure that the projections lack, if noise is no reason to smooth it."""
+    if case.residuals.noise > case.residuals.contrast:
+        raise NotTested("the noise is stronger than the contrast")
+    return case.distortions["sharpness"].offset
+
+
 def left_in_residuals(case: Case) -> Effect:
     """Share of the structure of the images that is left in the residuals."""
     return Effect(*case.residuals.unexplained())

@@ -93,18 +93,20 @@ def _dead(lines: Array, span: float) -> float:
 
 def dead_pixels(residuals: Residuals) -> Effect:
     """Share of pixels with a constant value in all tilts. At a limit of the values, where vacuum or saturation may be the
-    cause, only pixels that differ from their surroundings count."""
+    cause, only pixels that differ from their surroundings and from their expectation count."""
     images = residuals.images
     ends = float(images.min()), float(images.max())
     constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
     dead = constant & ~np.isin(images[0], ends)
-    span, mean = _span(images), images.mean(0)
+    span, mean, expected = _span(images), images.mean(0), residuals.projections.mean(0)
     for end in ends:
         regions, count = ndimage.label(constant & (images[0] == end))
         for number in range(1, count + 1):
-            around = ndimage.binary_dilation(regions == number) & ~constant
-            if around.any() and abs(float(np.median(mean[around])) - end) > _STEP * span:
-                dead |= regions == number
+            inside = regions == number
+            around = ndimage.binary_dilation(inside) & ~constant
+            beside = float(np.median(mean[around])) if around.any() else end
+            if min(abs(beside - end), abs(float(np.median(expected[inside])) - end)) > _STEP * span:
+                dead |= inside
     return Effect(0.0 if constant.all() else float(dead.mean()))
 
 
