@@ -346,6 +346,8 @@ def test_transforms_made_on_unbinned_images_are_scaled(tmp_path: Path) -> None:
     io.write(tmp_path / "a_bin4.mrc", raw.reshape(3, 8, 4, 12, 4).mean((2, 4)))
     np.savetxt(tmp_path / "a_bin4.rawtlt", [-30, 0, 30])
     series = recon.read_tilt_series(tmp_path / "a_bin4.mrc")
+    with pytest.warns(UserWarning, match="--alignment-binning"):
+        recon.read_alignment(tmp_path / "a.xf", series)
     given = recon.read_alignment(tmp_path / "a.xf", series, binning=4).joined(series)
     assert given.shifts[0].tolist() == [1, -2]
     io.write(tmp_path / "a.st", raw)  # the stack that was aligned
@@ -493,3 +495,15 @@ def test_image_keys_are_found_beside_a_link_to_the_images(tmp_path: Path) -> Non
         file["entry/data/data"] = detector["data"]
         file["entry/sample/rotation_angle"] = [0.0, 0, -30, -10, 10, 30, 0]
     assert recon.read_tilt_series(tmp_path / "a.nxs", mask_nan=True).tilt_angles.tolist() == [-30, -10, 10, 30]
+
+
+def test_the_options_of_files_arrive_in_the_volume(tmp_path: Path, run, refused) -> None:
+    from tests.test_formats import mrc_of_type
+
+    stack = mrc_of_type("f4")(tmp_path)
+    options = ["--method", "wbp", "--keep-tilts", "--pixel-size", "5", "--exclude-views", "1,12-13"]
+    result = run("reconstruct", stack, "-o", tmp_path / "volume.mrc", *options)
+    assert result["figures"]["tilts"] == "10, -50° to 40°"
+    assert io.read(tmp_path / "volume.mrc").voxel_size == (5, 5, 5)
+    for option in (["--exclude-views", "14"], ["--pixel-size", "-1"]):
+        assert option[0] in refused("reconstruct", stack, "-o", tmp_path / "other.mrc", *option)

@@ -17,6 +17,7 @@ from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
+_FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
 _AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
 
@@ -134,7 +135,20 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,
         )
-    return Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    alignment = Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
+    return alignment
+
+
+def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, stated: bool) -> None:
+    """Warn of shifts that may be those of larger images, if no file says which images were aligned."""
+    largest, edge = float(np.abs(alignment.shifts).max(initial=0.0)), min(tilt_series.images.shape[1:])
+    if not stated and largest > _FAR * edge:
+        warnings.warn(
+            f"{path} shifts images of {edge} pixels by up to {largest:.0f} pixels; if it was made on larger images, give "
+            "--alignment-binning, or put the stack that was aligned next to it",
+            stacklevel=4,
+        )
 
 
 def _transforms(table: io.TiltTable) -> NDArray[np.float64]:
