@@ -67,7 +67,12 @@ class Report:
     def figure(self, figure: Figure, *, caption: str) -> None:
         """Add a matplotlib figure as PNG on white. Use it for images, and `charts` for curves."""
         stream = io.BytesIO()
-        margins = None if figure.get_layout_engine() else "tight"  # "tight" draws everything twice
+        engine = figure.get_layout_engine()
+        if engine is not None:  # otherwise `savefig` would draw everything once more for the layout
+            figure.set_dpi(110)
+            engine.execute(figure)
+            figure.set_layout_engine("none")
+        margins = "tight" if engine is None else None
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
         data = base64.b64encode(stream.getvalue()).decode()
         text = _escape(caption)

@@ -106,7 +106,8 @@ def read_alignment(
 
 def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None) -> Alignment:
     """The alignment of a file with one transform for each image of a stack."""
-    table = _xf_with_angles(path, tilt_series) if path.suffix.lower() == ".xf" else io.read_tilts(path)
+    tables = (".aln", ".star", ".tomostar", ".mdoc", ".com")  # others are transforms, such as .xf and .prexg of IMOD
+    table = io.read_tilts(path) if path.suffix.lower() in tables else _xf_with_angles(path, tilt_series)
     if table.transforms is None:
         raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
     table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
