@@ -241,6 +241,13 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="about x"):
         given = recon.read_tilt_series(tmp_path / "a_ali.mrc", angles=tmp_path / "tilt.com")
     assert given.tilt_angles.tolist() == series.tilt_angles.tolist()
+    (tmp_path / "a.xf").write_text("1 0 0 1 0 0\n" * 4)
+    io.write(tmp_path / "a.mrc", stack)
+    (tmp_path / "a.rawtlt").write_text("-19\n-9\n11\n21\n")
+    raw = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert raw.tilt_angles.tolist() == [-17.5, 12.5, 22.5]
+    refined = recon.read_alignment(tmp_path / "a.xf", raw).joined(raw).apply(raw)
+    assert refined.tilt_angles.tolist() == series.tilt_angles.tolist()
     io.write(tmp_path / "b.mrc", stack)
     (tmp_path / "b.tlt").write_text("-20\n-10\n10\n20\n")
     assert recon.read_tilt_series(tmp_path / "b.mrc").num_tilts == 4  # the command file of another stack
@@ -507,3 +514,17 @@ def test_the_options_of_files_arrive_in_the_volume(tmp_path: Path, run, refused)
     assert io.read(tmp_path / "volume.mrc").voxel_size == (5, 5, 5)
     for option in (["--exclude-views", "14"], ["--pixel-size", "-1"]):
         assert option[0] in refused("reconstruct", stack, "-o", tmp_path / "other.mrc", *option)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "mrad", None])
+@pytest.mark.parametrize("name", ["angles", "scan/tilt_angle", "exchange/theta"])
+def test_angles_of_hdf5_files_by_name_and_unit(name: str, unit: str | None, tmp_path: Path) -> None:
+    import h5py
+
+    angles = np.arange(0, 350, 50.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["images"] = np.random.default_rng(0).random((7, 8, 9))
+        file[name] = (angles * {"rad": np.pi / 180, "mrad": np.pi / 0.18}.get(unit or "", 1.0))[:, None]
+        if unit is not None:
+            file[name].attrs["units"] = unit
+    np.testing.assert_allclose(recon.read_tilt_series(tmp_path / "a.h5").tilt_angles, angles)
