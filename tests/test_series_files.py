@@ -241,6 +241,13 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="about x"):
         given = recon.read_tilt_series(tmp_path / "a_ali.mrc", angles=tmp_path / "tilt.com")
     assert given.tilt_angles.tolist() == series.tilt_angles.tolist()
+    (tmp_path / "a.xf").write_text("1 0 0 1 0 0\n" * 4)
+    io.write(tmp_path / "a.mrc", stack)
+    (tmp_path / "a.rawtlt").write_text("-19\n-9\n11\n21\n")
+    raw = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert raw.tilt_angles.tolist() == [-17.5, 12.5, 22.5]
+    refined = recon.read_alignment(tmp_path / "a.xf", raw).joined(raw).apply(raw)
+    assert refined.tilt_angles.tolist() == series.tilt_angles.tolist()
     io.write(tmp_path / "b.mrc", stack)
     (tmp_path / "b.tlt").write_text("-20\n-10\n10\n20\n")
     assert recon.read_tilt_series(tmp_path / "b.mrc").num_tilts == 4  # the command file of another stack
