@@ -35,6 +35,9 @@ FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 _VISIBLE = 8.0
 
+# of the size: polymers lose up to a fifth under the beam
+_MOST_CHANGE = 0.25
+
 
 @dataclass(frozen=True)
 class Case:
@@ -172,6 +175,8 @@ def changing_size(case: Case) -> Effect:
     if case.tilt_series.num_tilts < FEWEST_TILTS:
         raise NotTested(f"needs {FEWEST_TILTS} tilts")
     found = estimate_shrinkage(case.series)
+    if abs(found.change) > _MOST_CHANGE:
+        raise NotTested("the profile along the axis changes by more than any change of size")
     return Effect(found.change if found.found else 0.0, found.error, found.order)
 
 
