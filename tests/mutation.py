@@ -59,7 +59,11 @@ TARGETS = {
     ],
     "noiseflow/metrics/evaluation.py": ["noiseflow/metrics/test_metrics.py"],
     "noiseflow/io/mrc.py": ["noiseflow/io/test_mrc.py", "noiseflow/io/test_tilt_axis.py"],
-    "noiseflow/io/angles.py": ["noiseflow/io/test_alignment.py", "recon/series/test_tilt_series.py"],
+    "noiseflow/io/angles.py": [
+        "noiseflow/io/test_alignment.py",
+        "recon/series/test_tilt_series.py",
+        "test_series_files.py",
+    ],
     "recon/projection/projector.py": ["recon/projection/test_projector.py"],
     "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
     "recon/projection/wbp.py": ["recon/projection/test_wbp.py"],

@@ -507,3 +507,17 @@ def test_the_options_of_files_arrive_in_the_volume(tmp_path: Path, run, refused)
     assert io.read(tmp_path / "volume.mrc").voxel_size == (5, 5, 5)
     for option in (["--exclude-views", "14"], ["--pixel-size", "-1"]):
         assert option[0] in refused("reconstruct", stack, "-o", tmp_path / "other.mrc", *option)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "mrad", None])
+@pytest.mark.parametrize("name", ["angles", "scan/tilt_angle", "exchange/theta"])
+def test_angles_of_hdf5_files_by_name_and_unit(name: str, unit: str | None, tmp_path: Path) -> None:
+    import h5py
+
+    angles = np.arange(0, 350, 50.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["images"] = np.random.default_rng(0).random((7, 8, 9))
+        file[name] = (angles * {"rad": np.pi / 180, "mrad": np.pi / 0.18}.get(unit or "", 1.0))[:, None]
+        if unit is not None:
+            file[name].attrs["units"] = unit
+    np.testing.assert_allclose(recon.read_tilt_series(tmp_path / "a.h5").tilt_angles, angles)

@@ -70,8 +70,9 @@ def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
 
 
 def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
-    lists = [(name, item) for name, item in found.items() if item.shape == (count,) and item.dtype.kind in "iuf"]
-    return recorded_angles(((name, list(np.asarray(item, float) * _unit(item))) for name, item in lists), count)
+    lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
+    numbers = ((name, np.ravel(item) * _unit(item)) for name, item in lists.items() if item.dtype.kind in "iuf")
+    return recorded_angles(((name, [float(value) for value in values]) for name, values in numbers), count)
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:

@@ -30,6 +30,7 @@ _STREAK = (
 )
 _STREAKS = 0.002  # of all lines: one in five hundred is harmless
 _REGION = 0.002  # of the pixels: one in five hundred is harmless, and no pixel is constant by chance
+_CHANCE = 1e-3  # of a line of equal counts
 _BORDERS = 0.1  # of the images: fewer are single defects, which screening removes
 _SEAM, _SEAM_STEP = (
     12.0,
@@ -126,8 +127,11 @@ def borders(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[st
 
 
 def _filled(lines: Array, span: float) -> Array:
-    """(tilt,) number of leading lines with a constant value that differs clearly from the next line."""
+    """(tilt,) number of leading lines with a constant value that differs clearly from the next line, and that counts in an image
+    mostly without electrons would not have by chance."""
     flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
+    alike = (lines == lines[:, :1, :1]).mean((1, 2))  # of the pixels
+    flat &= (alike ** lines.shape[2] < _CHANCE)[:, None]
     count = np.argmin(flat, axis=1)
     after = lines[np.arange(len(lines)), count].mean(1)
     return np.where(np.abs(after - lines[:, 0, 0]) > _STEP * span, count, 0)
