@@ -53,8 +53,8 @@ volume, which a method has to exceed. The last column names the field that predi
 takes it on the slab, and how far the others are behind, in nats per pixel.
 
 Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."""
-_NOT_RUN = """The weight is the same for all and the best of none: with weights searched for each field, differences may change their sign.
-Grids take their usual 150 steps.
+_NOT_RUN = """The weight is the same for all and the best of none: with weights searched for each field, differences may
+change their sign. Grids take their usual 150 steps.
 
 ## Not measured
 
