@@ -15,7 +15,7 @@ import noiseflow
 from benchmarks.scenes import Cell, Results
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from noiseflow import Gaussian, SignalDependentGaussian, fit
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.joint.laplace import Laplace

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from noiseflow import Gaussian, fit
-from recon.fields.fields import Field
+from recon.fields.kinds.kniesel2022 import DENSEST, PaperField
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import block_mask
-from recon.methods.kniesel2022.network import CoordinateDensity
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 WIDTHS = (32, 64, 128, 256)
@@ -24,32 +23,6 @@ _DENSITY_SCALE = 7.0
 _STEPS = 300
 _HIGHEST_RATE, _RATE_TIMES_WIDTH = 0.02, 1.28
 _EMPTY = -4.0
-
-
-class NetworkField(Field):
-    """A volume computed from coordinates by a network with nine layers.
-
-    Args:
-        shape: (depth, height, width) of the voxel grid.
-        layer_width: units of the hidden layers.
-    """
-
-    points: Tensor
-
-    def __init__(self, shape: Sequence[int], *, layer_width: int, scale: float = 1.0) -> None:
-        super().__init__(shape, scale=scale)
-        self.network = CoordinateDensity(width=layer_width)
-        nn.init.constant_(self.network.last.bias, _EMPTY)
-        axes = [(2 * torch.arange(size) + 1 - size) / self.width for size in (self.depth, self.width, self.height)]
-        z, x, y = torch.meshgrid(*axes, indexing="ij")
-        self.register_buffer("points", torch.stack([x, y, z], -1).reshape(-1, 3), persistent=False)
-
-    def start_from(self, volume: Tensor) -> None:
-        """Ignore the volume; the network starts nearly empty."""
-
-    def units(self) -> Tensor:
-        density: Tensor = self.network(self.points) * (2 * _DENSITY_SCALE / self.width / self.scale)
-        return density.view(self.depth, self.width, self.height)
 
 
 def fit_network(
@@ -74,7 +47,8 @@ def fit_network(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         start = JointReconstructor(noise_model=Gaussian, seed=seed).signal_model(tilt_series, grid)
-        field = NetworkField(grid.shape, layer_width=width, scale=float(start.field.scale))
+        field = PaperField(grid.shape, width=width, scale=2 * _DENSITY_SCALE / DENSEST / grid.width)
+        nn.init.constant_(field.network.last.bias, _EMPTY)  # type: ignore[union-attr, arg-type]
         rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
         model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)
         images = torch.from_numpy(np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32))

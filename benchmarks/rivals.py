@@ -22,7 +22,7 @@ from torch import nn
 from benchmarks.external import astra_sirt, missing, quantem_inr
 from benchmarks.scenes import Cell, Results, Scene, make_scene
 from noiseflow import Gaussian
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem

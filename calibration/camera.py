@@ -13,8 +13,18 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import BIAS, Grade, Reason, Verdict, frames_correlated, verdict_of
+from calibration.verdict import (
+    BIAS,
+    Grade,
+    Reason,
+    Verdict,
+    bent_response,
+    frames_correlated,
+    verdict_of,
+    with_pattern,
+)
 from noiseflow.described import described
+from noiseflow.statistics import robust_deviation
 
 if TYPE_CHECKING:
     from torch import nn
@@ -105,7 +115,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
             f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled or compressed. "
             "Use raw frames.",
         )
-    found += frames_correlated(figures.lag)
+    found += frames_correlated(figures.lag) + bent_response(figures.bend)
     if figures.chi_squared > LARGEST_CHI_SQUARED:
         text = f"the variance is not linear in the signal (χ² per degree of freedom {figures.chi_squared:.1f})"
         add(
@@ -143,6 +153,7 @@ def judge_camera(figures: CameraFigures) -> Verdict:
         )
     if not figures.saturated:
         add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
+    found = with_pattern(found, figures.pattern, correlation, figures.gain.median)
     return verdict_of([one for one in found if one.name != "not saturated"])
 
 
@@ -269,6 +280,11 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
             _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)"),
         ),
         ("excess-noise factor F²", _text(figures.excess_factor, "")),
+        (
+            "exponent of the response",
+            f"{figures.bend.exponent:.4g} ± {figures.bend.error:.2g}" if figures.bend.known else _value(None, ""),
+        ),
+        ("outliers of single frames", f"{figures.outliers}, excluded"),
         ("defective pixels", f"{int(camera.maps['defects'].sum())}"),
     ]
     return [(name, text.strip()) for name, text in rows]
@@ -303,6 +319,8 @@ def summary_of(camera: Camera) -> dict[str, Any]:
         for level in figures.levels
         if level.variance > 0
     ]
+    found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
+    found["outliers"] = figures.outliers
     found["defects"] = int(camera.maps["defects"].sum())
     return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.reasons], "camera": found}
 
@@ -332,9 +350,8 @@ def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
     for name in ("response", "offset"):
         if name in maps:
             values = maps[name]
-            middle = np.median(values)
-            spread = 1.4826 * np.median(np.abs(values - middle))
-            found |= np.abs(values - middle) > 8 * max(float(spread), np.finfo(float).tiny)
+            spread = max(robust_deviation(values), np.finfo(float).tiny)
+            found |= np.abs(values - np.median(values)) > 8 * spread
     if figures.dark is not None and figures.dark.frames >= LEAST_FRAMES:
         found |= maps["variance"] > 10 * np.median(maps["variance"])
     return np.asarray(found)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,8 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
-from calibration.detector.importance import DRAWS, ROUNDS
 from calibration.detector.measure import Detector, measure_detector
-from calibration.detector.models import KINDS, ModelScore, Pixels, collect_pixels, fit_models
+from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.codes import below_joins
@@ -27,10 +25,7 @@ from noiseflow.described import described
 if TYPE_CHECKING:
     from torch import nn
 
-    from noiseflow.commands.console import Progress
-
-Bar = Callable[[str, int], AbstractContextManager["Progress | None"]]
-"""``bar(title, total)``: context manager that returns a progress callback."""
+    from noiseflow.progress import Progress
 
 WITHIN = 0.999
 """Share of the pixels whose own clipping limit lies within the common one after a pattern is subtracted; the others are hot."""
@@ -93,7 +88,7 @@ def calibrate_exposures(
     kinds: Sequence[str] | None = None,
     seed: int = 0,
     device: Any = "cpu",
-    bar: Bar = lambda title, total: nullcontext(),
+    progress: Progress | None = None,
 ) -> Findings:
     """Align exposures, measure the detector, and fit and evaluate the noise models.
 
@@ -104,7 +99,7 @@ def calibrate_exposures(
         kinds: names of the noise models to fit; see `fit_models`.
         seed: random seed.
         device: torch device for the fits.
-        bar: function that creates progress bars.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: the exposures cannot be aligned, or the posterior does not converge.
@@ -121,12 +116,11 @@ def calibrate_exposures(
         >>> findings.verdict.grade, round(findings.figures.read_noise.median)
         ('good', 1)
     """
-    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, bar=bar)
+    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, progress=progress)
     pixels = collect_pixels(measured.pairs, seed=seed)
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
-    with bar("Fitting noise models", len(KINDS)) as progress:
-        scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
+    scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
     return replace(measured, pixels=pixels, scores=scores)
 
 
@@ -136,7 +130,7 @@ def measure_exposures(
     dark: Burst | None = None,
     flat: Burst | None = None,
     seed: int = 0,
-    bar: Bar = lambda title, total: nullcontext(),
+    progress: Progress | None = None,
 ) -> Findings:
     """Align exposures, measure the detector and test its results, without noise models; arguments as `calibrate_exposures`."""
     for frames in (dark, flat):
@@ -151,7 +145,11 @@ def measure_exposures(
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
     else:
-        pairs = [align_pair(pair) for pair in exposures]
+        pairs = []
+        for number, pair in enumerate(exposures):
+            if progress is not None:
+                progress("Aligning exposures", number, len(exposures), "")
+            pairs.append(align_pair(pair))
     pairs, repairs = repaired(pairs)
     repairs = replace(repairs, join=join, joined=joined)
     correlation = correlation_of(pairs)
@@ -160,8 +158,7 @@ def measure_exposures(
     detector, figures, reason = None, None, ""
     verdict = Verdict("bad", ())
     try:
-        with bar("Sampling the detector's posterior", DRAWS * ROUNDS) as progress:
-            detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+        detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         judged = judge_calibration(pairs, detector, figures, correlation, repairs)
         verdict = verdict_of([*judged.reasons, *compressed])

@@ -19,8 +19,10 @@ from calibration.detector.figures import (
 )
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
+from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.repair import LEAST_SHARE, Repairs
-from calibration.detector.shape import field_deviation
+from calibration.detector.residual import residual_of
+from calibration.detector.response import Response
 from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Image, rails
@@ -33,10 +35,6 @@ GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
 LEAST_MISFIT = 0.8
 """χ² per degree of freedom below which the histograms scatter less than those of independent pixels can. It varies by 0.05 over
 the roughly 1000 cells of a typical calibration. The frames of a burst share their mean, which reduces the scatter a little."""
-
-WIDEST_GAIN = 0.03
-"""Largest relative half-width of the gain's 90 % interval: twice the target accuracy. A wider interval means that the exposures
-contain too few electrons or too little contrast."""
 
 BIAS = 0.02
 """Largest relative error of the gain without a warning: the target accuracy of the calibration."""
@@ -98,6 +96,8 @@ def judge_calibration(
         correlation: correlation of the residuals of `pairs`.
         repairs: violated assumptions that were modelled before the measurement.
     """
+    shared = pairs[0].frames / max(pairs[0].frames - 1, 1)  # residuals from a mean that the frames of a burst share
+    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation * np.sqrt(shared))
     reasons = [
         *_scene(repairs, correlation),
         *_independence(pairs),
@@ -105,7 +105,7 @@ def judge_calibration(
         *_shape(detector, figures),
         *_range(pairs, detector, figures, repairs),
     ]
-    return verdict_of(reasons)
+    return verdict_of(with_pattern(reasons, pattern, correlation, figures.gain.median))
 
 
 def verdict_of(reasons: Sequence[Reason]) -> Verdict:
@@ -286,16 +286,7 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
                 "joined converters", "doubtful" if few else "bad", text + ". Record with a single converter setting."
             )
         )
-    gain = figures.gain
-    half = (gain.q95 - gain.q05) / (2 * gain.median)
-    if half > WIDEST_GAIN:
-        text = f"the uncertainty of the gain is ±{half:.0%}. Add exposures, record a scene with more contrast, or add flats "
-        found.append(Reason("gain uncertain", "doubtful", text + "at several levels."))
-    field = field_deviation(pairs)
-    if field > MOST_UNEVEN_FIELD:
-        text = f"at equal signal the noise variance differs by {field:.0%} rms across the field: the frames were divided by a "
-        text += "flat field or corrected for shading, so no single gain applies"
-        found.append(Reason("uneven field", "doubtful", text + ". Use uncorrected frames."))
+    found += bent_response(detector.response)
     for pair in pairs:
         if pair.exposure_ratio is not None and not pair.one_setting:
             text = f"the fitted ratio of the exposures is {1 / pair.scaling.slope:.3g}, the given one {pair.exposure_ratio:.3g}. "
@@ -307,6 +298,41 @@ def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, r
         text = f"{max(shares):.1%} of the pixels are at full-well saturation, below the converter's upper limit"
         found.append(Reason("saturation", "doubtful", text + ". Use a shorter exposure."))
     return found
+
+
+def bent_response(response: Response) -> list[Reason]:
+    """Return the reason to report if the response is not linear."""
+    if not response.bent:
+        return []
+    text = f"the response is not linear: the signal grows as light^{response.exponent:.3f} (± {response.error:.3f}), or the dark "
+    text += "frames or the exposure ratio belong to another setting. The gain is the local one at the mean signal"
+    return [Reason("nonlinear response", "doubtful", text + ". Use raw frames, and dark frames of the same setting.")]
+
+
+def with_pattern(reasons: Sequence[Reason], pattern: Pattern, correlation: Correlation, gain: float) -> list[Reason]:
+    """Add that the noise depends on the place, and leave out what follows from it.
+
+    Classes of pixels with gains of their own have a period, and give both exposures the same fine detail. Resampling has a period
+    too, but correlates neighbours.
+    """
+    if correlation.found and correlation.period:
+        return list(reasons)
+    found = uneven_field(pattern, gain)
+    explained = ("periodic noise", "short contained") if found and pattern.factors else ()
+    return [*found, *(one for one in reasons if one.name not in explained)]
+
+
+def uneven_field(pattern: Pattern, gain: float) -> list[Reason]:
+    """Return the reason to report if the noise at equal signal depends on the place."""
+    if pattern.relative <= (MOST_UNEVEN_FIELD if pattern.name == "field" else BIAS):
+        return []
+    text = f"at equal signal the noise variance differs by {pattern.relative:.1%} rms (± {pattern.error:.1%}) "
+    if pattern.name == "field":
+        text += "across the field: the frames were divided by a flat field or corrected for shading, so no single gain applies"
+        return [Reason("uneven field", "doubtful", text + ". Use uncorrected frames.")]
+    gains = ", ".join(f"{gain * one:.4g}" for one in pattern.factors)
+    text += f"between classes of pixels ({pattern.name}), whose gains are {gains} counts/e⁻: amplifiers or filters of their own"
+    return [Reason("uneven gains", "doubtful", text + ". Calibrate each class alone.")]
 
 
 def full_share(pair: AlignedPair) -> float:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 from noiseflow.installation import DISTRIBUTION
 
 GROUPS = (
     "noiseflow.commands",
+    "noiseflow.fields",
     "noiseflow.methods",
     "noiseflow.noise_models",
     "noiseflow.regularisers",
@@ -56,3 +60,19 @@ def load_plugins(group: str) -> dict[str, Any]:
         except ImportError as error:
             warnings.warn(str(error), stacklevel=2)
     return loaded
+
+
+def names_of(folder: Path, group: str, *, first: str) -> list[str]:
+    """Names that the modules of a folder and the entry points of a group provide, without importing them; `first` comes first.
+    Modules with an underscore, or named ``base``, provide nothing."""
+    own = [module.name for module in iter_modules([str(folder)])]
+    names = sorted(name.replace("_", "-") for name in own if not name.startswith("_") and name != "base")
+    return [first, *(name for name in names if name != first), *sorted(plugins(group))]
+
+
+def provided(name: str, package: str, group: str, attribute: str) -> Any:
+    """The object of that name: an attribute of a module of the package, or what an entry point of the group loads."""
+    other = plugins(group).get(name)
+    if other is not None:
+        return load_plugin(other)
+    return getattr(import_module(f"{package}.{name.replace('-', '_')}"), attribute)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from noiseflow.distributions.base import NoiseDistribution
+    from noiseflow.distributions.noise_distribution import NoiseDistribution
 
 
 @runtime_checkable

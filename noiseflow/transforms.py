@@ -1,6 +1,6 @@
 """Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2.
 
-Up to version 0.1, this module held the monotone maps of flows, now in ``noiseflow.distributions.transforms``.
+Up to version 0.1, this module held the monotone maps of flows, now in ``noiseflow.distributions.numerics.monotone_maps``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from noiseflow.arrays import is_array
-from noiseflow.models.around import as_noise_model
+from noiseflow.models.wrapper import as_noise_model
 
 
 class AddNoise(nn.Module):

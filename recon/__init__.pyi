@@ -1,7 +1,8 @@
-from .fields.coordinate_network import CoordinateNetwork as CoordinateNetwork
 from .fields.fields import Field as Field
-from .fields.fields import MultiresolutionField as MultiresolutionField
-from .fields.fields import VoxelField as VoxelField
+from .fields.kinds.gaussians import GaussianField as GaussianField
+from .fields.kinds.grids import MultiresolutionField as MultiresolutionField
+from .fields.kinds.network import CoordinateNetwork as CoordinateNetwork
+from .fields.kinds.voxels import VoxelField as VoxelField
 from .fields.regularisers import total_variation as total_variation
 from .joint.joint import JointReconstructor as JointReconstructor
 from .joint.signal_model import TomographySignal as TomographySignal
@@ -9,6 +10,7 @@ from .methods._registry import Method as Method
 from .methods._registry import reconstruct as reconstruct
 from .metrics.metrics import compare as compare
 from .metrics.metrics import fourier_shell_correlation as fourier_shell_correlation
+from .projection.dual_axis import DualAxisProjector as DualAxisProjector
 from .projection.image_formation import Linear as Linear
 from .projection.image_formation import Transmission as Transmission
 from .projection.projector import SliceProjector as SliceProjector
@@ -18,6 +20,7 @@ from .reconstruction import Reconstruction as Reconstruction
 from .series.alignment import Alignment as Alignment
 from .series.alignment_files import read_alignment as read_alignment
 from .series.alignment_files import write_alignment as write_alignment
+from .series.channels import prepare_channels as prepare_channels
 from .series.prepare import Prepared as Prepared
 from .series.prepare import prepare as prepare
 from .series.tilt_series import TiltSeries as TiltSeries

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.described import described
+from recon.fields.files import sampled_volume
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import Volume
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow import FitResult
+    from recon.fields.fields import Field
     from recon.joint.signal_model import TomographySignal
     from recon.joint.weight import WeightChoice
     from recon.uncertainty.result import Uncertainty
@@ -68,6 +70,8 @@ class Reconstruction:
         """The result for the series with the orientation reverted; tilts are reversed if their angles were negated."""
         if orientation == Orientation():
             return self
+        if self.signal_model is not None:
+            self.signal_model.field.flipped = orientation.axes
         bars = self.uncertainty
         if bars is not None:
             bars = replace(bars, std=_turned(bars.std, orientation), bias=_turned(bars.bias, orientation))
@@ -78,6 +82,25 @@ class Reconstruction:
             uncertainty=bars,
             orientation=orientation,
         )
+
+    @property
+    def field(self) -> Field | None:
+        """The volume as a field, which has values at any point; None for methods without one, and for volumes in blocks."""
+        return None if self.signal_model is None or self.slices_at_once is not None else self.signal_model.field
+
+    def sampled(self, voxel_size: float) -> Volume:
+        """The volume with other voxels, from the field.
+
+        Args:
+            voxel_size: Å; smaller voxels show the field between the voxels of the fit.
+
+        Raises:
+            ValueError: there is no field, or its voxel size is not known.
+        """
+        if self.field is None:
+            how = f"method {self.method}" if self.slices_at_once is None else "a volume in blocks"
+            raise ValueError(f"{how} has no field to sample; fit the whole volume with --method joint")
+        return sampled_volume(self.field, voxel_size)
 
     @property
     def weight(self) -> float:

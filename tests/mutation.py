@@ -41,14 +41,14 @@ from tests.mutation_left_out import LEFT_OUT
 
 ROOT = Path(__file__).parents[1]
 TARGETS = {
-    "noiseflow/distributions/transforms.py": ["noiseflow/distributions/test_transforms.py"],
-    "noiseflow/distributions/normal.py": ["noiseflow/distributions/test_normal.py"],
-    "noiseflow/distributions/law.py": ["noiseflow/distributions/test_law.py"],
-    "noiseflow/distributions/digitised.py": [
+    "noiseflow/distributions/numerics/monotone_maps.py": ["noiseflow/distributions/test_transforms.py"],
+    "noiseflow/distributions/numerics/normal.py": ["noiseflow/distributions/test_normal.py"],
+    "noiseflow/distributions/noise_distribution.py": ["noiseflow/distributions/test_law.py"],
+    "noiseflow/distributions/wrappers/digitised.py": [
         "noiseflow/distributions/test_digitised.py",
         "noiseflow/models/test_digitisation.py",
     ],
-    "noiseflow/fitting/pixels.py": ["noiseflow/fitting/test_pixels.py"],
+    "noiseflow/fitting/pixel_split.py": ["noiseflow/fitting/test_pixels.py"],
     "noiseflow/fitting/observation_table.py": [
         "noiseflow/fitting/test_table_edges.py",
         "noiseflow/distributions/test_tabulated.py",
@@ -59,7 +59,11 @@ TARGETS = {
     ],
     "noiseflow/metrics/evaluation.py": ["noiseflow/metrics/test_metrics.py"],
     "noiseflow/io/mrc.py": ["noiseflow/io/test_mrc.py", "noiseflow/io/test_tilt_axis.py"],
-    "noiseflow/io/angles.py": ["noiseflow/io/test_alignment.py", "recon/series/test_tilt_series.py"],
+    "noiseflow/io/angles.py": [
+        "noiseflow/io/test_alignment.py",
+        "recon/series/test_tilt_series.py",
+        "test_series_files.py",
+    ],
     "recon/projection/projector.py": ["recon/projection/test_projector.py"],
     "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
     "recon/projection/wbp.py": ["recon/projection/test_wbp.py"],
@@ -67,7 +71,7 @@ TARGETS = {
     "recon/fields/regularisers/total_variation.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
     "recon/fields/occupancy.py": ["recon/fields/test_occupancy.py", "recon/fields/test_vacuum.py"],
     "calibration/detector/log_posterior.py": ["calibration/detector/test_log_posterior.py"],
-    "recon/joint/state_files.py": ["recon/joint/test_state_files.py", "recon/test_resume.py"],
+    "noiseflow/runs/states.py": ["noiseflow/runs/test_states.py", "recon/test_resume.py"],
 }
 """File → the tests nearest to it, nearest first."""
 PAIRS: dict[type, type] = {
@@ -100,7 +104,7 @@ class Mutant:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Outcome:
     """What became of a mutant."""
 
     file: str
@@ -245,7 +249,7 @@ def survives(tests: list[str], mutant: Mutant | None, seconds: float) -> bool:
     return status == 0
 
 
-def judge(chosen: list[tuple[str, int]]) -> Iterator[Verdict]:
+def judge(chosen: list[tuple[str, int]]) -> Iterator[Outcome]:
     """Run every mutant, a file and an index, against its tests, after making sure that these pass as they are."""
     patience: dict[str, float] = {}
     for file, index in chosen:
@@ -256,7 +260,7 @@ def judge(chosen: list[tuple[str, int]]) -> Iterator[Verdict]:
                 raise SystemExit(f"the tests of {file} fail as they are")
             patience[file] = max(LEAST_SECONDS, PATIENCE * (_children_seconds() - before))
         killed = not survives(tests, changed, patience[file])
-        yield Verdict(file, changed.line, changed.before, changed.after, killed)
+        yield Outcome(file, changed.line, changed.before, changed.after, killed)
 
 
 def _children_seconds() -> float:
@@ -264,7 +268,7 @@ def _children_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def table(verdicts: list[Verdict]) -> str:
+def table(verdicts: list[Outcome]) -> str:
     """Markdown: a row for each file, then each survivor."""
     rows = ["| file | mutants | killed |", "|---|---|---|"]
     for file in TARGETS:

@@ -21,7 +21,7 @@ KIND = "of this tensor the number type and the device are taken over, nothing el
 RNG = "seed of the package's own random choices: another seed is another, equally good choice"
 
 LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
-    "noiseflow/distributions/transforms.py": [
+    "noiseflow/distributions/numerics/monotone_maps.py": [
         ("small = t < 1e-3", "numbers", BOTH),
         ("small = t < 1e-3", "t < 0.001", BOTH),
         ("torch.where(x < 0, self.left, self.right)", "x < 0", "at 0 the map is 0 with slope 1 whatever the weight"),
@@ -33,7 +33,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "at the end of the knots nothing lies beyond: the slope is not used",
         ),
     ],
-    "noiseflow/distributions/normal.py": [
+    "noiseflow/distributions/numerics/normal.py": [
         ("limit: float = 12.0, count: int = 401", "numbers", FINER),
         ("flip = low > -high", "low > -high", "an interval symmetric about zero is its own mirror image"),
         ("narrow = width * (1 + middle.abs()) < 0.1", "numbers", BOTH),
@@ -55,13 +55,13 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("torch.where(far, x, -torch.ones_like(x))", "-torch.ones_like(x)", SAFE),
         ("torch.where(high <= 0, left", "high <= 0", "at 0 both forms are the same number"),
     ],
-    "noiseflow/distributions/law.py": [
+    "noiseflow/distributions/noise_distribution.py": [
         ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
         ("num_steps: int = 60", "numbers", FINER),
         ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
         ("like=torch.empty(0,", "numbers", KIND),
     ],
-    "noiseflow/distributions/digitised.py": [
+    "noiseflow/distributions/wrappers/digitised.py": [
         ("like=torch.empty(0,", "numbers", KIND),
         (
             "if inside.shape == self.batch_shape",

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from noiseflow.commands import console
+from noiseflow import progress
 from noiseflow.commands.cli import main
 
 FORK = multiprocessing.get_context("fork")
@@ -48,7 +48,7 @@ def wait_for(condition: Callable[[], bool], process: ForkProcess, seconds: float
 def _child(arguments: list[str], log: Path) -> None:
     os.setpgrp()
     torch.set_num_threads(1)
-    console._LOG_SECONDS = -1.0
+    progress._LOG_SECONDS = -1.0
     with log.open("w", buffering=1) as stream:
         sys.stdout = sys.stderr = stream
         sys.argv = ["noiseflow", *arguments]

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow.commands import console, sample_files
+from noiseflow import progress
+from noiseflow.commands import sample_files
 from noiseflow.commands.cli import main
 from tests.bad_files import ANGLES, make_good_files
 
@@ -93,7 +94,7 @@ def test_bars_fit_a_terminal_and_tell_rate_and_time(name: str, good: Path, tmp_p
 
 @pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(console, "_LOG_SECONDS", -1.0)
+    monkeypatch.setattr(progress, "_LOG_SECONDS", -1.0)
     for more in ([], ["--json"]):
         with pytest.raises(SystemExit) as ended:
             main([*words(name, good, tmp_path), *more, "--debug"])  # an error shows where it comes from

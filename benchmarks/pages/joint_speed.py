@@ -14,8 +14,9 @@ import torch
 from benchmarks.scenes import in_turn, make_scene
 from noiseflow import Gaussian, fit
 from noiseflow.kept_memory import kept_memory
-from recon.fields.coordinate_network import CoordinateNetwork
-from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.kinds.voxels import VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.methods.kniesel2022.presets import PRESETS
@@ -100,7 +101,7 @@ def network(size: int = 96) -> Row:
     return row | {"ratio": row["ray by ray"] / slice_wise}
 
 
-_NETWORK = partial(CoordinateNetwork, width=32, layers=3, frequencies=6, skip=1)
+_NETWORK = partial(CoordinateNetwork, width=32)
 
 
 def skipping(

@@ -12,6 +12,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
+from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
@@ -117,8 +118,9 @@ def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[I
     for one, known in zip(residuals, expected or [np.zeros(len(LAGS))] * len(residuals), strict=True):
         for index, (dy, dx) in enumerate(LAGS):
             first, second = _shifted(dy, dx)
-            count = float(np.count_nonzero(one.mask[first] & one.mask[second]))
-            products[index] += float((one.z[first] * one.z[second]).sum()) - count * known[index]
+            frames = one.z.size // one.mask.size
+            count = float(frames * np.count_nonzero(one.mask[first] & one.mask[second]))
+            products[index] += float((one.z[..., *first] * one.z[..., *second]).sum()) - count * known[index]
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
     near = _near_clear(value, error)
@@ -177,10 +179,11 @@ def _period(residual: Residual) -> float:
     from scipy.ndimage import maximum_filter1d
 
     found = [0.0]
-    scene = np.zeros(residual.z.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
-    for z, signal in ((residual.z, scene), (residual.z.T, scene.T)):
+    scene = np.zeros(residual.mask.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
+    for z, signal in ((residual.z, scene), (residual.z.swapaxes(-1, -2), scene.T)):
         own = maximum_filter1d(_lines(signal.mean(0)), 3)
-        for profile in ((z**2).mean(0), (z[:, 1:] * z[:, :-1]).mean(0)):
+        rows = tuple(range(z.ndim - 1))
+        for profile in ((z**2).mean(rows), neighbour_products(z).mean(rows)):
             if len(profile) < LEAST_PROFILE:
                 continue
             relative = _lines(profile)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.detector.correlation import Correlation, correlation_of_residuals
+from calibration.detector.correlation import LAGS, Correlation, correlation_of_residuals
 from calibration.detector.independence import correlation_of_flats
 from calibration.detector.moments import Level, level_of
+from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.posterior import Interval
 from calibration.detector.residual import CUT, Residual
+from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image
+from calibration.exposures.outliers import without_outliers
 from noiseflow.described import described
+from noiseflow.statistics import weighted_line
 
 LINEAR_RANGE = 0.7
 """Fraction of saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
@@ -25,6 +28,7 @@ LEVEL_ERROR = 0.003
 
 NINETY = 1.645
 LEAST_LEVELS = 2
+_POINT = ("mean", "variance", "variance_error")
 
 
 @described(
@@ -61,6 +65,9 @@ class CameraFigures:
         dark: moments of the dark frames; None without dark frames.
         correlation: correlation of the temporal noise of neighbouring pixels.
         chi_squared: χ² per degree of freedom of the photon-transfer line.
+        bend: exponent of the response to light; the gain is the local one at the mean signal.
+        pattern: places whose noise differs at equal signal.
+        outliers: number of values that stood out in one frame only and were replaced.
         lag: correlation of the noise of successive frames; 0 if not significant.
     """
 
@@ -80,6 +87,9 @@ class CameraFigures:
     dark: Level | None
     correlation: Correlation
     chi_squared: float
+    bend: Response
+    pattern: Pattern
+    outliers: int = 0
     lag: float = 0.0
 
     @property
@@ -114,6 +124,7 @@ def measure_camera(
         NotMeasurable: there are too few levels, all are saturated, or the noise does not grow with the signal.
     """
     _require_equal(flats, darks, flat_times, dark_times)
+    flats, darks, outliers = _without_outliers(flats, darks)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
     ordered = [flats[int(index)] for index in order]
     levels = tuple(map(level_of, ordered))
@@ -138,8 +149,21 @@ def measure_camera(
             "differ more"
         )
     unsaturated = [flat for flat, level in zip(ordered, levels, strict=True) if any(level is one for one in used)]
-    residuals = [one for flat in unsaturated for one in _residuals(flat)]
-    correlation = correlation_of_residuals(residuals)
+    fixed = 0.0 if dark is None else dark.image - dark.mean
+    residuals = [
+        _residual(flat, np.maximum(intercept + slope * (level.image - fixed), 0.1 * level.variance))
+        for flat, level in zip(unsaturated, used, strict=True)
+    ]
+    # a difference less its mean over N pixels has a correlation of −1/(N − 1) between any two
+    own = np.full(len(LAGS), -1 / max(flats[0].frames[0].size - 1, 1))
+    correlation = correlation_of_residuals(residuals, [own] * len(residuals))
+    mean, variance, spread = (np.array([getattr(one, name) for one in points]) for name in _POINT)
+    bend = response_of(
+        mean,
+        variance,
+        np.hypot(spread, LEVEL_ERROR * np.abs(variance)),
+        offset=None if dark is None else (dark.mean, 0.0),
+    )
     dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
     zero = offset if offset is not None else 0.0
     top = levels[int(np.argmax([level.variance for level in levels]))]
@@ -148,7 +172,7 @@ def measure_camera(
     half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
     times = None if flat_times is None else [flat_times[int(index)] for index in order]
     return CameraFigures(
-        gain=_normal(slope, error),
+        gain=bend.local(_normal(slope, error)),
         dark_noise=None if dark_noise is None or dark is None else _normal(dark_noise, _read_error(dark, slope, error)),
         offset=offset,
         saturation=float(saturation),
@@ -159,13 +183,26 @@ def measure_camera(
         dsnu=None if dark is None else float(np.sqrt(max(dark.spatial, 0.0)) / slope),
         prnu=None if dark is None else float(np.sqrt(max(half.spatial - dark.spatial, 0.0)) / (half.mean - dark.mean)),
         dark_current=_dark_current(dark_levels, dark_times, slope),
-        excess_factor=_excess_factor(points, slope, intercept),
+        excess_factor=_excess_factor(points, slope, error),
         levels=levels,
         dark=dark,
         correlation=correlation,
         chi_squared=chi_squared,
+        bend=bend,
+        pattern=pattern_of(residuals, inflation=correlation.inflation),
+        outliers=outliers,
         lag=correlation_of_flats(unsaturated),
     )
+
+
+def _without_outliers(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int]:
+    cleaned = [
+        (replace(one, frames=frames), number)
+        for one in (*flats, *darks)
+        for frames, number in [without_outliers(one.frames)]
+    ]
+    found = [one for one, _ in cleaned]
+    return found[: len(flats)], found[len(flats) :], sum(number for _, number in cleaned)
 
 
 def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:
@@ -198,20 +235,13 @@ def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
 
 def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
     """Return the slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
-    mean, variance, error = (
-        np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
-    )
+    mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in _POINT)
     spread = np.hypot(error, LEVEL_ERROR * np.abs(variance))
-    weight = 1 / spread**2
-    middle = float(np.average(mean, weights=weight))
-    information = float(np.sum(weight * (mean - middle) ** 2))
-    slope = float(np.sum(weight * (mean - middle) * variance)) / max(information, np.finfo(float).tiny)
-    intercept = float(np.average(variance, weights=weight)) - slope * middle
-    chi_squared = float(np.sum(weight * (variance - intercept - slope * mean) ** 2)) / max(len(points) - 2, 1)
-    return slope, float(np.sqrt(max(chi_squared, 1.0) / max(information, np.finfo(float).tiny))), intercept, chi_squared
+    line = weighted_line(mean, variance, 1 / spread**2)
+    return line.slope, line.slope_error * max(line.chi_squared, 1.0) ** 0.5, line.intercept, line.chi_squared
 
 
-def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> Interval | None:
+def _excess_factor(points: Sequence[Level], slope: float, slope_error: float) -> Interval | None:
     """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
 
     With K = g·F², the third central moment grows by K²·(2 − 1/F²) per count: K² for Poisson noise, 1.5·K² for F² = 2.
@@ -221,11 +251,9 @@ def _excess_factor(points: Sequence[Level], slope: float, intercept: float) -> I
         return None
     mean = np.array([one.mean for one in known])
     third, error = (np.array([float(getattr(one, name) or 0.0) for one in known]) for name in ("third", "third_error"))
-    weight = 1 / np.maximum(error, np.finfo(float).tiny) ** 2
-    centred = mean - np.average(mean, weights=weight)
-    information = float(np.sum(weight * centred**2))
-    ratio = float(np.sum(weight * centred * third)) / information / slope**2
-    spread = 1 / np.sqrt(information) / slope**2
+    line = weighted_line(mean, third, 1 / np.maximum(error, np.finfo(float).tiny) ** 2)
+    ratio = line.slope / slope**2
+    spread = float(np.hypot(line.slope_error / slope**2, 2 * ratio * slope_error / slope))
     if spread > 0.1:  # cannot distinguish the ratios 1 and 1.5 at three standard errors
         return None
     low, middle, high = (
@@ -245,23 +273,13 @@ def _dark_current(darks: Sequence[Level], times: Sequence[float] | None, slope: 
     return float(np.polyfit(np.asarray(times, float), [one.mean for one in darks], 1)[0] / slope)
 
 
-def _residuals(burst: Burst) -> list[Residual]:
-    """Return standardised differences of successive frames; each frame is used once."""
-    found = []
-    mask: NDArray[np.bool_] = np.ones(burst.frames.shape[1:], bool)
-    for first, second in zip(burst.frames[::2], burst.frames[1::2], strict=False):
-        difference = first - second
-        difference = difference - difference.mean()
-        spread = float(difference.std())
-        found.append(
-            Residual(
-                np.clip(difference / max(spread, np.finfo(float).tiny), -CUT, CUT),
-                mask,
-                0.0,
-                np.full(mask.shape, spread),
-            )
-        )
-    return found
+def _residual(burst: Burst, variance: Image) -> Residual:
+    """Return differences of successive frames over the noise expected at each pixel's signal; each frame is used once."""
+    number = len(burst.frames) // 2 * 2
+    z = (burst.frames[0:number:2] - burst.frames[1:number:2]) / np.sqrt(2 * variance)
+    z = z - z.mean(axis=(1, 2), keepdims=True)
+    z = z / max(float(z.std()), np.finfo(float).tiny)
+    return Residual(np.clip(z, -CUT, CUT), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
 
 
 def _normal(middle: float, error: float) -> Interval:

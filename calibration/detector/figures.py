@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,11 +37,13 @@ class Figures:
     """Gain, offset and read noise as reported, with 90 % intervals.
 
     Attributes:
-        gain: counts per electron, times the excess-noise factor if the detector has one.
+        gain: counts per electron, times the excess-noise factor if the detector has one: the local gain at the mean signal. The
+            interval includes that the exponent of the response may not be known.
         offset: counts; None if the exposures do not determine it.
         read_noise: electrons rms; None if the exposures do not determine it.
         source: ``"posterior"``, or ``"photon transfer"`` if the noise is not Poisson-Gaussian. Photon transfer is valid for any
             detector of independent events.
+        linear: the same for a detector with a linear response.
         factor: correction of the gain for the variance lost by pixel correlation or resampling; 1 if none.
     """
 
@@ -50,6 +52,7 @@ class Figures:
     read_noise: Interval | None
     source: str = "posterior"
     factor: float = 1.0
+    linear: Interval | None = None
 
 
 def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -> Figures:
@@ -60,6 +63,20 @@ def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -
         correlation: correlation of the residuals of the same pairs.
         repairs: violated assumptions that were modelled.
     """
+    figures = _of_linear(detector, correlation, repairs)
+    if detector.electrons:  # the distance of the peaks is the gain, whatever the response
+        return replace(figures, linear=figures.gain)
+    local = detector.response.local(figures.gain)
+    read = figures.read_noise
+    if read is not None:
+        change = figures.gain.median / local.median
+        low, high = (local.median / one for one in (local.q95, local.q05))
+        kept = figures.gain.median / figures.gain.q95, figures.gain.median / max(figures.gain.q05, 1e-3 * local.median)
+        read = Interval(change * read.median, change * read.q05 * low / kept[0], change * read.q95 * high / kept[1])
+    return replace(figures, gain=local, linear=figures.gain, read_noise=read)
+
+
+def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -> Figures:
     found = detector.posterior
     figures = Figures(_with_line(detector), found.offset, found.read_noise)
     if not poisson_gaussian(detector):

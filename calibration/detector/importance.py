@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
+from noiseflow.progress import Progress
 
 DRAWS = 256
 """Number of draws per round, sufficient for a density of three parameters."""
@@ -75,7 +76,7 @@ def importance_sample(
     log_density: Callable[[Image], Image],
     starts: Sequence[tuple[Image, Image]],
     generator: np.random.Generator,
-    progress: Callable[[int, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Weighted | None:
     """Sample a density with an adaptive mixture of kernels (adaptive multiple importance sampling).
 
@@ -86,7 +87,7 @@ def importance_sample(
         log_density: function (W, 3) -> (W,) nats.
         starts: (3,) points, the maximum first, with (3, 3) covariances; one round each.
         generator: random generator.
-        progress: called with the number of evaluations done and a note.
+        progress: called with a task, the evaluations done and at most needed, and a note.
 
     Returns:
         The weighted draws, or None if `ROUNDS` rounds give fewer than `ENOUGH` effective samples.
@@ -108,7 +109,12 @@ def importance_sample(
         weight = np.exp(log_weight - log_weight.max())
         found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2)
         if progress is not None:
-            progress(len(draws), f"{found.effective:.0f} effective samples")
+            progress(
+                "Sampling the detector's posterior",
+                len(draws),
+                DRAWS * ROUNDS,
+                f"{found.effective:.0f} effective samples",
+            )
         if number + 1 < len(kernels):
             continue
         if number > len(starts) and found.effective > ENOUGH:

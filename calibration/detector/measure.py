@@ -13,8 +13,9 @@ from calibration.detector.cells import collect_cells
 from calibration.detector.electrons import electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
-from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
+from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
+from calibration.detector.response import LINEAR, RATIO_ERROR, Response, response_of
 from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
@@ -23,7 +24,7 @@ from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
 if TYPE_CHECKING:
-    from noiseflow.commands.console import Progress
+    from noiseflow.progress import Progress
 
 EXCESS_NOISE = (
     "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only the "
@@ -64,6 +65,7 @@ class Detector:
         uneven: relative deviation (rms) of the pixels' variances at equal signal, in a burst of at least four frames; 0 if none.
         codes: relative deviation (rms) of the converter's code widths; 0 if none.
         electrons: whether the pixel values have single-electron peaks, one gain apart.
+        response: exponent of the response to light.
         dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
 
     Example:
@@ -85,6 +87,7 @@ class Detector:
     misfit: float
     uneven: float = 0.0
     dark_deviation: float | None = None
+    response: Response = LINEAR
     codes: float = 0.0
     electrons: bool = False
 
@@ -104,7 +107,7 @@ def measure_detector(
         dark: frames taken without light; they determine offset and read noise directly.
         flat: frames of uniform illumination; they add one level.
         seed: random seed of the sampler.
-        progress: called with the number of steps of the sampler and a note.
+        progress: called with a task, steps of the sampler, at most how many, and a note.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.
@@ -151,6 +154,7 @@ def measure_detector(
         chi_squared,
         uneven=unevenness(pairs),
         dark_deviation=dark_deviation(dark),
+        response=_response(pairs, line, offset),
         codes=codes,
         electrons=electrons_show(levels, float(posterior.most_likely[0])),
     )
@@ -262,6 +266,19 @@ def _kept(pair: AlignedPair) -> float:
     """Return the fraction of white-noise variance that interpolation of the long exposure preserves."""
     noise = np.random.default_rng(0).standard_normal(pair.long.shape)
     return float(np.var(pair.registration.warp(noise)[0][pair.mask]))
+
+
+def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:
+    """Fit the exponent of the response; the offset is that of dark frames, or of two exposures of one setting."""
+    alike = [pair for pair in pairs if pair.one_setting]
+    free = line.clipped < 1e-3
+    error = np.hypot(line.variance_error, MODEL_ERROR * line.variance)
+    ratio = None
+    if alike:
+        powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
+        ratio = float(np.mean(powers)), RATIO_ERROR / float(np.log(alike[0].exposure_ratio or 1.0))
+        offset = offset or alike[0].scaling.common_offset()
+    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio)
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

@@ -13,6 +13,9 @@ MOST_CLIPPED = 1e-3
 """Largest share of clipped pixel values that hardly affects the variance: clipping at three standard deviations reduces it by
 0.3 %."""
 
+CLEAR = 5.0
+"""Standard errors above which the light is not steady; the means of a few pixels of skewed noise exceed three once in 100."""
+
 COARSE = 0.24
 """Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between
 two codes (EMVA 1288, release 3.1, section 6.5)."""
@@ -60,15 +63,21 @@ def level_of(burst: Burst) -> Level:
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
     rounding = rounding_step(frames[0]) ** 2 / 12
     means = frames.mean(axis=(1, 2))
-    drift = max(float(means.var(ddof=1)) - float(noise.mean()) / image.size, 0.0)  # light that changed between frames
+    drift = float(means.var(ddof=1)) - float(noise.mean()) / image.size  # light that changed between frames
+    if drift < CLEAR * float(noise.mean()) / image.size * np.sqrt(2 / (number - 1)):
+        drift = 0.0
     variance = float(noise.mean()) - drift
-    residual = (frames - image) - (means - means.mean())[:, None, None]
+    residual = frames - image
+    shrunk = 1.0
+    if image.size > 2:  # a frame's mean over N pixels takes part of the third moment with it
+        residual = residual - (means - means.mean())[:, None, None]
+        shrunk = (1 - 1 / image.size) * (1 - 2 / image.size)
     fourth = float(np.mean(residual**4)) * (number / (number - 1)) ** 2 if number > 2 else 3 * variance**2
     error = np.sqrt(max(fourth - variance**2, 0.5 * variance**2) / (image.size * (number - 1)))
     third, third_error = None, 0.0
     if number > 2:
-        scale = number**2 / ((number - 1) * (number - 2))  # unbiased third central moment
-        cubes = (residual**3).mean(axis=0) * scale
+        scale = number**2 / ((number - 1) * (number - 2)) / shrunk  # unbiased third central moment
+        cubes = residual**3 * scale
         third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
     spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
     low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))

@@ -11,6 +11,7 @@ from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
 from noiseflow.described import described
+from noiseflow.statistics import weighted_line
 
 MODEL_ERROR = 0.005
 """Relative model error added to the error of each level's variance, so that one level with very many pixels does not dominate the
@@ -123,13 +124,9 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     for _ in range(3):
         level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
         weight = 1 / (level**2 * (relative**2 + MODEL_ERROR**2))
-        middle = float(np.average(signal, weights=weight))
-        information = float(np.sum(weight * (signal - middle) ** 2))
-        rate = float(np.sum(weight * (signal - middle) * variance)) / information
-        line = VarianceLine(float(np.average(variance, weights=weight)) - rate * middle, rate)
-    departure = variance - line.floor - line.rate * signal
-    chi_squared = float(np.sum(weight * departure**2)) / max(len(signal) - 2, 1)
-    return line, float(np.sqrt(max(chi_squared, 1.0) / information)), chi_squared
+        found = weighted_line(signal, variance, weight)
+        line = VarianceLine(found.intercept, found.slope)
+    return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
 
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:

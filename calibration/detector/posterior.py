@@ -16,7 +16,7 @@ from calibration.exposures.frames import Image
 from noiseflow.described import described
 
 if TYPE_CHECKING:
-    from noiseflow.commands.console import Progress
+    from noiseflow.progress import Progress
 
 NUM_WALKERS = 16
 
@@ -155,7 +155,7 @@ def sample_posterior(
         num_steps: number of steps before the first convergence check.
         largest_num_steps: largest number of steps.
         seed: random seed.
-        progress: called with the number of steps done, at most `largest_num_steps`, and a note.
+        progress: called with a task, steps done, at most how many, and a note.
 
     Raises:
         ValueError: the chain has not converged; the message states how many steps are required.
@@ -217,7 +217,12 @@ def _chain(
         chain = sampler.get_chain()
         time, rhat = float(np.max(sampler.get_autocorr_time(tol=0))), potential_scale_reduction(chain)
         if progress is not None:
-            progress(len(chain), f"{len(chain) / time:.0f} autocorrelation times")
+            progress(
+                "Sampling the detector's posterior",
+                len(chain),
+                largest_num_steps,
+                f"{len(chain) / time:.0f} autocorrelation times",
+            )
         if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
             return sampler, time, rhat
         if max(2 * len(chain), NUM_TIMES * time) > largest_num_steps:  # short chains underestimate it

@@ -55,11 +55,14 @@ class Residual:
     """Standardised residual of a pair's short exposure.
 
     Attributes:
-        z: (y, x) residual over the standard deviation at its level, clipped at `CUT`, 0 outside the mask.
+        z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CUT`; 0 outside
+            the mask.
         mask: (y, x) valid pixels.
         share: share of the residual variance due to the noise of the signal.
         spread: (y, x) standard deviation at the level, counts.
         signal: (y, x) counts; None for frames without a scene.
+        expected: (y, x) squares expected from each pixel's own signal, which the pixels of a mosaic do not share; None if all are
+            equal.
     """
 
     z: Image
@@ -67,10 +70,18 @@ class Residual:
     share: float
     spread: Image
     signal: Image | None = None
+    expected: Image | None = None
 
 
 def residual_of(pair: AlignedPair) -> Residual:
-    """Compute the standardised residual of a pair."""
+    """Return the standardised residual of a pair, which is computed once."""
+    known = vars(pair)
+    if "_residual" not in known:
+        known["_residual"] = _residual_of(pair)
+    return known["_residual"]  # type: ignore[no-any-return]
+
+
+def _residual_of(pair: AlignedPair) -> Residual:
     share = float(pair.share[pair.mask].mean())
     blur = _LITTLE_BLUR if share < _LITTLE_NOISE else _MUCH_BLUR
     difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
@@ -80,7 +91,8 @@ def residual_of(pair: AlignedPair) -> Residual:
     cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
-    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal)
+    expected = pair.total_variance(pair.signal) / spread**2
+    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal, expected)
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:

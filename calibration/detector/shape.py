@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
-from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
@@ -45,9 +44,6 @@ appear many times noisier than expected."""
 
 CUT = 5.0
 """Standard deviations at which differences are clipped to limit the effect of outliers."""
-
-CHANCE = 40.0
-"""χ² with five degrees of freedom that is exceeded by chance once in 10⁷ frames."""
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
@@ -157,29 +153,6 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
         error = power / np.sqrt(independent) * float(np.sqrt(np.sum(weight**2)) / weight.sum())  # of even pixels
         found = max(found, mean if mean > CLEAR_PIXELS * error else 0.0)
     return float(np.sqrt(found))
-
-
-def field_deviation(pairs: Sequence[AlignedPair]) -> float:
-    """Return the relative deviation (rms) of the noise variance over the field at equal signal; 0 if not significant.
-
-    The variance is modelled as a second-order polynomial of the position. A flat-field division makes the gain depend on the
-    position, a camera does not.
-    """
-    gram, moment, power, number = np.zeros((5, 5)), np.zeros(5), 0.0, 0
-    for pair in pairs:
-        residual = residual_of(pair)
-        y, x = (
-            index / max(size - 1, 1) - 0.5 for index, size in zip(np.nonzero(pair.mask), pair.mask.shape, strict=True)
-        )
-        terms = np.stack([x, y, x * x, x * y, y * y])
-        terms -= terms.mean(axis=1, keepdims=True)
-        squares = residual.z[pair.mask] ** 2
-        squares = squares / squares.mean() - 1
-        gram, moment = gram + terms @ terms.T, moment + terms @ squares
-        power, number = power + float(np.sum(squares**2)), number + squares.size
-    explained = float(moment @ np.linalg.solve(gram, moment))
-    usual = power / number
-    return float(np.sqrt(explained / number - len(moment) * usual / number)) if explained > CHANCE * usual else 0.0
 
 
 def _products(frames: Image, spread: Image) -> tuple[Image, float]:

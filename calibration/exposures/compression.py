@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.exposures.frames import Image
 from noiseflow.models.digitisation import detect_digitisation
+from noiseflow.statistics import robust_deviation
 
 SIDE = 8
 """Side of a block in JPEG and its successors, pixels."""
@@ -120,6 +121,4 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
 
 def _deviations(values: Image) -> Image:
     """Distance from the median in robust standard deviations."""
-    middle = np.median(values)
-    scatter = 1.4826 * float(np.median(np.abs(values - middle)))
-    return np.asarray((values - middle) / max(scatter, np.finfo(float).tiny))
+    return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))

@@ -17,6 +17,10 @@ from noiseflow.models.digitisation import detect_digitisation
 
 Image = NDArray[np.float64]
 
+ALIKE = 0.8
+"""Mean squared difference of successive slices along the last axis, relative to that along the first, below which the last axis
+counts the frames. It is 1 for pure noise, whose axes do not matter, and above 1 for frames along the first axis."""
+
 MINIMUM_SIDE = 32
 """Smallest frame side, in pixels, that can be registered and measured."""
 
@@ -194,8 +198,39 @@ def _largest_value(data: NDArray[Any]) -> float:
     return float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else float("inf")
 
 
+def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[Any], str]:
+    """Read the frames of a file, and return them with the file's name for messages.
+
+    Arrays whose last axis counts the frames, as in MATLAB, are recognised: successive frames of one scene differ less than
+    neighbouring pixels.
+
+    Args:
+        path: the file.
+        channel: name or index of one channel or image, if the file holds several.
+
+    Returns:
+        (frame, y, x) or (y, x) array, and the name.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
+    """
+    data, name = read(path, channel=channel).data, str(path)
+    if data.ndim == 3 and data.shape[-1] in (3, 4) and data.shape[0] > 4:
+        raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+    if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
+        first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))
+        if last < ALIKE * first:
+            return np.moveaxis(data, 2, 0), f"{name} (axes y, x, frame)"
+    return data, name
+
+
 def read_pairs(
-    short: Sequence[str | Path], long: Sequence[str | Path], *, exposure_ratio: float | None = None
+    short: Sequence[str | Path],
+    long: Sequence[str | Path],
+    *,
+    exposure_ratio: float | None = None,
+    channel: str | None = None,
 ) -> list[ExposurePair]:
     """Read exposure pairs in the order given.
 
@@ -203,6 +238,7 @@ def read_pairs(
         short: files of the short exposures.
         long: files of the long exposures: one per short exposure, or one for all.
         exposure_ratio: exposure ratio of every pair; None if unknown.
+        channel: see `frames_of`.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -227,18 +263,27 @@ def read_pairs(
                 f"{one} was given as both short and long exposure; give two separate exposures of one scene"
             )
     return [
-        ExposurePair(read(one).data, read(other).data, exposure_ratio, str(one), str(other))
+        ExposurePair(
+            frames_of(one, channel=channel)[0],
+            frames_of(other, channel=channel)[0],
+            exposure_ratio,
+            str(one),
+            str(other),
+        )
         for one, other in zip(short, longs, strict=True)
     ]
 
 
-def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False) -> Burst:
+def read_burst(
+    paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False, channel: str | None = None
+) -> Burst:
     """Read a burst from one stack, or from single-frame files in the order recorded.
 
     Args:
         paths: the files.
         name: name of the burst in messages; by default the file name, or "the burst".
         calibration: whether these are dark or flat frames.
+        channel: see `frames_of`.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -252,14 +297,13 @@ def read_burst(paths: Sequence[str | Path], *, name: str | None = None, calibrat
         (5, 32, 32)
     """
     frames: list[NDArray[Any]] = []
+    shown = ""
     for path in paths:
-        data = read(path).data
-        if data.ndim == 3 and data.shape[-1] in (3, 4) and data.shape[0] > 4:
-            raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+        data, shown = frames_of(path, channel=channel)
         frames += list(data) if data.ndim == 3 else [data]
     for frame in frames[1:]:
         _require_same_size(frames[0], "the first frame", frame, "a later frame")
-    return Burst(np.stack(frames), name or (str(paths[0]) if len(paths) == 1 else "the burst"), calibration)
+    return Burst(np.stack(frames), name or (shown if len(paths) == 1 else "the burst"), calibration)
 
 
 def _holds(name: str) -> str:
@@ -267,7 +311,9 @@ def _holds(name: str) -> str:
     return "contain" if name.endswith("frames") else "contains"
 
 
-def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -> list[Burst]:
+def read_levels(
+    paths: Sequence[str | Path], *, name: str = "the flat frames", channel: str | None = None
+) -> list[Burst]:
     """Read flat frames at several light levels.
 
     Each stack is one level. Consecutive single-frame files with equal means also form one level.
@@ -275,6 +321,7 @@ def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -
     Args:
         paths: the files.
         name: name of the frames in messages.
+        channel: see `frames_of`.
 
     Raises:
         FileNotFoundError: a file does not exist.
@@ -283,7 +330,7 @@ def read_levels(paths: Sequence[str | Path], *, name: str = "the flat frames") -
     levels: list[list[NDArray[Any]]] = []
     single = False
     for path in paths:
-        data = read(path).data
+        data, _ = frames_of(path, channel=channel)
         frames = list(data) if data.ndim == 3 else [data]
         equal = levels and single and len(frames) == 1 and _equal_light(levels[-1][-1], frames[0])
         if equal:

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from calibration.exposures.frames import Image, rails, saturation_level
 from calibration.exposures.scaling import spread_by_level
+from noiseflow.statistics import robust_deviation
 
 Mask = NDArray[np.bool_]
 
@@ -29,6 +30,7 @@ class MaskCounts:
     hot: int
     dead: int
     restless: int = 0
+    outliers: int = 0
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
@@ -131,5 +133,5 @@ def _deviation(frame: Image) -> Image:
     result = np.empty(frame.size)
     for group in np.array_split(order, max(1, frame.size // 2000)):
         values = difference.flat[group]
-        result[group] = values / max(1.4826 * np.median(np.abs(values)), np.sqrt(np.finfo(float).tiny))
+        result[group] = values / max(robust_deviation(values, 0.0), np.sqrt(np.finfo(float).tiny))
     return result.reshape(frame.shape)

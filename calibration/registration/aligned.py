@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from calibration.exposures.frames import ExposurePair, Image, rails
+from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, saturated
+from calibration.exposures.outliers import outliers_of
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from noiseflow.described import described
@@ -141,14 +143,20 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal = scaling.slope * long + scaling.intercept
+    found = outliers_of(
+        pair.short - signal, scaling.slope * level + scaling.intercept, trusted, step=rounding_step(pair.short)
+    )
+    found = ndimage.binary_dilation(found, iterations=1) & trusted  # the finest band reaches one pixel
+    trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
     own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0])
     _require_cleaner(pair, total, own, signal[mask])
-    lost = covered & ~trusted & ~hot & ~dead
-    counts = MaskCounts(*(int(m.sum()) for m in (~covered, (railed & trusted) | lost, hot, dead)))
+    lost = covered & ~trusted & ~hot & ~dead & ~found
+    lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
+    counts = MaskCounts(*(int(one.sum()) for one in lost_by))
     return AlignedPair(
         pair.short, pair.long, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio
     )

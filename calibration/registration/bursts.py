@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated
+from calibration.exposures.outliers import without_outliers
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
@@ -37,6 +38,7 @@ class BurstReport:
         dose_error: (frame,) standard errors of `dose`.
         drifting: whether the frames were registered before they were compared.
         fading: whether the dose changes by more than its errors and `LEAST_DOSE_CHANGE`.
+        outliers: number of values that stood out in one frame only and were replaced.
 
     Example:
         >>> import calibration, noiseflow, torch
@@ -54,6 +56,7 @@ class BurstReport:
     dose_error: Image
     drifting: bool
     fading: bool
+    outliers: int = 0
 
 
 def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
@@ -80,7 +83,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
         >>> len(pairs), report.drifting
         (6, False)
     """
-    frames = burst.frames
+    frames, outliers = without_outliers(burst.frames)
     hot, dead = defects(frames)
     trusted = ~(hot | dead | np.any([saturated(frame) for frame in frames], axis=0))
     # select by the mean: a selection by single pixel values would truncate their noise
@@ -108,7 +111,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     dose = np.array([pair.scaling.slope for pair in pairs])
     error = np.array([pair.scaling.slope_error for pair in pairs])
     fading = bool(np.any(np.abs(dose - 1) > np.maximum(3 * error, LEAST_DOSE_CHANGE)))
-    return pairs, BurstReport(shift, drift, dose, error, drifting, fading)
+    return pairs, BurstReport(shift, drift, dose, error, drifting, fading, outliers)
 
 
 def _registrations(frames: Image) -> list[Registration | None]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from calibration.exposures.frames import Image
+from noiseflow.statistics import block_means
 
 Method = Literal["sift", "phase correlation"]
 
@@ -63,7 +64,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
     """
     for blur in (1.5, 4.0):
         factor = max(1, int(blur / 1.5), max(short.shape) // 512)
-        first, second = (_binned(band_pass(image, blur), factor) for image in (short, long))
+        first, second = (block_means(band_pass(image, blur), factor, factor) for image in (short, long))
         step = np.degrees(3.0 / max(first.shape))
         angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
         _, matrix = max((_best_shift(first, second, angle) for angle in angles), key=lambda item: item[0])
@@ -170,12 +171,6 @@ def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image
     matrix = turn.copy()
     matrix[:, 2] += turn[:, :2] @ np.array(shift)
     return float(surface[row, column]), matrix
-
-
-def _binned(image: Image, factor: int) -> Image:
-    rows, columns = (n // factor * factor for n in image.shape)
-    tiles = image[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
-    return np.asarray(tiles.mean(axis=(1, 3)))
 
 
 def _scaled(matrix: Image, factor: int) -> Image:

@@ -9,8 +9,9 @@ import numpy as np
 
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
-from calibration.detector.models import ModelScore, simplest_sufficient
+from calibration.detector.models import CHANCE, HEAVIER, ModelScore, foremost, simplest_sufficient
 from calibration.detector.posterior import Interval
+from calibration.detector.response import Response
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
@@ -31,6 +32,11 @@ from noiseflow.report import Report, provenance
 LARGEST_MISALIGNMENT = 0.1
 """Largest registration error without visible residuals, pixels."""
 
+UNKNOWN_RESPONSE = (
+    "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
+    "from 0.85 to 1.15; add dark frames or --exposure-ratio to measure it."
+)
+
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
 
 LEAST_DIVERGENCE = 5e-4
@@ -42,14 +48,31 @@ TABLE_HEADER = (
 )
 
 
+TAILS_HEADER = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
+
+
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
-    """Return the scores of each model as text; divergences in units of 10⁻⁴."""
-    return [_row(score) for score in scores]
+    """Return the scores of each model as text; divergences, in units of 10⁻⁴, of the foremost ones."""
+    compared = foremost(scores) if scores else []
+    return [_row(score, score in compared) for score in scores]
 
 
-def _row(score: ModelScore) -> list[str]:
-    judged, overall = score.evaluation, score.evaluation.overall
+def tail_rows(score: ModelScore) -> list[list[str]]:
+    """Return the shares beyond 3, 4 and 5 standard deviations at each signal, per cent, each beside the model's."""
+    return [
+        [
+            f"{one.signal:.5g}",
+            *(f"{100 * value:.3g}" for two in zip(one.observed, one.expected, strict=True) for value in two),
+        ]
+        for one in score.evaluation.tails
+    ]
+
+
+def _row(score: ModelScore, compared: bool) -> list[str]:
     likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
+    if not compared:
+        return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
+    judged, overall = score.evaluation, score.evaluation.overall
     pairs = (
         *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
         *(judged.mean_jsd, judged.mean_jsd_floor),
@@ -77,12 +100,21 @@ def verdict(scores: Sequence[ModelScore]) -> str:
             f" However, its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
             "finite-sample floor: check the histograms before you use it."
         )
+    heavy = max(chosen.evaluation.tails, key=lambda one: one.observed[1] - one.expected[1])
+    if heavy.observed[1] > HEAVIER * heavy.expected[1] and heavy.p_value[1] < CHANCE:
+        text += (
+            f" Its tails are too light: at {heavy.signal:.4g} counts {heavy.observed[1]:.2%} of the pixels lie beyond four "
+            f"standard deviations, of the model's {heavy.expected[1]:.2%} (random telegraph noise, sparks or a changing scene)."
+        )
     return text
 
 
 def describe_figures(figures: Figures) -> str:
     """Describe gain, offset and read noise with their 90 % intervals, and the method that gave them."""
     parts = [f"{name} {_interval(value, unit)}" for name, unit, value in _named(figures)]
+    if figures.linear is not None and figures.linear != figures.gain:
+        straight = _interval(figures.linear, "counts/e⁻")
+        parts[0] += f"; for a linear response {straight}"
     source = "posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
     corrected = f"; variance multiplied by {figures.factor:.3g} for pixel correlation" if figures.factor != 1 else ""
     per_count = f"1 count = {1 / figures.gain.median:.4g} e⁻"
@@ -113,7 +145,15 @@ def describe_detector(findings: Findings) -> str:
     text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
     if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
+    text += describe_response(detector.response) + " "
     return text + EXCESS_NOISE
+
+
+def describe_response(response: Response) -> str:
+    """Describe the exponent of the response to light."""
+    if not response.known:
+        return UNKNOWN_RESPONSE
+    return f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
 
 
 def describe_burst(burst: BurstReport) -> str:
@@ -127,7 +167,8 @@ def describe_burst(burst: BurstReport) -> str:
             else "the frames were compared without registration."
         )
     dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
-    return drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
+    text = drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
+    return text + (f" {burst.outliers} outliers of single frames were replaced." if burst.outliers else "")
 
 
 def describe_registration(pair: AlignedPair) -> str:
@@ -146,7 +187,9 @@ def describe_registration(pair: AlignedPair) -> str:
         f"{found.motion} motion by {method}: shift ({x:.2f}, {y:.2f}) px, rotation {found.rotation:.3f}°, scale "
         f"{found.scale:.5f}, standard error {found.error_px:.3f} px, rms of the matches {found.rms_px:.2f} px; {ratio}. "
         f"Excluded: {counts.outside} pixels outside the long exposure, {counts.saturated} saturated, {counts.hot} hot, "
-        f"{counts.dead} dead" + (f", {counts.restless} in changing regions." if counts.restless else ".")
+        f"{counts.dead} dead"
+        + (f", {counts.outliers} at outliers of one exposure" if counts.outliers else "")
+        + (f", {counts.restless} in changing regions." if counts.restless else ".")
     )
 
 
@@ -269,6 +312,10 @@ def _add_models(page: Report, findings: Findings) -> None:
         "samples drawn from the model itself."
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
+    if findings.scores:
+        chosen = simplest_sufficient(findings.scores)
+        caption = f"Tails of the {LABELS[chosen.name]} model: share of held-out pixels beyond 3, 4 and 5 standard "
+        page.table(TAILS_HEADER, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
     histograms = histogram_figure(findings.pixels, findings.scores)
@@ -277,7 +324,7 @@ def _add_models(page: Report, findings: Findings) -> None:
         caption="Residuals of the held-out pixels at each signal level (grey), with the density of every model.",
     )
     page.figure(
-        pit_figure(findings.scores),
+        pit_figure(foremost(findings.scores)),
         caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
     )
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import noiseflow
-from noiseflow.commands.console import progress_bar
+from noiseflow.progress import progress_shown
 from noiseflow.report import new_figure, show_image
 
 DATA = Path(noiseflow.__file__).parent / "data" / "exposures_miro"
@@ -80,7 +80,7 @@ def denoise(noisy: Tensor, *, num_steps: int = 200, seed: int = 0) -> tuple[Tens
     network = BlindSpotNetwork(noisy)
     # mean preservation keeps an offset of the signal from hiding in the noise
     noise_model = noiseflow.SplineFlow(mean_preserving=True)
-    with progress_bar("network and noise", num_steps) as progress:
+    with progress_shown() as progress:
         result = noiseflow.fit(noise_model, network, noisy, num_steps=num_steps, progress=progress)
     with torch.no_grad():
         return network.signal().reshape(noisy.shape), noise_model, result

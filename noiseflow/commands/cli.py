@@ -25,7 +25,19 @@ from noiseflow.installation import DISTRIBUTION, library_version
 from noiseflow.plugins import load_plugin, package_of, plugins
 from noiseflow.threads import wait_passively
 
-_ORDER = ("demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct", "batch", "compare", "measure", "doctor")
+_ORDER = (
+    "demo",
+    "calibrate",
+    "sample",
+    "evaluate",
+    "simulate",
+    "reconstruct",
+    "batch",
+    "export",
+    "compare",
+    "measure",
+    "doctor",
+)
 _TYPED = "noiseflow.typed"
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 

@@ -1,4 +1,4 @@
-"""Shared parts of all commands: options, progress, and output for people and programs. Does not import torch."""
+"""Shared parts of all commands: options, and output for people and programs. Does not import torch."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import shlex
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Annotated, Any, NoReturn
@@ -25,20 +24,15 @@ OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace existing outputs even if noiseflow did not write them.")
 ]
 
-Progress = Callable[[int, str], None]
-"""``progress(done, note)``: number of completed steps, and a short note such as the current likelihood."""
-StepReport = Callable[[str, int, int, str], None]
-"""``report(title, done, total, note)``: the same for several tasks in sequence."""
 START_AGAIN = "no partial results were kept; run the same command to start again"
 """Message for interrupted work that keeps no state."""
-_LOG_SECONDS = 10.0
 
 
 def end_stopped(text: str) -> NoReturn:
     """Exit with one line and code 130 after an interrupt; further interrupts are ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from noiseflow.io.partials import clear_unfinished
+    from noiseflow.runs.partials import clear_unfinished
 
     clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
@@ -83,88 +77,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if value == value and abs(value) != float("inf") else None
     return value if isinstance(value, (str, int, bool, type(None))) else str(value)
-
-
-_SHOWN: ContextVar[bool] = ContextVar("shown", default=False)
-
-
-@contextlib.contextmanager
-def progress_shown() -> Iterator[None]:
-    """Show progress in JSON mode too, for commands that another command runs for their JSON result."""
-    token = _SHOWN.set(True)
-    try:
-        yield
-    finally:
-        _SHOWN.reset(token)
-
-
-@contextlib.contextmanager
-def progress_bar(title: str, total: int, *, json_mode: bool = False) -> Iterator[Progress]:
-    """Progress of one task of `total` steps; see `step_report`."""
-    with step_report(json_mode=json_mode) as report:
-        yield lambda done, note: report(title, done, total, note)
-
-
-@contextlib.contextmanager
-def step_report(*, json_mode: bool = False) -> Iterator[StepReport]:
-    """Progress with rate and remaining time: a bar on a terminal, occasional lines in a log, nothing in JSON mode."""
-    if json_mode and not _SHOWN.get():
-        yield lambda title, done, total, note: None
-    elif not sys.stderr.isatty():
-        yield _LogLines()
-    else:
-        yield from _bars()
-
-
-class _Rate:
-    """Steps per second of the current task; a new title or a smaller count starts a new measurement."""
-
-    title, first, last, started = "", 0, 0, 0.0
-
-    def __call__(self, title: str, done: int) -> float:
-        now = time.monotonic()
-        if title != self.title or done < self.last:
-            self.title, self.first, self.started = title, done - 1, now
-        self.last = done
-        return (done - self.first - 1) / (now - self.started) if now > self.started else 0.0
-
-
-class _LogLines:
-    def __init__(self) -> None:
-        self.rate, self.last = _Rate(), time.monotonic()
-
-    def __call__(self, title: str, done: int, total: int, note: str) -> None:
-        rate, now = self.rate(title, done), time.monotonic()
-        if now - self.last >= _LOG_SECONDS and rate > 0:
-            self.last = now
-            speed = f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
-            left = _duration((total - done) / rate)
-            line = f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}"
-            print(printable(line), file=sys.stderr, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def _bars() -> Iterator[StepReport]:
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as RichProgress
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    more = (TextColumn("{task.fields[rate]:.1f}/s"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
-    with RichProgress(*columns, *more, console=Console(stderr=True)) as bars:
-        task, measure = bars.add_task("", total=None, rate=0.0, note="", visible=False), _Rate()
-
-        def report(title: str, done: int, total: int, note: str) -> None:
-            if title != measure.title:
-                bars.reset(task, total=total, description=title, visible=True)
-            bars.update(task, completed=done, rate=measure(title, done), note=note)
-
-        yield report
 
 
 def choose_device(name: str) -> Any:

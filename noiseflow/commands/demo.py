@@ -12,7 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, progress_shown
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.progress import in_json_mode_too
 
 _FILES = (
     *("report.html", "detector.safetensors", "clean.tif", "sampled.tif", "needle.mrc", "phantom.mrc"),
@@ -86,7 +87,7 @@ class _Runner:
         if command != "compare":
             words += ["--seed", self.seed]
         printed = textio.StringIO()
-        shown_progress = contextlib.nullcontext() if self.output.json_mode else progress_shown()
+        shown_progress = contextlib.nullcontext() if self.output.json_mode else in_json_mode_too()
         with contextlib.redirect_stdout(printed), shown_progress:
             build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from noiseflow.commands.console import Progress
     from noiseflow.models.base import NoiseModelBase
+    from noiseflow.progress import Progress
 
 DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
 _PIECE = 2**20  # pixels sampled at once
@@ -50,7 +50,7 @@ def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress
     generator, drawn = torch.Generator(noise_model.device).manual_seed(seed), []
     for part in parts:
         drawn.append(noise_model(part.to(noise_model.device)).sample(generator=generator).cpu())
-        progress(len(drawn), "")
+        progress("Sampling", len(drawn), len(parts), "")
     return torch.cat(drawn)
 
 

@@ -14,11 +14,9 @@ from noiseflow.commands.console import (
     Output,
     OverwriteOption,
     SeedOption,
-    StepReport,
     choose_device,
-    progress_bar,
-    step_report,
 )
+from noiseflow.progress import Progress, progress_shown
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -46,7 +44,7 @@ def sample(
     import noiseflow
     from noiseflow import io
     from noiseflow.commands import sample_files
-    from noiseflow.models.around import as_noise_model
+    from noiseflow.models.wrapper import as_noise_model
 
     io.require_other(output, clean)
     io.check_output(output, overwrite=overwrite)
@@ -55,7 +53,7 @@ def sample(
     io.require_finite(data, clean)
     noise_model = as_noise_model(noiseflow.load(model).to(choose_device(device)))
     pieces = sample_files.pieces(noise_model, _tensor(data))
-    with progress_bar("Sampling", len(pieces), json_mode=json) as progress:
+    with progress_shown(json_mode=json) as progress:
         noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
     stored = sample_files.stored(noisy.numpy(), dtype, data.dtype, noise_model)
     io.write(output, stored, voxel_size=voxel_size)
@@ -103,16 +101,17 @@ def evaluate(
         # NumPy's generator, not torch's: the split must not depend on noise that `sample` drew with the same seed
         half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
-        with step_report(json_mode=json) as report:
-            models |= _fitted_baselines(train_signal, train_observation, seed, report)
-    with progress_bar("Judging", len(models) + len(pairs), json_mode=json) as progress:
+        with progress_shown(json_mode=json) as progress:
+            models |= _fitted_baselines(train_signal, train_observation, seed, progress)
+    count = len(models) + len(pairs)
+    with progress_shown(json_mode=json) as progress:
         results, structures = {}, []
         for name, item in models.items():
             results[name] = metrics.evaluate(item, clean, noisy, seed=seed)
-            progress(len(results), name)
+            progress("Judging", len(results), count, name)
         for pair in pairs:
             structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
-            progress(len(results) + len(structures), "neighbours")
+            progress("Judging", len(results) + len(structures), count, "neighbours")
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
@@ -125,7 +124,7 @@ def evaluate(
     )
 
 
-def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, report: StepReport) -> dict[str, nn.Module]:
+def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, progress: Progress) -> dict[str, nn.Module]:
     import torch
 
     import noiseflow
@@ -133,17 +132,13 @@ def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, report: St
     fitted: dict[str, nn.Module] = {}
     for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
         name, generator = type(baseline).__name__, torch.Generator().manual_seed(seed)
-
-        def progress(done: int, note: str, title: str = f"Fitting {name}") -> None:
-            report(title, done, _BASELINE_STEPS, note)
-
         fitted[name] = noiseflow.fit(
             baseline.to(signal.device),
             signal,
             observation,
             num_steps=_BASELINE_STEPS,
             generator=generator,
-            progress=progress,
+            progress=lambda _, *rest, task=f"Fitting {name}": progress(task, *rest),
         ).noise_model
     return fitted
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, register_kl
 
-from noiseflow.distributions.law import NoiseDistribution
-from noiseflow.distributions.numerical import as_noise_distribution
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 
 def _of_two(p: NoiseDistribution, q: NoiseDistribution) -> Tensor:

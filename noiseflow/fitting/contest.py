@@ -5,17 +5,17 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
-from noiseflow.fitting.judged_pixels import JudgedPixels
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.progress import Progress
 
-Progress = Callable[[int, str], None]
 _SCREENING_PIXELS = 32768
 _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
@@ -152,7 +152,7 @@ class Contest:
         self.seconds[name] += time.perf_counter() - started
         self._done += 1
         if self._progress is not None:
-            self._progress(self._done, name)
+            self._progress("comparing noise models", self._done, max(self._done, len(self.models)), name)
 
 
 def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[float, float]:

@@ -12,19 +12,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import as_tensor, is_array, unmasked
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, Progress, Schedule
+from noiseflow.arguments import as_mask, check, check_order, check_precision, real
+from noiseflow.arrays import is_array, unmasked
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
-from noiseflow.fitting.pixels import FitPixels
+from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
-from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ForeignModel, as_noise_model
+from noiseflow.progress import Progress
 from noiseflow.threads import few_threads, warn_if_spinning
 
 _log = logging.getLogger("noiseflow")
+_PART = 2**20  # pixels predicted at once
 
 
 @torch.enable_grad()
@@ -83,7 +86,7 @@ def fit(
         train_noise: whether to train the noise model; otherwise it is not changed.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
-        progress: called with the number of completed steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
         checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C.
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
@@ -94,8 +97,9 @@ def fit(
         The fitted model, the held-out likelihood and its history. Both models are left in their best held-out state.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, there are too few pixels, `warm_up` is out of range, the signal model
-            returns shapes that `SignalModel` does not allow, or the likelihood is never finite.
+        ValueError: an argument is out of range, shapes differ, pixels are complex, not finite, or too few, their precision does
+            not resolve the noise, signal and observation seem exchanged, the signal model returns shapes that `SignalModel`
+            does not allow, or the likelihood is never finite.
 
     Example:
         >>> import noiseflow, torch
@@ -105,27 +109,29 @@ def fit(
         >>> round(result.noise_model.log_scale.exp().item(), 1)
         3.0
     """
-    if not 0 <= warm_up < 1:
-        raise ValueError(f"warm_up is {warm_up}; give a share of the steps, at least 0 and less than 1")
+    check(held_out=held_out, num_steps=num_steps, batch_size=batch_size, learning_rate=learning_rate, warm_up=warm_up)
+    check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
     (signal, observation), kept = unmasked(signal, observation)
-    if is_array(signal):
-        signal = as_tensor(signal)
-    observation = as_tensor(observation)
-    mask = mask if mask is None else as_tensor(mask)
-    held_out = held_out if isinstance(held_out, float | int) else as_tensor(held_out)
+    if is_array(signal) or isinstance(signal, Tensor):
+        signal = real(signal, "signal")
+    observation = real(observation, "observation")
+    use = as_mask(mask, observation)
+    judge = float(held_out) if np.ndim(held_out) == 0 else as_mask(held_out, observation, "held_out")
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
         )
     signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal  # type: ignore[assignment]
     check_signal_model(signal_model, observation.numel())
-    if kept is not None:
-        kept = kept.to(observation.device).reshape(observation.shape)
-        mask = kept if mask is None else mask.reshape(observation.shape).bool() & kept
-    use = _usable(signal_model, observation, mask, skip_non_finite)
+    use = use if kept is None else use & kept.to(use.device)
+    use = _usable(signal_model, observation, use, skip_non_finite)
+    if isinstance(signal_model, KnownSignal):
+        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
+        check_precision(known, seen)
+        check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     if digitise and model.learns and not model.describes_single_readings:
-        model, digitisation = _behind_converter(model, observation, use)
+        model, digitisation = _behind_converter(model, signal_model, observation, use)
     if model.needs_image and observation.ndim < 2:
         raise ValueError(
             f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
@@ -133,7 +139,7 @@ def fit(
         )
     axis = model.shared_axis
     choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
-    pixels = choose(_as_floating(observation), use, held_out, _own_generator(generator))
+    pixels = choose(_as_floating(observation), use, judge, _own_generator(generator))
     num_steps = model.num_steps if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
@@ -146,7 +152,7 @@ def fit(
     )
     if resume is not None:
         loop.load_state(resume)
-    schedule = Schedule(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
+    schedule = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     if loop.signal_optimiser is not None:
         warn_if_spinning()
         return loop.run(schedule, progress, checkpoint)
@@ -154,12 +160,9 @@ def fit(
         return loop.run(schedule, progress, checkpoint)
 
 
-def _usable(signal_model: nn.Module, observation: Tensor, mask: Tensor | None, skip_non_finite: bool) -> Tensor:
-    """The pixels to use, (N,) boolean."""
+def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
+    """The finite ones of the pixels `use`, (N,) boolean."""
     flat = observation.reshape(-1)
-    use = torch.ones_like(flat, dtype=torch.bool) if mask is None else mask.reshape(-1).bool()
-    if use.shape != flat.shape:
-        raise ValueError(f"mask has {use.numel()} pixels, observation {flat.numel()}; they must be equal")
     finite = torch.isfinite(flat)
     if isinstance(signal_model, KnownSignal):
         finite &= torch.isfinite(signal_model.flat)
@@ -179,11 +182,13 @@ def _as_floating(observation: Tensor) -> Tensor:
 
 
 def _behind_converter(
-    noise_model: NoiseModelBase, observation: Tensor, use: Tensor
+    noise_model: NoiseModelBase, signal_model: nn.Module, observation: Tensor, use: Tensor
 ) -> tuple[NoiseModelBase, Digitisation]:
     """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
-    values = observation.detach().reshape(-1)[use].cpu()
-    found = detect_digitisation((values.float() if values.dtype == torch.bfloat16 else values).numpy())
+    values = observation.detach().cpu()
+    values = values.float() if values.dtype == torch.bfloat16 else values
+    used = np.ma.masked_array(values.numpy(), ~use.reshape(observation.shape).cpu().numpy())
+    found = detect_digitisation(used, _predicted(signal_model, observation))
     if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
@@ -192,6 +197,17 @@ def _behind_converter(
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
+
+
+@torch.no_grad()
+def _predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
+    """The signal of all pixels, shaped like the observation."""
+    if hasattr(signal_model, "signal"):
+        whole: Tensor = signal_model.signal()  # type: ignore[operator]
+    else:
+        pixels = torch.arange(observation.numel(), device=observation.device)
+        whole = torch.cat([signal_model(part) for part in torch.split(pixels, _PART)])
+    return whole.detach().reshape(observation.shape)
 
 
 def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:

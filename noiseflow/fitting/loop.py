@@ -13,16 +13,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.picked import Signal, needs_image, pick, values_of, window_size
+from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixels import FitPixels, thinned
+from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.progress import Progress
 from noiseflow.threads import few_threads
 
-Progress = Callable[[int, str], None]
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
@@ -36,7 +36,7 @@ _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not move far fro
 
 
 @dataclass(frozen=True)
-class Schedule:
+class LoopSettings:
     """Settings of a fit; see `noiseflow.fit`."""
 
     num_steps: int
@@ -99,7 +99,7 @@ class FitLoop:
             self.average = WeightAverage(self.noise_model)
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
-    def run(self, schedule: Schedule, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
+    def run(self, schedule: LoopSettings, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
         """Take all remaining steps, and restore the best held-out state."""
         started = saved = time.perf_counter()
         num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
@@ -134,7 +134,7 @@ class FitLoop:
                 if not joint and self._never_improves(schedule):
                     break
                 if progress is not None:
-                    progress(step, f"held-out NLL {self.result.held_out_nll:.4f}")
+                    progress("fit", step, num_steps, f"held-out NLL {self.result.held_out_nll:.4f}")
         except KeyboardInterrupt:
             if checkpoint is not None:
                 checkpoint(self.state())
@@ -146,7 +146,7 @@ class FitLoop:
         self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
         return self.result
 
-    def _take_step(self, step: int, schedule: Schedule) -> bool:
+    def _take_step(self, step: int, schedule: LoopSettings) -> bool:
         """Take one step of all trainable models. Return False if loss or gradient was not finite."""
         joint = self.signal_optimiser is not None
         finite = self._signal_step(schedule.batch_size)
@@ -186,7 +186,7 @@ class FitLoop:
         with torch.no_grad():
             return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
 
-    def _never_improves(self, schedule: Schedule) -> bool:
+    def _never_improves(self, schedule: LoopSettings) -> bool:
         """Whether the initial state is still the best of several evaluations after 40 % of the steps."""
         history = self.result.history
         late = self.done >= 0.4 * schedule.num_steps and len(history) > 1

@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
-from noiseflow.fitting.contest import Contest, Progress, mean_and_error
-from noiseflow.fitting.judged_pixels import JudgedPixels
+from noiseflow.fitting.comparison_pixels import JudgedPixels
+from noiseflow.fitting.contest import Contest, mean_and_error
 from noiseflow.models import baselines, flow, mixture, physical, physics_flow
-from noiseflow.models.around import ForeignModel, as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ForeignModel, as_noise_model
+from noiseflow.progress import Progress
 
 NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
@@ -159,7 +161,7 @@ def select(
         digitise: detect rounding and clipping; if False, candidates are not wrapped.
         refit: fit the chosen model again with the validation pixels included.
         seed: seed of all random choices.
-        progress: called with the number of completed fits and the name of the candidate.
+        progress: called with a task, the completed and expected fits, and the name of the candidate.
 
     Raises:
         ValueError: as `fit`; there are no candidates; or some pixels are impossible under all of them.
@@ -172,18 +174,20 @@ def select(
         >>> noiseflow.select(signal, observation, candidates=candidates, num_steps=60).chosen.name
         'Gaussian'
     """
+    check(held_out=held_out, num_steps=num_steps, seed=seed)
     models = dict(default_candidates() if candidates is None else candidates)
     if not models:
         raise ValueError("there are no candidates; give noise models by name, simplest first")
     wrapped = {name: as_noise_model(model) for name, model in models.items()}
     (signal, observation), kept = unmasked(signal, observation)
-    mask = kept if mask is None else mask if kept is None else as_tensor(mask).reshape(-1).bool().cpu() & kept
-    pixels = JudgedPixels.of(
-        as_tensor(signal), as_tensor(observation), list(wrapped.values()), mask, held_out, blocks, seed
-    )
+    signal, observation = real(signal, "signal"), real(observation, "observation")
+    use = as_mask(mask, observation)
+    use = use if kept is None else use & kept.to(use.device)
+    pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
     found = Digitisation()
     if digitise:
-        found = detect_digitisation(as_tensor(observation).detach().reshape(-1)[pixels.use].cpu().numpy())
+        unused = ~pixels.use.reshape(pixels.observation.shape).cpu().numpy()
+        found = detect_digitisation(np.ma.masked_array(as_tensor(observation).detach().cpu(), unused), pixels.signal)
     if found.found:
         wrapped = {
             name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model

@@ -14,9 +14,9 @@ from noiseflow.fitting.fit import fit
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics.evaluation import pixel_log_prob
-from noiseflow.models.around import as_noise_model
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.mixture import MixtureDistribution
+from noiseflow.models.wrapper import as_noise_model
 
 _NUM_PIXELS, _AT_ONCE = 100_000, 8192
 _LEAST_VARIANCE = 1e-4  # relative to the variance of the noise

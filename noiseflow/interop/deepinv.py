@@ -9,7 +9,7 @@ from deepinv.optim import DataFidelity, Distance
 from deepinv.physics import NoiseModel
 from torch import Tensor, nn
 
-from noiseflow.models.around import as_noise_model
+from noiseflow.models.wrapper import as_noise_model
 
 
 class FittedNoise(NoiseModel):  # type: ignore[misc]

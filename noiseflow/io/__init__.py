@@ -1,25 +1,30 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
-from .alignment import read_transforms as read_transforms
+from noiseflow.runs.lock import locked as locked
+from noiseflow.runs.outputs import atomic_path as atomic_path
+from noiseflow.runs.outputs import check_folder as check_folder
+from noiseflow.runs.outputs import check_output as check_output
+from noiseflow.runs.outputs import output_folder as output_folder
+from noiseflow.runs.outputs import require_other as require_other
+from noiseflow.runs.partials import partial_folder as partial_folder
+
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
+from .angles import read_tilts as read_tilts
 from .angles import tilt_angles_of as tilt_angles_of
+from .angles import tilts_of as tilts_of
 from .checks import SeveralImages as SeveralImages
 from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite
-from .files import atomic_path as atomic_path
-from .files import check_folder as check_folder
-from .files import check_output as check_output
-from .files import output_folder as output_folder
-from .files import require_other as require_other
 from .folder import files_of as files_of
 from .image_file import SUFFIXES as SUFFIXES
 from .image_file import ImageFile as ImageFile
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
-from .lock import locked as locked
-from .partials import partial_folder as partial_folder
+from .imod import parse_views as parse_views
+from .imod import read_transforms as read_transforms
 from .tilt_axis import tilt_axis_of as tilt_axis_of
+from .tilt_table import TiltTable as TiltTable

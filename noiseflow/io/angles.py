@@ -1,124 +1,241 @@
-"""Tilt angles from text files, from SerialEM's ``.mdoc`` files, and from the angle file next to a stack."""
+"""Tilt angles of a stack or a folder of images: one reader for each kind of file, and one function that joins them to images."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import number, text_lines
+from noiseflow.io import angle_text, aretomo, imod, mdoc, star
 from noiseflow.io.image_file import ImageFile
+from noiseflow.io.tilt_table import LARGEST_ANGLE as LARGEST_ANGLE
+from noiseflow.io.tilt_table import TiltTable
+
+_READERS: dict[str, Callable[[Path], TiltTable]] = {
+    ".mdoc": mdoc.read,
+    ".star": star.read,
+    ".tomostar": star.read,
+    ".aln": aretomo.read,
+    ".com": imod.read,
+}
+"""Readers by suffix; other files are lists of angles."""
 
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
-LARGEST_ANGLE = 720
-"""Largest plausible tilt angle, degrees: two full turns, more than any stage reports."""
+_TABLES = (".tomostar", ".star", ".aln")
+_STAGES = re.compile(r"_(pre)?ali$")
+_SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
+_PLAUSIBLE = 2.0
+"""Degrees by which the nominal and the measured angle of a stage may differ."""
 
 
-def read_angles(path: str | Path) -> NDArray[np.float64]:
-    """Read tilt angles in degrees, in the order of the stack.
+def read_tilts(path: str | Path) -> TiltTable:
+    """Read what a file says of the images of a tilt series.
 
     Args:
-        path: a text file with one angle per line (``.rawtlt``, ``.tlt``; blank lines are skipped), or an ``.mdoc`` file.
+        path: a list of angles (``.rawtlt``, ``.tlt``, any text: one angle per line, or the column of a table; comments and
+            decimal commas are accepted), SerialEM's ``.mdoc``, AreTomo's ``.aln``, ``.star`` of RELION, ``.tomostar`` of Warp,
+            or IMOD's ``tilt.com``.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: a line is not a number, or the file is empty.
+        ValueError: the file holds no angles, or an angle is not a number of degrees.
+
+    Example:
+        >>> import noiseflow, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "a.mdoc"
+        >>> _ = path.write_text("[ZValue = 0]\\nTiltAngle = -3\\n[ZValue = 1]\\nTiltAngle = 3\\n")
+        >>> noiseflow.io.read_tilts(path).angles.tolist()
+        [-3.0, 3.0]
     """
     path = Path(path)
-    lines = text_lines(path, "angle file", holds="one angle in degrees per line")
-    values = _mdoc_angles(lines, path) if path.suffix.lower() == ".mdoc" else _angle_lines(lines, path)
-    if not values:
+    table = _READERS.get(path.suffix.lower(), angle_text.read)(path)
+    if not len(table.angles):
         raise ValueError(f"{path} holds no angles; one angle in degrees per line is required")
-    return np.array(values)
+    for angle in table.angles:
+        if not abs(angle) <= LARGEST_ANGLE:
+            raise ValueError(f"{path}: {angle:g} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}")
+    return table
+
+
+def read_angles(path: str | Path) -> NDArray[np.float64]:
+    """Tilt angles in degrees, in the order of the file; for arguments and errors see `read_tilts`."""
+    return read_tilts(path).angles
 
 
 def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
-    """The tilt angles of a stack, from the angle file next to it or else from the file itself.
+    """The tilt angle of every image, degrees. Arguments and errors as for `tilts_of`."""
+    return tilts_of(stack, image).angles
+
+
+def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = None) -> TiltTable:
+    """The tilts of the images of a stack or folder, from a file next to it or else from the stack itself.
+
+    Images are joined to angles by name if both have names (``SubFramePath``, ``ImageFile`` or ``[Image = …]`` of an mdoc, movie
+    names of a star file), or by the angle in the image's name; otherwise by order.
 
     Args:
-        stack: the file the stack was read from. For ``name.st``, the files ``name.rawtlt``, ``name.tlt``, ``name.st.mdoc``
-            and ``name.mdoc`` are tried; for an aligned stack (``.ali``), the refined ``.tlt`` first. For a folder of images, a
-            single such file inside the folder is used, too.
-        image: the image file that was read.
+        stack: the file or folder the images were read from. For ``name.st``, the files ``name.rawtlt``, ``name.tlt``,
+            ``name.st.mdoc``, ``name.mdoc``, ``name.tomostar``, ``name.star`` and ``name.aln`` are tried; for an aligned stack
+            (``.ali``), the refined ``.tlt`` first. For a folder of images, a single such file inside the folder is used, too.
+            An IMOD ``tilt.com`` of this stack adds its offset and its excluded views.
+        image: the images that were read.
+        angles: the file of angles, if it is not one of these.
 
     Returns:
-        (section,) degrees.
+        One row for each image.
 
     Raises:
         FileNotFoundError: there are no angles in either place.
-        ValueError: the angle file cannot be read.
+        ValueError: the angle file cannot be read, or does not match the images.
     """
-    if (angle_file := angle_file_of(stack)) is not None:
-        angles = read_angles(angle_file)
-        _compare(angles, image.tilt_angles, angle_file, Path(stack))
-        return angles
-    if image.tilt_angles is not None:
-        return image.tilt_angles
-    names = ", ".join(candidate.name for candidate in _candidates(stack)[:2])
-    raise FileNotFoundError(
-        f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
-    )
+    file = angle_file_of(stack) if angles is None else Path(angles)
+    if file is None and image.tilt_angles is None:
+        names = ", ".join(candidate.name for candidate in candidates(stack)[:2])
+        raise FileNotFoundError(
+            f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
+        )
+    if file is None:
+        assert image.tilt_angles is not None
+        table = TiltTable(image.tilt_angles)
+    else:
+        table = read_tilts(file)
+        table = table.rows(_joined(table, image, file, Path(stack)))
+    return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
+
+
+def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list[int]:
+    """The row of the table for every image."""
+    count = len(image.data) if image.data.ndim == 3 else 1
+    if image.names and table.names and (found := _by_name(table.names, image.names, file, stack)) is not None:
+        return found
+    if image.names and image.tilt_angles is not None and len(table.angles) >= count:
+        found = _by_angle(table.angles, image.tilt_angles)
+        if found is not None:
+            if found != list(range(count)):
+                warnings.warn(f"{file} is joined to {stack} by the angles in the names of the images", stacklevel=3)
+            return found
+    if table.sections is not None and sorted(table.sections) == list(range(count)):
+        return [int(row) for row in np.argsort(table.sections)]
+    if len(table.angles) != count:
+        raise ValueError(
+            f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; give the angle file of "
+            "these images"
+        )
+    _compare(table.angles, image.tilt_angles, file, stack)
+    return list(range(count))
+
+
+def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path) -> list[int] | None:
+    """Rows by the names of images; None if no name occurs in the file.
+
+    Raises:
+        ValueError: some images are not named in the file, or two images are the same row.
+    """
+    stems = [file_stem(name) for name in rows]
+    patterns = [re.compile(rf"(?<![0-9a-z]){re.escape(stem)}(?![0-9a-z]|\.\d)") for stem in stems]
+    found: list[int | None] = []
+    for name in map(file_stem, names):
+        same = [row for row, stem in enumerate(stems) if stem == name]
+        same = same or [row for row, pattern in enumerate(patterns) if stems[row] and pattern.search(name)]
+        longest = [row for row in same if len(stems[row]) == max(len(stems[k]) for k in same)]
+        found.append(longest[0] if len(longest) == 1 else None)
+    known = [row for row in found if row is not None]
+    if not known:
+        return None
+    if len(known) < len(found) or len(set(known)) < len(known):
+        wrong = next(k for k, row in enumerate(found) if row is None or found.index(row) < k)
+        raise ValueError(
+            f"{file} names {len(rows)} images, and {stack} has {len(names)}; {names[wrong]} is not one of those that are "
+            "named once: remove this image, or give the file of these images with --angles"
+        )
+    if len(known) < len(rows):
+        warnings.warn(
+            f"{len(rows) - len(known)} of {len(rows)} images that {file} names are not in {stack}", stacklevel=4
+        )
+    return known
+
+
+def _by_angle(rows: NDArray[np.float64], named: NDArray[np.float64]) -> list[int] | None:
+    """Rows by the angles in names of images; None if any is further from its row than half a step or the stage's error."""
+    steps = np.diff(np.unique(named))
+    nearest = [int(np.abs(rows - angle).argmin()) for angle in named]
+    near = min(_PLAUSIBLE, float(steps.min()) / 2) if steps.size else _PLAUSIBLE
+    if len(set(nearest)) < len(nearest) or np.abs(rows[nearest] - named).max() > near:
+        return None
+    return nearest
+
+
+def names_images(file: Path, names: Sequence[str]) -> bool:
+    """Whether a file of angles names these images."""
+    rows = read_tilts(file).names
+    return bool(rows) and _by_name(rows, names, file, file.parent) is not None
+
+
+def file_stem(name: str) -> str:
+    """The name of a file on any system without folders and suffixes, in lower case."""
+    stem = re.split(r"[\\/]", name.strip())[-1]
+    while _SUFFIX.search(stem):
+        stem = _SUFFIX.sub("", stem)
+    return stem.lower()
 
 
 def angle_file_of(stack: str | Path) -> Path | None:
-    """The angle file that `tilt_angles_of` uses; None if there is none."""
-    return next((candidate for candidate in _candidates(stack) if candidate.is_file()), None)
+    """The angle file that `tilts_of` uses; None if there is none. Suffixes may be in capitals."""
+    found: dict[Path, dict[str, Path]] = {}
+    for candidate in candidates(stack):
+        folder = candidate.parent
+        if folder not in found:
+            found[folder] = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        file = candidate if candidate.is_file() else found[folder].get(candidate.name.lower())
+        if file is not None and _is_table(file):
+            return file
+    return None
 
 
-def _candidates(stack: str | Path) -> list[Path]:
+def _is_table(file: Path) -> bool:
+    """Whether a file exists; a ``.star`` file must be a table of tilts, as other programs write tables of that name."""
+    return file.is_file() and (file.suffix.lower() != ".star" or star.has_tilts(file))
+
+
+def candidates(stack: str | Path) -> list[Path]:
+    """Possible angle files of a stack, or of a folder of images, most likely first."""
     stack = Path(str(stack).partition("::")[0])
     if not stack.is_dir():
         return beside(stack)
     stack = stack.resolve()
-    inside = [file for suffix in (*RAW_FIRST, ".mdoc") for file in stack.glob(f"*{suffix}")]
+    inside = [
+        file for suffix in (*RAW_FIRST, ".mdoc", *_TABLES) for file in stack.glob(f"*{suffix}") if _is_table(file)
+    ]
     return [*beside(stack), *(inside if len(inside) == 1 else [])]
 
 
 def beside(stack: Path) -> list[Path]:
     """Possible angle files of a stack, most likely first."""
+    stack = stack.with_suffix("") if stack.suffix.lower() in (".gz", ".bz2") else stack
     refined = stack.suffix.lower() == ".ali" or stack.stem.endswith("_ali")
-    stem = stack.with_name(stack.name.removesuffix(stack.suffix).removesuffix("_ali") + ".x")
+    stem = stack.with_name(bare_stem(stack) + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
-    return [*texts, stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
+    mdocs = [stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
+    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES)]
+
+
+def bare_stem(stack: Path) -> str:
+    """The name of a stack without its suffix and its stage of processing: ``series`` for ``series_preali.mrc``."""
+    name = stack.name.removesuffix(".gz").removesuffix(".bz2")
+    return _STAGES.sub("", name.removesuffix(Path(name).suffix))
 
 
 def _compare(angles: NDArray[np.float64], inside: NDArray[np.float64] | None, angle_file: Path, stack: Path) -> None:
-    if inside is None or len(inside) != len(angles) or np.abs(inside - angles).max() <= 2:
+    if inside is None or len(inside) != len(angles) or np.abs(inside - angles).max() <= _PLAUSIBLE:
         return
     worst = int(np.abs(inside - angles).argmax())
     warnings.warn(
         f"{angle_file} says {angles[worst]:g}° for section {worst}, {stack} itself {inside[worst]:g}°; "
         "the angle file is used",
-        stacklevel=3,
+        stacklevel=4,
     )
-
-
-def _angle_lines(lines: list[str], path: Path) -> list[float]:
-    values = []
-    for count, line in enumerate(lines, 1):
-        if line.strip():
-            try:
-                values.append(number(line.strip()))
-            except ValueError:
-                raise ValueError(f"{path} line {count}: '{line.strip()[:40]}' is not an angle in degrees") from None
-            if not abs(values[-1]) <= LARGEST_ANGLE:
-                raise ValueError(
-                    f"{path} line {count}: {line.strip()[:40]} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}"
-                )
-    return values
-
-
-def _mdoc_angles(lines: list[str], path: Path) -> list[float]:
-    """``TiltAngle`` of every ``[ZValue = n]``, sorted by n: the order of the stack, not of acquisition."""
-    found: dict[int, float] = {}
-    section = None
-    for line in lines:
-        if header := re.fullmatch(r"\s*\[\s*ZValue\s*=\s*(\d+)\s*\]\s*", line):
-            section = int(header[1])
-        elif section is not None and (entry := re.fullmatch(r"\s*TiltAngle\s*=\s*(\S+)\s*", line)):
-            found[section] = _angle_lines([entry[1]], path)[0]
-    return [found[index] for index in sorted(found)]

@@ -150,7 +150,18 @@ def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
         raise FileNotFoundError(
             f"{kind} {path} {'is not a file' if path.exists() else 'does not exist'}; check the path"
         )
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    raw = path.read_bytes()
+    text = raw.decode(_encoding(raw[:64]), errors="replace")
     if "\0" in text:
         raise ValueError(f"{path} is not a text file; an {kind} holds {holds}")
     return text.splitlines()
+
+
+def _encoding(start: bytes) -> str:
+    """UTF-16 if a file begins with its mark, or if every second byte is zero, as some Windows programs write it."""
+    even, odd = start[::2], start[1::2]
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if odd and not any(odd) and all(even):
+        return "utf-16-le"
+    return "utf-16-be" if odd and all(odd) and not any(even) else "utf-8-sig"

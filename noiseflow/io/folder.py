@@ -1,8 +1,9 @@
-"""Folders of single images as one stack, in natural order, with tilt angles from the file names."""
+"""Folders of single images or movies as one stack, in natural order, with the tilt angle of each file."""
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.image_file import SUFFIXES, ImageFile
+from noiseflow.io import angles
+from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile
+from noiseflow.io.tilt_table import TiltTable
 
 _NUMBER = re.compile(r"([-+]*)(\d+(?:\.\d+)?)")
 _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
@@ -20,36 +23,92 @@ _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
     """Stack the images of a folder. Files of other types than the most common one are ignored.
 
+    Movies (stacks of frames, one for each tilt) are summed if each has its own angle: an mdoc, or its name.
+
     Args:
         folder: the folder of images.
         read: function that reads one image.
 
     Raises:
-        ValueError: there are fewer than two images, or their sizes differ.
+        ValueError: there are fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
     """
     files = files_of(folder)
     if len(files) < 2:
         found = f"with only one image, {files[0].name}" if files else "without images"
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
-    names = [file.name for file in files]
-    images = [read(file) for file in files]
+    names = tuple(file.name for file in files)
+    tables = [_own_table(file) for file in files]
     sections: list[NDArray[Any]] = []
-    for name, image in zip(names, images, strict=True):
-        section = image.data[0] if image.data.ndim == 3 and len(image.data) == 1 else image.data
-        if section.ndim != 2:
-            raise ValueError(
-                f"{folder / name} holds a stack of shape {image.data.shape}; a folder must hold single "
-                "images: give the stack itself, or move it to another folder"
-            )
+    inside: list[float] = []
+    frames: set[int] = set()
+    first: ImageFile | None = None
+    for file, table in zip(files, tables, strict=True):
+        image = read(file)
+        first = first or image
+        if image.data.ndim == 3 and len(image.data) > 1:
+            _require_movie(file, image, table, folder, names)
+            frames.add(len(image.data))
+        section = _summed(image.data)
         if sections and section.shape != sections[0].shape:
             raise ValueError(
-                f"{folder / name} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
+                f"{file} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
                 "all images of a folder must have the same size"
             )
         sections.append(section)
-    angles = [image.tilt_angles for image in images if image.tilt_angles is not None]
-    inside = np.concatenate(angles) if len(angles) == len(images) else None
-    return ImageFile(np.stack(sections), images[0].voxel_size, inside if inside is not None else angles_in_names(names))
+        told = image.tilt_angles if table is None else table.angles
+        inside += [] if told is None or len(told) != 1 else list(told)
+    if frames:
+        counts = f"{min(frames)}" if len(frames) == 1 else f"{min(frames)} to {max(frames)}"
+        warnings.warn(f"{folder} holds movies of {counts} frames, which are summed without an alignment", stacklevel=4)
+    assert first is not None
+    own = next((table for table in tables if table is not None), None)
+    size, stated = None if own is None else own.pixel_size, first.voxel_size
+    if size is not None and (stated is None or stated[2] == 1):  # 1 Å: programs write it where they know no size
+        stated = size, size, size
+    return ImageFile(
+        np.stack(sections),
+        stated,
+        np.array(inside) if len(inside) == len(files) else angles_in_names(list(names)),
+        first.tilt_axis,
+        names=names,
+    )
+
+
+def _own_table(file: Path) -> TiltTable | None:
+    """What a file next to one image of a folder says of it."""
+    own = next((each for each in angles.beside(file) if each.is_file() and each.suffix != ".star"), None)
+    return None if own is None else angles.read_tilts(own)
+
+
+def _require_movie(file: Path, image: ImageFile, table: TiltTable | None, folder: Path, names: tuple[str, ...]) -> None:
+    """Check that a stack in a folder is the movie of one tilt.
+
+    Raises:
+        ValueError: it may be a tilt series, because its angle is not known by its name.
+    """
+    listed = angles.angle_file_of(folder)
+    known = (
+        angles_in_names(list(names)) is not None
+        or (table is not None and len(table.angles) == 1)
+        or (listed is not None and angles.names_images(listed, names))
+    )
+    if not known or (table is not None and len(table.angles) > 1):
+        raise ValueError(
+            f"{file} holds a stack of shape {image.data.shape}; a folder must hold single images, or movies that an mdoc or "
+            "their names join to tilt angles: give the stack itself, or move it to another folder"
+        )
+
+
+def _summed(data: NDArray[Any]) -> NDArray[Any]:
+    """One image: the sum of the frames of a movie, in the narrowest type that holds it."""
+    if data.ndim == 2:
+        return data
+    if len(data) == 1:
+        return np.asarray(data[0])
+    if data.dtype.kind == "f":
+        return np.asarray(data.sum(0, dtype=np.float64).astype(np.float32))
+    total = data.sum(0, dtype=np.int64)
+    return np.asarray(total.astype(np.result_type(np.min_scalar_type(total.min()), np.min_scalar_type(total.max()))))
 
 
 def files_of(path: str | Path) -> list[Path]:
@@ -61,7 +120,8 @@ def files_of(path: str | Path) -> list[Path]:
         return [path]
     if path.suffix.lower() == ".zarr":
         return sorted(file for file in path.rglob("*") if file.is_file())
-    files = [f for f in path.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    plain = [f for f in path.iterdir() if f.is_file() and not f.name.startswith(".")]
+    files = [f for f in plain if f.suffix.lower() in SUFFIXES] or [f for f in plain if f.suffix.lower() == PNG_SUFFIX]
     suffixes = Counter(file.suffix.lower() for file in files).most_common(1)
     return [path / name for name in natural_sorted(f.name for f in files if f.suffix.lower() == suffixes[0][0])]
 

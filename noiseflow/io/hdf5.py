@@ -1,21 +1,37 @@
-"""HDF5 and NeXus files: the largest numeric array, or a named one (extra ``[formats]``)."""
+"""HDF5 and NeXus files: the largest numeric array, or a named one (extra ``[formats]``).
+
+Sources: NXtomo, https://manual.nexusformat.org/classes/applications/NXtomo.html; Data Exchange,
+https://dxfile.readthedocs.io
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noiseflow.io.checks import choose_member, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.metadata import in_degrees, recorded_angles
-from noiseflow.io.units import in_angstrom
+from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
+
+_FLATS = re.compile(r"/(data_white|data_flat|flats?|flat_?fields?|white)$", re.IGNORECASE)
+_DARKS = re.compile(r"/(data_dark|darks?|dark_?fields?)$", re.IGNORECASE)
+_SAMPLE, _FLAT, _DARK = 0, 1, 2
+"""Kinds of frames in ``image_key``; others are invalid."""
+_SIZES = tuple(rf"/(sample_)?{axis}_(magnified_)?pixel_size$|/pixel_size(_{axis})?$" for axis in "yx")
+
+Datasets = dict[str, Any]
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read an image, stack or volume. Tilt angles are read from ``theta``, ``rotation_angle`` and similar datasets.
+
+    Frames that ``image_key`` marks as flat, dark or invalid are no images of the specimen; flat and dark frames, also of
+    ``data_white`` and ``data_dark``, become the fields of the image file.
 
     Args:
         path: the file.
@@ -24,40 +40,118 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     """
     import h5py
 
-    found: dict[str, Any] = {}
+    found: Datasets = {}
     with h5py.File(path, "r") as file:
         file.visititems(
             lambda name, item: found.__setitem__(f"/{name}", item) if isinstance(item, h5py.Dataset) else None
         )
-        names = [name for name, item in found.items() if item.ndim in (2, 3) and item.dtype.kind in "iufc"]
-        dataset = found[names[choose_member(names, [found[name].shape for name in names], member)]]
+        names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufc"]
+        names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
+        name = names[choose_member(names, [found[name].shape for name in names], member)]
+        dataset = found[name]
         require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
-        native = dataset.dtype.newbyteorder("=")
-        data = (
-            mapped_copy(dataset, dataset.shape, native, in_memory=IN_MEMORY) if mapped else np.asarray(dataset, native)
-        )
-        lists = [(name, item) for name, item in found.items() if item.ndim == 1 and item.shape == (len(data),)]
-        angles = recorded_angles(
-            ((name, list(np.asarray(item, float) * _unit(item))) for name, item in lists if item.dtype.kind in "iuf"),
-            len(data),
-        )
-        voxel_size = _voxel_size(dataset)
-    return ImageFile(data, voxel_size, angles)
+        axis = _tilt_axis_of_maps(dataset, found)
+        kinds = _kinds(name, dataset, found)
+        angles = _angles(found, dataset.shape[axis])
+        data = _pixels(dataset, kinds == _SAMPLE, axis, mapped=mapped)
+        fields = [_field(name, dataset, found, kinds, *kind) for kind in ((_FLAT, _FLATS), (_DARK, _DARKS))]
+        voxel_size = _voxel_size(name, dataset, found)
+    if angles is not None and len(kinds) == len(angles):
+        angles = angles[kinds == _SAMPLE]
+    channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
+    return ImageFile(data, voxel_size, angles, channels=channels, flat=fields[0], dark=fields[1])
+
+
+def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
+    """The axis of the tilts: the first, or the second of maps (element, tilt, y, x) unless only the first has angles."""
+    if dataset.ndim < 4:
+        return 0
+    return 0 if _angles(found, dataset.shape[1]) is None and _angles(found, dataset.shape[0]) is not None else 1
+
+
+def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
+    lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
+    numbers = ((name, np.ravel(item) * _unit(item)) for name, item in lists.items() if item.dtype.kind in "iuf")
+    return recorded_angles(((name, [float(value) for value in values]) for name, values in numbers), count)
+
+
+def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
+    """``image_key`` of every frame; all are of the specimen without it."""
+    keys = [
+        np.asarray(item, dtype=np.int64)
+        for other, item in found.items()
+        if other.split("/")[1] == name.split("/")[1]
+        and other.rpartition("/")[2] in ("image_key", "image_key_control")
+        and item.shape == dataset.shape[:1]
+    ]
+    kinds = np.zeros(dataset.shape[0] if dataset.ndim == 3 else 0, dtype=np.int64)
+    for key in keys:
+        kinds = np.where(kinds == _SAMPLE, key, kinds)
+    return kinds
+
+
+def _pixels(dataset: Any, sample: NDArray[np.bool_], axis: int, *, mapped: bool) -> NDArray[Any]:
+    native = dataset.dtype.newbyteorder("=")
+    if dataset.ndim != 3 or (sample.all() and not mapped):
+        data = np.asarray(dataset, native)
+        return np.moveaxis(data, 1, 0) if dataset.ndim == 4 and axis == 0 else data
+    chosen = np.flatnonzero(sample)
+    parts = (np.asarray(dataset[index], native) for index in chosen)
+    return mapped_copy(
+        parts, (len(chosen), *dataset.shape[1:]), native, in_memory=IN_MEMORY if mapped else dataset.nbytes
+    )
+
+
+def _field(
+    name: str, dataset: Any, found: Datasets, kinds: NDArray[np.int64], kind: int, names: re.Pattern[str]
+) -> NDArray[np.float64] | None:
+    """The mean of the flat or of the dark frames that belong to a stack; None if there are none."""
+    if dataset.ndim != 3 or names.search(name):
+        return None
+    frames = [np.asarray(dataset[index], float) for index in np.flatnonzero(kinds == kind)]
+    group = name.rpartition("/")[0]
+    for other, item in found.items():
+        if (
+            names.search(other)
+            and other.startswith(group)
+            and item.ndim in (2, 3)
+            and item.shape[-2:] == dataset.shape[1:]
+        ):
+            frames += list(np.asarray(item, float).reshape(-1, *dataset.shape[1:]))
+    return np.mean(frames, axis=0) if frames else None
 
 
 def _unit(dataset: Any) -> float:
-    return in_degrees(_text(dataset.attrs.get("units", "deg"))) or 1.0
+    return in_degrees(_text(dataset.attrs.get("units", dataset.attrs.get("unit", "deg")))) or 1.0
 
 
 def _text(value: Any) -> str:
+    value = value[0] if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _voxel_size(dataset: Any) -> VoxelSize | None:
-    """Read ``element_size_um``, (z, y, x) in µm, as written by ilastik and BigDataViewer, or ``voxel_size`` with its unit."""
+def _voxel_size(name: str, dataset: Any, found: Datasets) -> VoxelSize | None:
+    """Read ``element_size_um``, (z, y, x) in µm, as written by ilastik and BigDataViewer, or the pixel sizes of NeXus with their
+    units."""
     sizes = np.asarray(dataset.attrs.get("element_size_um", ()), dtype=float).reshape(-1)
     unit = in_angstrom("µm") or 0.0
-    if sizes.size != 3 or not (sizes > 0).all():
-        return None
-    z, y, x = (float(size) * unit for size in sizes)
-    return z, y, x
+    if sizes.size == 3 and (sizes > 0).all():
+        z, y, x = (float(size) * unit for size in sizes)
+        return z, y, x
+    edges = [_length(pattern, name, found) for pattern in _SIZES]
+    height, width = edges[0] or edges[1], edges[1] or edges[0]
+    return None if height is None or width is None else (width, height, width)
+
+
+def _length(pattern: str, name: str, found: Datasets) -> float | None:
+    """Å, from the dataset of such a name, first in the group of the images; magnified sizes before those of the detector."""
+    group = name.rpartition("/")[0]
+    matches = [other for other, item in found.items() if re.search(pattern, other) and item.size == 1]
+    matches.sort(key=lambda other: ("magnified" not in other and "sample_" not in other, not other.startswith(group)))
+    for other in matches:
+        attributes = found[other].attrs
+        unit = in_angstrom(_text(attributes.get("units", attributes.get("unit", ""))))
+        value = float(np.asarray(found[other], float).reshape(-1)[0])
+        if unit is not None and 0 < value < np.inf:
+            return value * unit
+    return None

@@ -12,18 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import Unsupported, as_array, choose
-from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
+from noiseflow.io.checks import SeveralImages, Unsupported, as_array, choose
 from noiseflow.io.image_file import (
+    CAMERA_SUFFIXES,
     HDF5_SUFFIXES,
     MICROSCOPE_SUFFIXES,
     MRC_SUFFIXES,
+    PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
+    TIFF_LIKE_SUFFIXES,
     TIFF_SUFFIXES,
     ImageFile,
     VoxelSize,
+    numbered,
 )
+from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +37,7 @@ _NO_IMAGES = {
     ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
-_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"}
+_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"} | CAMERA_SUFFIXES
 """Suffixes of formats whose readers choose an image by its name."""
 
 
@@ -41,9 +45,10 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     """Read an image, stack or volume.
 
     Args:
-        path: an MRC (``.mrc .mrcs .st .ali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, a grey ``.png`` image, or a folder
-            of single images of these formats except PNG; with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .hspy .zarr``
-            and HDF5. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
+        path: an MRC (``.mrc .mrcs .st .ali .preali .rec .map``), TIFF, ``.npy`` or ``.npz`` file, also packed (``.gz``,
+            ``.bz2``), a grey ``.png`` image, or a folder of single images of these formats, PNG only if there are no others;
+            with the extra ``[formats]`` also ``.dm3 .dm4 .emd .ser .emi .hspy .zarr`` and HDF5, and the formats of cameras that
+            `noiseflow.io.camera_formats` lists. ``FILE::NAME`` selects one image, or one channel, of a file that holds several.
         mapped: memory-map the pixels; changes to the array are not written to the file. Large stacks that cannot be mapped
             (compressed TIFF, HDF5, OME-Zarr) are read in pieces into a temporary file.
         channel: name, or index from zero, of one image or channel of a file that holds several; as ``FILE::NAME``.
@@ -65,16 +70,20 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
+    if path.suffix.lower() in PACKED_SUFFIXES:
+        return _unpacked(path, member or channel)
     reader = _reader(path, member or wanted, mapped=mapped)
     try:
-        named = path.suffix.lower() in _NAMED
-        image = _one_channel(reader(path), wanted if named and member else member or wanted, named=named)
+        image = reader(path)
+        named = image.named or path.suffix.lower() in _NAMED
+        image = _one_channel(image, wanted if named and member else member or wanted, named=named)
     except PermissionError:
         raise
     except ModuleNotFoundError as error:
+        extra = "camera-formats" if path.suffix.lower() in CAMERA_SUFFIXES else "formats"
         raise ModuleNotFoundError(
             f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            f"install it with: {install_command('formats')}"
+            f"install it with: {install_command(extra)}"
         ) from error
     except Unsupported as error:
         raise error.about(path) from error
@@ -94,7 +103,9 @@ def read_image(path: str | Path) -> NDArray[Any]:
     return data
 
 
-def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None) -> None:
+def write(
+    path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSize | None = None, stack: bool = False
+) -> None:
     """Write an image, stack or volume in the format of the path's suffix.
 
     Args:
@@ -102,6 +113,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
             file is replaced only when the new one is complete.
         data: (y, x) or (z, y, x), array or tensor; ``.npy`` files may have more axes.
         voxel_size: Å along (z, y, x).
+        stack: the sections are images, not slices of a volume; MRC headers say so.
 
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
@@ -122,7 +134,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:
-            stored = mrc.write(target, data, voxel_size)
+            stored = mrc.write(target, data, voxel_size, stack=stack)
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
@@ -131,7 +143,7 @@ def write(path: str | Path, data: NDArray[Any] | Tensor, *, voxel_size: VoxelSiz
 
 
 def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
+    from noiseflow.io import camera_formats, hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
 
     suffix = path.suffix.lower()
     if suffix in MICROSCOPE_SUFFIXES:
@@ -146,22 +158,50 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
         )
     if suffix not in SUFFIXES | {PNG_SUFFIX}:
         raise ValueError(
-            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}"
+            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}; of any other "
+            f"image, {camera_formats.EXPORT}"
         )
     if suffix in MRC_SUFFIXES:
         return partial(mrc.read, mapped=mapped)
-    if suffix in TIFF_SUFFIXES:
-        return partial(tiff.read, mapped=mapped)
+    if suffix in TIFF_SUFFIXES | TIFF_LIKE_SUFFIXES:
+        return partial(tiff.read, mapped=mapped, member=member)
+    if suffix in CAMERA_SUFFIXES:
+        return partial(camera_formats.read, member=member)
     if suffix == PNG_SUFFIX:
         return png.read
     return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
 
 
+def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
+    """The image in a file that gzip or bzip2 packed, such as ``.mrc.gz``; it is unpacked to a temporary file first."""
+    import bz2
+    import gzip
+    import shutil
+    import tempfile
+
+    opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.stem
+        try:
+            with opener(path, "rb") as packed, plain.open("wb") as target:
+                shutil.copyfileobj(packed, target)
+            image = read(plain, channel=channel)
+        except (EOFError, gzip.BadGzipFile) as error:
+            raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
+        except SeveralImages as error:
+            raise SeveralImages(str(error).replace(str(plain), str(path)), error.names) from error
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(plain), str(path))) from error
+    return image
+
+
 def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:
     """The chosen channel of (channel, section, y, x); readers of formats with named images have chosen already."""
     if image.data.ndim == 4:
-        names = image.channels or tuple(str(index) for index in range(len(image.data)))
-        return replace(image, data=image.data[choose(names, wanted, "channels")])
+        # axes without names: there are fewer channels than tilts, and another number of angles is refused
+        swapped = not image.channels and image.data.shape[0] > image.data.shape[1]
+        data = np.moveaxis(image.data, 1, 0) if swapped else image.data
+        return replace(image, data=data[choose(image.channels or numbered(len(data)), wanted, "channels")])
     if wanted not in (None, "0") and not named:
         raise Unsupported(f"holds one image; remove ::{wanted} or --channel {wanted}")
     return image

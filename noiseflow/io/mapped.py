@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.files import reserve_room
 from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
-from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start, signature
+from noiseflow.runs.outputs import reserve_room
+from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start, signature
 
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
@@ -119,18 +119,24 @@ def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
     """Flush a volume to its file, and write the statistics of an MRC header."""
     if isinstance(volume, np.memmap):
         volume.flush()
-    if path.suffix.lower() not in MRC_SUFFIXES:
-        return
+    if path.suffix.lower() in MRC_SUFFIXES:
+        finish_mrc(path)
+
+
+def finish_mrc(path: Path, *, stack: bool = False) -> None:
+    """Write the statistics of a complete MRC file to its header, and whether it is a stack of images."""
     import mrcfile
 
-    low, high, mean, squares, count = math.inf, -math.inf, 0.0, 0.0, 0
-    for part in volume:  # one pass over the file: mean and sum of squared deviations, part by part
-        low, high = min(low, float(part.min())), max(high, float(part.max()))
-        own = float(part.mean(dtype=np.float64))
-        squares += float(np.sum((part - own) ** 2, dtype=np.float64))
-        squares += (own - mean) ** 2 * count * part.size / (count + part.size)
-        mean, count = mean + (own - mean) * part.size / (count + part.size), count + part.size
-        let_go(volume)
     with mrcfile.mmap(path, "r+") as file:
+        low, high, mean, squares, count = math.inf, -math.inf, 0.0, 0.0, 0
+        for part in file.data:  # one pass over the file: mean and sum of squared deviations, part by part
+            low, high = min(low, float(part.min())), max(high, float(part.max()))
+            own = float(part.mean(dtype=np.float64))
+            squares += float(np.sum((part - own) ** 2, dtype=np.float64))
+            squares += (own - mean) ** 2 * count * part.size / (count + part.size)
+            mean, count = mean + (own - mean) * part.size / (count + part.size), count + part.size
+            let_go(file.data)
         file.header.dmin, file.header.dmax, file.header.dmean = low, high, mean
         file.header.rms = math.sqrt(squares / count)
+        if stack:
+            file.set_image_stack()

@@ -1,4 +1,4 @@
-"""Tilt angles in the metadata of any file: as many numbers as sections, under a matching name."""
+"""Units in file formats, and tilt angles in the metadata of any file: as many numbers as sections, under a matching name."""
 
 from __future__ import annotations
 
@@ -9,11 +9,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_ANGLE_NAME = re.compile(r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle", re.IGNORECASE)
+from noiseflow.io.tilt_table import LARGEST_ANGLE
+
+_ANGLE_NAME = re.compile(
+    r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE
+)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
+    **dict.fromkeys(("mrad", "milliradian", "milliradians"), 0.18 / np.pi),
 }
+
+
+_ANGSTROM = {
+    **dict.fromkeys(("å", "a", "angstrom", "angstroms", r"\u00c5", "ångström", "ångstrom"), 1.0),
+    **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),
+    **dict.fromkeys(("nm", "nanometer", "nanometre"), 10.0),
+    **dict.fromkeys(("µm", "μm", "um", "micron", "microns", "micrometer", "micrometre", r"\u00b5m", "µ", "μ"), 1e4),
+    **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e7),
+    **dict.fromkeys(("cm", "centimeter", "centimetre"), 1e8),
+    **dict.fromkeys(("inch", "in", '"'), 2.54e8),
+    **dict.fromkeys(("m", "meter", "metre"), 1e10),
+}
+
+
+def in_angstrom(unit: object) -> float | None:
+    """Å per unit, by its name or symbol; None if it is not a unit of length."""
+    return _ANGSTROM.get(str(unit).strip().lower())
 
 
 def in_degrees(unit: object) -> float | None:
@@ -33,7 +55,7 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
         if _ANGLE_NAME.search(name):
             recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(values)
     for values in recorded.values():
-        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= 180
+        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= LARGEST_ANGLE
         if plausible and (count == 1 or np.ptp(values) > np.pi):  # otherwise radians, or a stage that did not move
             return np.array(values)
     return None

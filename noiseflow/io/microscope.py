@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import choose_member, require_room
+from noiseflow.io.checks import Unsupported, choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
-from noiseflow.io.metadata import in_degrees, leaves_of, recorded_angles
+from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles
 from noiseflow.io.tilt_axis import recorded_axis
-from noiseflow.io.units import in_angstrom
-from noiseflow.io.velox import stage_angles
 
 _PLUGINS = {
     ".dm3": "digitalmicrograph",
@@ -38,11 +37,15 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         member: title of the image to read, if the file holds several.
     """
     plugin = _PLUGINS[path.suffix.lower()]
+    pixel_files = sorted(path.parent.glob(f"{path.stem}_*.ser")) if path.suffix.lower() == ".emi" else []
+    if path.suffix.lower() == ".emi" and not pixel_files:
+        raise Unsupported(f"holds no pixels: they are in {path.stem}_1.ser; put this file next to it, or give it")
     signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
     titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
     signal = signals[choose_member(titles, [signal["data"].shape for signal in signals], member)]
     lazy = signal["data"]
-    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED)
+    stored = sum(part.stat().st_size for part in (path, *pixel_files))
+    require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED, size=stored)
     data = np.asarray(lazy.compute(scheduler="single-threaded") if hasattr(lazy, "compute") else lazy)
     data = data.astype(data.dtype.newbyteorder("="), copy=False)
     axes = [
@@ -52,7 +55,7 @@ def read(path: Path, member: str | None = None) -> ImageFile:
         data, axes = np.ascontiguousarray(data.transpose()), axes[::-1]
     angles = _tilt_angles(signal, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
-        angles = stage_angles(path, len(data))
+        angles = _velox_angles(path, len(data))
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)))
 
@@ -76,3 +79,29 @@ def _tilt_angles(signal: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> 
         return recorded
     steps = np.arange(count, dtype=np.float64)
     return unit * (float(axes[0]["offset"]) + float(axes[0]["scale"]) * steps)
+
+
+def _velox_angles(path: Path, count: int) -> NDArray[np.float64] | None:
+    """Alpha tilt of the stage for every frame of a Velox EMD file, degrees, from the metadata of each (rosettasciio reads only
+    the first); None if their number differs from `count` or the stage did not move."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        images = file.get("Data/Image")
+        groups = images.values() if isinstance(images, h5py.Group) else ()
+        texts = [group["Metadata"] for group in groups if isinstance(group, h5py.Group) and "Metadata" in group]
+        for text in texts:
+            if text.ndim == 2 and text.shape[1] == count:
+                require_room(text.nbytes, path, compressed=True)
+                return _alpha(np.asarray(text, dtype=np.uint8))
+    return None
+
+
+def _alpha(texts: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    try:
+        frames: list[dict[str, Any]] = [json.loads(column.tobytes().partition(b"\0")[0]) for column in texts.T]
+        radians = np.array([float(frame["Stage"]["AlphaTilt"]) for frame in frames])
+    except (ValueError, KeyError, TypeError):
+        return None
+    told = np.isfinite(radians).all() and np.abs(radians).max() <= np.pi and np.ptp(radians) > 0
+    return np.rad2deg(radians) if told else None

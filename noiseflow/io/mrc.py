@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
-from noiseflow.io.image_file import ImageFile, VoxelSize
-from noiseflow.io.ownership import signature
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
+from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.tilt_axis import axis_in_titles
+from noiseflow.runs.ownership import signature
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -23,6 +24,10 @@ _REFUSED = {
     101: "4-bit pixels; unpack them with IMOD: newstack -mode 1 IN OUT",
 }
 _IMOD_STAMP = 1146047817
+_VOLUME_STACKS = 401
+"""Lowest space group of a stack of volumes."""
+_MUCH = 0.2
+"""Share of the steps between neighbours that contradicts the statistics: wraps make steps of the whole range."""
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 """Bytes per section of each field of SerialEM's extended header, by its flag."""
 
@@ -30,7 +35,7 @@ _OLD_FEI_REALS, _OLD_FEI_AXIS = 32, 10
 
 
 def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read an MRC file in its own data type. The header is checked against the file size.
+    """Read an MRC file, a stack of volumes as (volume, z, y, x). The header is checked against the file size.
 
     If `mapped`, pixels in native byte order are memory-mapped, and changes to the array are not written to the file.
     """
@@ -42,18 +47,28 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
         extended = stream.read(int(header["nsymbt"]))
         shape = tuple(int(header[name]) for name in ("nz", "ny", "nx"))
         dtype: np.dtype[Any] = _data_type(header)
+        further = (size - stream.tell()) // (dtype.itemsize * shape[1] * shape[2]) - shape[0]
+        if further > 0:
+            warnings.warn(
+                f"{path}: the header says {shape[0]} sections, and the file has room for {further} more, which are not read; if "
+                "they are images, correct the header (alterheader of IMOD)",
+                stacklevel=4,
+            )
         if mapped:
             data: NDArray[Any] = np.memmap(path, dtype, "c", stream.tell(), shape)
         else:
             data = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
-    data = data.astype(data.dtype.newbyteorder("="), copy=False)
+    data = _as_meant(data.astype(data.dtype.newbyteorder("="), copy=False), header, path, mapped=mapped)
+    volumes = _volumes(header)
+    if volumes > 1:
+        return ImageFile(data.reshape(volumes, -1, *data.shape[1:]), _voxel_size(header), channels=numbered(volumes))
     angles = _tilt_angles(header, extended, len(data))
     if int(header["ispg"]) == 0 and len(data) == 1:
         data = data[0]
     return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles, _tilt_axis(header, extended))
 
 
-def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack: bool = False) -> NDArray[Any]:
     """Write 8- and 16-bit integers and float32 unchanged; float64 is rounded to float32, wider integers must fit exactly.
 
     Returns:
@@ -73,6 +88,8 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     stored = np.ascontiguousarray(_storable(data))
     with Sectionwise(path, "w+", overwrite=True) as mrc:
         mrc.set_data(stored)
+        if stack and stored.ndim == 3:
+            mrc.set_image_stack()
         mrc.add_label(signature())
         if voxel_size is not None:
             mrc.voxel_size = voxel_size[::-1]
@@ -125,21 +142,53 @@ def _problem(header: np.void, size: int, *, mode_matters: bool = True) -> str | 
 
 
 def _data_type(header: np.void) -> np.dtype[Any]:
-    mode = int(header["mode"])
-    dtype = np.dtype("u1" if mode == 0 and not _bytes_are_signed(header) else _TYPES[mode])
-    return dtype.newbyteorder(">" if _is_big_endian(header) else "<")
+    """The type of the pixels as stored; bytes and short integers may be unsigned, see `_as_meant`."""
+    return np.dtype(_TYPES[int(header["mode"])]).newbyteorder(">" if _is_big_endian(header) else "<")
 
 
 def _is_big_endian(header: np.void) -> bool:
     return bool(header.dtype["nx"] == np.dtype(">i4"))
 
 
-def _bytes_are_signed(header: np.void) -> bool:
-    """From IMOD's flag, or else from statistics outside the range of one type; MRC2014 bytes are signed."""
+def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) -> NDArray[Any]:
+    """Bytes and short integers in the type that their writer meant.
+
+    IMOD stamps its files and flags bytes that it stored less 128. Without its stamp, MRC2014 says that they are signed, but
+    unsigned ones are common: statistics or the smoother image decide.
+    """
+    unsigned = data.view(f"u{data.dtype.itemsize}") if data.dtype.kind == "i" else data
     stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], ">i4" if _is_big_endian(header) else "<i4")
-    if stamp == _IMOD_STAMP:
-        return bool(flags & 1)
-    return not float(header["dmax"]) > 127
+    if int(header["mode"]) == 0 and stamp == _IMOD_STAMP:
+        if not flags & 1:
+            return unsigned
+        shifted = (section ^ np.uint8(128) for section in unsigned)
+        return mapped_copy(shifted, data.shape, np.uint8, in_memory=IN_MEMORY if mapped else data.nbytes)
+    if data.dtype.kind != "i" or not _is_unsigned(data, unsigned, header):
+        return data
+    if data.dtype.itemsize > 1:
+        warnings.warn(
+            f"{path} holds unsigned integers, although its header says signed; they are read as such", stacklevel=5
+        )
+    return unsigned
+
+
+def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) -> bool:
+    low, high = float(header["dmin"]), float(header["dmax"])
+    if high > np.iinfo(data.dtype).max:
+        return True
+    some = np.unique([0, len(data) // 2, len(data) - 1])
+    signed_steps, unsigned_steps = (
+        float(np.abs(np.diff(stack[some].astype(np.float64), axis=-1)).sum()) for stack in (data, unsigned)
+    )
+    return unsigned_steps < signed_steps * (_MUCH if low < 0 and low < high else 1.0)
+
+
+def _volumes(header: np.void) -> int:
+    """The number of volumes of a stack of volumes, each of MZ sections; otherwise 1."""
+    sections, each = int(header["nz"]), int(header["mz"])
+    if int(header["ispg"]) < _VOLUME_STACKS or each < 1 or sections % each:
+        return 1
+    return sections // each
 
 
 def _voxel_size(header: np.void) -> VoxelSize | None:

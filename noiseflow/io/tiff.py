@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, exactly_as, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.ownership import signature
-from noiseflow.io.units import in_angstrom
+from noiseflow.io.metadata import in_angstrom
+from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -20,24 +21,36 @@ if TYPE_CHECKING:
 _IMAGEJ_TYPES = (np.uint8, np.uint16, np.float32)
 _OUTSIDE_OME = (np.float16, np.int64, np.uint64)
 _IMAGEJ_BYTES = 2**32 - 2**20
+_PRINTED = {2: 2.54e8, 3: 1e8}
+"""Å per ResolutionUnit: inch, centimetre."""
+_FINEST_PRINT = 2e5
+"""Å: programs set 72 to 1200 dots per inch, 21 µm and more, without knowing the scale; pixels of microscopes are smaller."""
 
 
-def read(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the first series of a TIFF file. If `mapped`, memory-map it, or a temporary copy if it is compressed."""
+def read(path: Path, *, mapped: bool = False, member: str | None = None) -> ImageFile:
+    """Read the largest series, such as a position, of a TIFF file.
+
+    Args:
+        path: the file.
+        mapped: memory-map the pixels, or a temporary copy if the file is compressed.
+        member: name or index of the series, if several have the largest size.
+    """
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
         pages = _pages(tiff)
         compressed = any(getattr(page, "compression", 1) != 1 for page in pages)
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
-        series = tiff.series[0]
+        series, several = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
         if "S" in series.axes:
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
         data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
-        voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
+        if getattr(series.pages[0], "photometric", None) == 0:
+            data = _inverted(data, series.pages[0], path)
+        voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
         data, channels = _channels_first(data, series.axes, _channel_names(tiff))
-    return ImageFile(data, voxel_size, channels=channels)
+    return ImageFile(data, voxel_size, channels=channels, named=several)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -73,6 +86,16 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     return data
 
 
+def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
+    """The chosen series, and whether there were others of its size to choose from."""
+    most = max(one.size for one in tiff.series)
+    largest = [one for one in tiff.series if one.size == most]
+    names = [one.name or str(index) for index, one in enumerate(largest)]
+    names = names if len(set(names)) == len(names) else [str(index) for index in range(len(names))]
+    several = len(largest) > 1
+    return largest[choose(names, member, "positions") if several else 0], several
+
+
 def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
     """Memory-map the pixels of a stack if they are contiguous and in native byte order."""
     begin, native = series.dataoffset, series.dtype.newbyteorder("=")
@@ -84,6 +107,32 @@ def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
     return mapped_copy((page.asarray() for page in series.pages), series.shape, native, in_memory=IN_MEMORY)
 
 
+def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
+    """Pixels whose files count from white (MINISWHITE) as counts from black.
+
+    Raises:
+        Unsupported: white has no value, because the pixels are not unsigned integers.
+    """
+    if data.dtype.kind != "u":
+        raise Unsupported(
+            f"counts {data.dtype} pixels from white (MINISWHITE), which is defined for unsigned integers only"
+        )
+    warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
+    white = data.dtype.type(2 ** int(page.bitspersample) - 1)
+    return mapped_copy((white - part for part in data), data.shape, data.dtype, in_memory=IN_MEMORY)
+
+
+def _printed_size(tiff: TiffFile) -> VoxelSize | None:
+    """The pixel size by the tags for printers, if it is not one of a printer."""
+    tags: Any = tiff.pages.first.tags
+    unit = _PRINTED.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else None
+    rates = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
+    if unit is None or len(rates) < 2 or not all(numerator and denominator for numerator, denominator in rates):
+        return None
+    y, x = (unit * denominator / numerator for numerator, denominator in rates)
+    return (x, y, x) if max(y, x) < _FINEST_PRINT else None
+
+
 def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[NDArray[Any], tuple[str, ...]]:
     """The array without axes of one pixel, channels first, and their names; a list of channels alone is a stack."""
     keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
@@ -91,7 +140,7 @@ def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[ND
     if "C" not in axes or data.ndim < 4:
         return data, ()
     data = np.moveaxis(data, axes.index("C"), 0)
-    return data, tuple(names) if len(set(names)) == len(data) else ()
+    return data, numbered(len(data), names)
 
 
 def _channel_names(tiff: TiffFile) -> list[str]:

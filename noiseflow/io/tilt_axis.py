@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from noiseflow.io.angles import beside
+from noiseflow.io.angles import candidates
 from noiseflow.io.checks import text_lines
 from noiseflow.io.image_file import ImageFile
 
@@ -29,7 +29,7 @@ def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
     Returns:
         Degrees, or None if no file states it.
     """
-    files = beside(Path(str(stack).partition("::")[0]))
+    files = candidates(stack)
     for file in files:
         if file.suffix.lower() == ".mdoc" and (found := _axis_in(file)) is not None:
             return found

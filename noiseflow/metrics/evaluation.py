@@ -15,13 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
-from noiseflow.distributions.numerical import as_noise_distribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.judged import judged_pixels
+from noiseflow.metrics.evaluated_pixels import judged_pixels
+from noiseflow.metrics.tails import Tails, tails
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -68,6 +70,7 @@ class Evaluation:
         ks: Kolmogorov–Smirnov distance of the PIT from the uniform distribution.
         ks_floor: distance that the true model exceeds with a probability of 5 %.
         num_pixels: number of pixels used.
+        tails: shares beyond 3, 4 and 5 standard deviations in each signal bin, observed and under the model.
     """
 
     nll: float
@@ -78,6 +81,7 @@ class Evaluation:
     ks: float
     ks_floor: float
     num_pixels: int
+    tails: tuple[Tails, ...]
 
     @property
     def mean_jsd(self) -> float:
@@ -114,6 +118,7 @@ def evaluate(
     Raises:
         ValueError: shapes differ, pixels are not finite, or there are no pixels.
     """
+    check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
     random = np.random.default_rng(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
@@ -134,6 +139,7 @@ def evaluate(
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
+        tails=tuple(tails(noise_model, signal[g], observation[g]) for g in groups),
     )
 
 
@@ -159,11 +165,15 @@ def divergence(
     num_groups: int = _SIGNAL_GROUPS,
     random: np.random.Generator | None = None,
 ) -> Divergence:
-    """Divergence between the residuals observation − signal, (N,) each, and the model's exact probabilities in the same bins.
+    """Divergence between the residuals observation − signal and the model's exact probabilities in the same bins.
 
-    The (N,) signals are represented by at least `num_groups` signals.
+    The signals, arrays of any shape, are represented by at least `num_groups` signals. Masked pixels are excluded.
+
+    Raises:
+        ValueError: as `evaluate`.
     """
-    signal, observation = floating(signal), floating(observation)
+    check(num_bins=num_bins, num_groups=num_groups)
+    signal, observation = judged_pixels(signal, observation)
     random = random or np.random.default_rng(0)
     residual = (observation - signal).double().cpu().numpy()
     low, high = np.quantile(residual, (0.001, 0.999))
@@ -183,11 +193,11 @@ def residual_masses(
     *,
     num_groups: int = _SIGNAL_GROUPS,
 ) -> NDArray[np.float64]:
-    """Probability of each residual bin from the model's CDF, averaged over (N,) signals; (K,) for (K+1,) edges.
+    """Probability of each residual bin from the model's CDF, averaged over signals of any shape; (K,) for (K+1,) edges.
 
-    The (N,) signals are represented by at least `num_groups` signals.
+    The signals are represented by at least `num_groups` of them.
     """
-    signal, edges = floating(signal), as_tensor(edges)
+    signal, edges = floating(signal).reshape(-1), as_tensor(edges)
     order = torch.argsort(signal)
     groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)

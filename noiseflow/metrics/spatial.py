@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import floating
 from noiseflow.described import described
-from noiseflow.distributions.numerical import as_noise_distribution
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.scan_noise import ScanDistribution
+from noiseflow.statistics import neighbour_products
 
 
 @described()
@@ -67,9 +68,9 @@ def spatial_structure(
     height, width = z.shape[-2:]
     error = 1 / math.sqrt(z.size)
     rows, columns = float(z.mean(-1).var() * width), float(z.mean(-2).var() * height)
-    horizontal, vertical = float((z[..., 1:] * z[..., :-1]).mean()), float((z[..., 1:, :] * z[..., :-1, :]).mean())
+    horizontal, vertical = (float(neighbour_products(z, axis=axis).mean()) for axis in (-1, -2))
     stack = z.reshape(-1, height, width)
-    pattern = float((stack[1:] * stack[:-1]).mean()) if len(stack) > 1 else 0.0
+    pattern = float(neighbour_products(stack, axis=0).mean()) if len(stack) > 1 else 0.0
     shared = _shared(z), _shared(z.swapaxes(-1, -2))
     neighbours = max(abs(horizontal - shared[0]), abs(vertical - shared[1]))
     excess = {

@@ -5,11 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.arguments import check
+from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.baselines import Poisson
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.wrapper import ModelAround
 
 
 class AtLevel(ModelAround):
@@ -35,6 +37,7 @@ class AtLevel(ModelAround):
 
     def __init__(self, model: nn.Module, level: float = 0.0) -> None:
         super().__init__(model)
+        check(level=level)
         if self.model.needs_image or self.model.describes_single_readings:
             raise ValueError(
                 "AtLevel must be the innermost model: put rounding, clipping and image terms around AtLevel(model, level)"
@@ -79,4 +82,6 @@ def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
     if isinstance(model, Digitised):
         low, high, origin = model.low + level, model.high + level, model.origin + level
         return Digitised(at_level(model.model, level), model.step, low, high, origin)
+    if isinstance(model, Poisson):
+        return Poisson(float(model.log_gain.exp()), float(model.offset) + level, spread=model.spread)
     return AtLevel(model, level)

@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.textbook import GaussianDistribution as GaussianDistribution
-from noiseflow.distributions.textbook import PoissonDistribution as PoissonDistribution
-from noiseflow.distributions.textbook import SpreadPoissonDistribution
+from noiseflow.arguments import check
+from noiseflow.distributions.laws.textbook import GaussianDistribution as GaussianDistribution
+from noiseflow.distributions.laws.textbook import PoissonDistribution as PoissonDistribution
+from noiseflow.distributions.laws.textbook import SpreadPoissonDistribution
 from noiseflow.models.base import NoiseModelBase
-
-_NEAR_STEP = 0.2  # of the rounding step: a gain this close to the step may be the step itself, as in event counting
 
 
 class Gaussian(NoiseModelBase):
@@ -32,6 +31,7 @@ class Gaussian(NoiseModelBase):
 
     def __init__(self, scale: float = 0.1) -> None:
         super().__init__()
+        check(scale=scale)
         self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
 
     def forward(self, signal: Tensor) -> GaussianDistribution:
@@ -67,6 +67,7 @@ class Poisson(NoiseModelBase):
 
     def __init__(self, gain: float = 1.0, offset: float = 0.0, *, spread: bool = False) -> None:
         super().__init__()
+        check(gain=gain, offset=offset)
         self.spread = spread
         self.log_gain = nn.Parameter(torch.tensor(math.log(gain)))
         self.offset = nn.Parameter(torch.tensor(float(offset)))
@@ -96,7 +97,7 @@ class Poisson(NoiseModelBase):
     ) -> None:
         """Choose the position of the grid on the levels of a converter, by the likelihood of (N,) signals and observations.
 
-        If the gain is one step, as for a counter of single events, grid and levels may coincide. With a coarser grid of unknown
+        If the gain is one step, as for a counter of single events, grid and levels coincide. With a coarser grid of unknown
         spacing some levels would be impossible, so its probabilities are spread.
         """
         step = 0.0 if behind is None else behind(self).step
@@ -104,10 +105,10 @@ class Poisson(NoiseModelBase):
             return
         gain, offset = float(self.log_gain.exp()), float(self.offset)
         places = [(gain, offset, gain >= step)]
-        if abs(gain - step) <= _NEAR_STEP * step:
-            nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
-            places += [(step, nearest + more * step, False) for more in (-2, -1, 0, 1, 2)]
-            places.append((step, 0.0, False))
+        # event counting, whose gain is one step: the residuals of a predicted signal may not show it
+        nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
+        offsets = [nearest + more * step for more in (-2, -1, 0, 1, 2)] + [0.0, float(observation.min())]
+        places += [(step, place, False) for place in offsets]
         found: list[float] = []
         for place in places:
             self._move_to(*place)

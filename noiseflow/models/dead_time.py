@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.dead_time import DeadTimeDistribution
+from noiseflow.arguments import check
+from noiseflow.distributions.laws.dead_time import DeadTimeDistribution
 from noiseflow.models.base import NoiseModelBase
 
 
@@ -33,8 +34,7 @@ class DeadTimeCounter(NoiseModelBase):
 
     def __init__(self, dead_time: float = 1e-3) -> None:
         super().__init__()
-        if not 0 < dead_time < 1:
-            raise ValueError(f"dead_time is {dead_time}; give a share of the exposure between 0 and 1")
+        check(dead_time=dead_time)
         self.raw_dead_time = nn.Parameter(torch.logit(torch.tensor(float(dead_time))))
 
     @property

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.electrons import log_density
+from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.digitised import DigitisedDistribution as DigitisedDistribution
-from noiseflow.distributions.picked import Signal, given_to, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.arguments import check
+from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
 
@@ -53,8 +54,7 @@ class Digitised(ModelAround):
         origin: float = 0.0,
     ) -> None:
         super().__init__(model)
-        if step < 0:
-            raise ValueError(f"step is {step}; give a positive rounding step, or 0 for clipping without rounding")
+        check(step=step)
         if not low < high:
             raise ValueError(f"low is {low} and high is {high}; the low clipping limit must be below the high one")
         if self.model.shared_axis is not None:

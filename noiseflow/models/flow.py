@@ -8,9 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import LatentDistribution, normal_quadrature
-from noiseflow.distributions.picked import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.transforms import Transform
+from noiseflow.arguments import check
+from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.layers import Layer as Layer
 from noiseflow.models.layers import affine_layer as affine_layer
@@ -29,7 +31,8 @@ _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
     """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values."""
     generator = torch.Generator().manual_seed(0)
-    first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
+    with torch.random.fork_rng(devices=[]):  # torch initialises layers from the global random state
+        first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
     with torch.no_grad():
         for layer in (first, hidden):
             nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
@@ -80,8 +83,7 @@ class ConditionalFlow(NoiseModelBase):
         self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
     ) -> None:
         super().__init__()
-        if neighbourhood < 1 or neighbourhood % 2 == 0:
-            raise ValueError(f"neighbourhood is {neighbourhood}; give the odd side of a window: 1, 3, 5, …")
+        check(neighbourhood=neighbourhood, width=width)
         self.layers, self.neighbourhood = tuple(layers), neighbourhood
         self.mean_preserving = mean_preserving
         self.width = width
@@ -254,6 +256,7 @@ class RadialFlow(ConditionalFlow):
         width: int = 32,
         neighbourhood: int = 1,
     ) -> None:
+        check(num_layers=num_layers, num_conditional=num_conditional)
         if (
             num_layers > _MOST_LAYERS
         ):  # each layer is an object: a file that claims many would use far more memory than its size
@@ -290,6 +293,7 @@ class SplineFlow(ConditionalFlow):
     def __init__(
         self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
     ) -> None:
+        check(num_bins=num_bins)
         layers = [affine_layer(), spline_layer(num_bins), tail_layer()]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_bins = num_bins

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.tabulated import state_of
-from noiseflow.distributions.transforms import Transform
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import normal_cdf
+from noiseflow.distributions.numerics.table_axes import state_of
 from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
 from noiseflow.models.physics_distribution import latent_nodes
@@ -95,7 +96,7 @@ class LatentMean:
             mapped, added = transform.forward(mapped)
             ladj = ladj + added
         density = torch.exp(ladj - mapped**2 / 2) / (2 * torch.pi) ** 0.5
-        mean = residual[:, -1] - torch.trapezoid(torch.special.ndtr(mapped), residual)
+        mean = residual[:, -1] - torch.trapezoid(normal_cdf(mapped), residual)
         return -mean, torch.trapezoid(density, residual)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, Transform
+from noiseflow.distributions.numerics.monotone_maps import Affine, Radial, Spline, StudentTail, Transform
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, log_normal_interval, normal_quadrature
-from noiseflow.distributions.transforms import between_rows
+from noiseflow.arguments import check
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.monotone_maps import between_rows
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation
@@ -53,8 +55,7 @@ class Mixture(NoiseModelBase):
         width: int = 32,
     ) -> None:
         super().__init__()
-        if num_components < 1:
-            raise ValueError(f"num_components is {num_components}; a mixture needs at least one Gaussian")
+        check(num_components=num_components, width=width)
         self.num_components, self.shared_shape = num_components, shared_shape
         self.mean_preserving, self.width = mean_preserving, width
         self.standardisation = Standardisation()
@@ -170,8 +171,7 @@ class MixtureDistribution(NoiseDistribution):
         return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - _LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
-        probability: Tensor = (self.log_weight.exp() * torch.special.ndtr(self._standard(value))).sum(-1)
-        return probability
+        return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1)
 
     def _standard_bound(self, bound: Tensor) -> Tensor:
         finite = torch.isfinite(bound)  # infinity times a derivative would be NaN
@@ -193,13 +193,13 @@ class MixtureDistribution(NoiseDistribution):
     @torch.no_grad()
     def from_latent(self, latent: Tensor) -> Tensor:
         """The observation of a standard normal latent, by bisection of the tail probability."""
-        upper, tail = latent > 0, torch.special.ndtr(-latent.double().abs())
+        upper, tail = latent > 0, normal_cdf(-latent.double().abs())
         low, high = (end.double() + 0 * tail for end in self._ends())
         for _ in range(_BISECTIONS):
             middle = low + (high - low) / 2
             standard = self._standard(middle)
             standard = torch.where(upper[..., None], -standard, standard)
-            mass = (self.log_weight.exp() * torch.special.ndtr(standard)).sum(-1)
+            mass = (self.log_weight.exp() * normal_cdf(standard)).sum(-1)
             above = torch.where(upper, mass <= tail, mass >= tail)
             low, high = torch.where(above, low, middle), torch.where(above, middle, high)
         found: Tensor = high.to(latent.dtype)

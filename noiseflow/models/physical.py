@@ -9,8 +9,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
-from noiseflow.distributions.poisson_gaussian import UnevenPoissonGaussian
+from noiseflow.arguments import check
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
+from noiseflow.distributions.laws.poisson_gaussian import UnevenPoissonGaussian
 from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
@@ -73,8 +74,7 @@ class PoissonGaussian(ElectronCounter):
 
     def __init__(self, gain: float = 0.01, offset: float = 0.0, read_noise: float = 2.0) -> None:
         super().__init__()
-        if not (gain > 0 and read_noise > 0):
-            raise ValueError(f"gain is {gain} and read_noise is {read_noise}; both must be positive")
+        check(gain=gain, offset=offset, read_noise=read_noise)
         self.change = nn.Parameter(torch.zeros(3))
         start = torch.tensor([math.log(gain), offset, math.log(read_noise)], dtype=torch.float64)
         self.register_buffer("origin", start)

@@ -8,17 +8,18 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import (
-    NoiseDistribution,
+from noiseflow.distributions.electrons.exact import log_density, log_tail
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
+from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import (
+    hazard_of,
     log_normal_cdf,
     log_normal_interval,
+    normal_cdf,
     normal_hazard,
 )
-from noiseflow.distributions.electrons import log_density, log_tail
-from noiseflow.distributions.normal import hazard_of
-from noiseflow.distributions.pixelwise import pixelwise
-from noiseflow.distributions.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.transforms import Transform
 from noiseflow.models.flow import _inverse
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -99,8 +100,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return self._log_prob(value)
 
     def cdf(self, value: Tensor) -> Tensor:
-        probability: Tensor = torch.special.ndtr(self._mapped_bound(self._detector_latent(value)))
-        return probability.to(value.dtype)
+        return normal_cdf(self._mapped_bound(self._detector_latent(value))).to(value.dtype)
 
     def _mapped_bound(self, latent: Tensor) -> Tensor:
         finite = torch.isfinite(latent)
@@ -150,7 +150,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         for part in torch.split(signal, _SIGNALS_AT_ONCE):
             distribution = self._model(part[:, None])
             residual, latent = latent_nodes(distribution.base)
-            below = torch.special.ndtr(distribution.correct(latent)[0])
+            below = normal_cdf(distribution.correct(latent)[0])
             mean = residual[:, -1] - torch.trapezoid(below, residual)
             about = residual - mean[:, None]
             parts.append((mean, about[:, -1] ** 2 - 2 * torch.trapezoid(about * below, residual)))
@@ -160,6 +160,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
 
 
+@compilable
 def _latent(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:

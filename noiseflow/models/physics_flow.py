@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.transforms import Affine, Transform
+from noiseflow.arguments import check
+from noiseflow.distributions.numerics.monotone_maps import Affine, Transform
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow, affine_layer, spline_layer
 from noiseflow.models.latent_mean import LatentMean
@@ -52,6 +53,7 @@ class PhysicsFlow(NoiseModelBase):
         detector: PoissonGaussian | None = None,
     ) -> None:
         super().__init__()
+        check(num_bins=num_bins, width=width)
         self.num_bins, self.mean_preserving, self.width = num_bins, mean_preserving, width
         self.detector = (PoissonGaussian() if detector is None else detector).requires_grad_(False)
         self.correction = ConditionalFlow([affine_layer(), spline_layer(num_bins)], width=width)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.arguments import check
 from noiseflow.arrays import floating
-from noiseflow.distributions.base import NoiseDistribution
-from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.models.around import ModelAround
+from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround
 
 
 class WithMaps(ModelAround):
@@ -59,9 +59,8 @@ class WithMaps(ModelAround):
     ) -> None:
         super().__init__(model)
         if variance is not None and np.ndim(variance) == 0:
+            check(variance=variance)
             variance = float(variance)
-            if not 0 < variance < math.inf:
-                raise ValueError(f"variance is {variance}; give a positive number or a map")
         given = [each for each in (gain, offset, variance) if each is not None and not isinstance(each, (int, float))]
         sizes = [tuple(each.shape) for each in given] or [tuple(shape or ())]
         if len(sizes[0]) != 2 or len(set(sizes)) != 1:

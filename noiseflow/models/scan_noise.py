@@ -9,10 +9,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution, bisect_quantile, normal_quadrature
-from noiseflow.distributions.picked import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.models.around import ModelAround, as_noise_model
+from noiseflow.arguments import check
+from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround, as_noise_model
 
 _REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
@@ -46,8 +48,7 @@ class ScanNoise(ModelAround):
 
     def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
         super().__init__(model)
-        if not scale > 0:
-            raise ValueError(f"scale is {scale}; the standard deviation of the offsets must be positive")
+        check(scale=scale)
         if along not in ("row", "column"):
             raise ValueError(f"along is {along!r}; choose 'row' or 'column'")
         if self.model.shared_axis is not None:

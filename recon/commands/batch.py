@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption
+from noiseflow.progress import progress_shown
 
 if TYPE_CHECKING:
     from recon.scale.many import Job, Row
@@ -68,13 +69,13 @@ def batch(
             output.line(f"{len(known)} of {len(jobs)} series are already done")
         with (
             client_of(None, scheduler) as client,
-            progress_bar("series", max(1, len(left)), json_mode=json) as progress,
+            progress_shown(json_mode=json) as progress,
         ):
             try:
                 for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
                     rows.append(row)
                     write_table(table, _in_order(rows, jobs))
-                    progress(done, Path(row["series"]).name)
+                    progress("series", done, max(1, len(left)), Path(row["series"]).name)
                     output.line(_in_words(row))
             except KeyboardInterrupt:
                 done = sum(row["status"] == "done" for row in rows)

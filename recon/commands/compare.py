@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption
+from noiseflow.progress import progress_shown
 from recon.commands.options import parse_mode
 
 
@@ -29,7 +30,7 @@ def compare(
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
     from recon.commands.measure import read_shell_band
-    from recon.metrics.comparison import NUM_STEPS, THRESHOLDS, compare_volumes, comparison_report, error_table
+    from recon.metrics.comparison import THRESHOLDS, compare_volumes, comparison_report, error_table
     from recon.metrics.metrics import reach_in_words
     from recon.series.tilt_series import Volume
 
@@ -39,7 +40,7 @@ def compare(
     files = [io.read(path, mapped=True) for path in (volume, reference)]
     first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
     tilt_angles = None if angles is None else io.read_angles(angles)
-    with progress_bar("comparing", NUM_STEPS, json_mode=json) as progress:
+    with progress_shown(json_mode=json) as progress:
         comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
     comparison = replace(comparison, expected=read_shell_band(volume))
     header, rows = error_table(comparison)
@@ -50,6 +51,8 @@ def compare(
     if comparison.expected is not None:
         reach = comparison.expected.in_words(second.voxel_size)
         output.line(f"resolution at 0.5 expected from its error bars: {reach}")
+    if comparison.orientation is not None:
+        output.line(comparison.orientation.in_words())
     page = None
     if report is not None:
         pictures = comparison_report(

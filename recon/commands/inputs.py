@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.commands.console import Output, StepReport
+from noiseflow.commands.console import Output
+from noiseflow.progress import Progress
 from recon.commands.options import parse_mode
 from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
+from recon.series.channels import prepare_channels
 from recon.series.contrast import invert_contrast as inverted
 from recon.series.prepare import Prepared as Prepared
 from recon.series.prepare import prepare as prepare_series
@@ -30,6 +33,8 @@ def load_tilt_series(
     mask_nan: bool,
     mapped: bool = False,
     channel: str | None = None,
+    pixel_size: float | None = None,
+    exclude_views: str = "",
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command.
 
@@ -44,6 +49,8 @@ def load_tilt_series(
         mask_nan=mask_nan,
         mapped=mapped,
         channel=channel,
+        pixel_size=pixel_size,
+        exclude_views=exclude_views,
     )
     if invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles)
@@ -58,33 +65,39 @@ def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[P
 
 
 def prepare(
-    tilt_series: TiltSeries,
+    channels: Mapping[str, TiltSeries],
     *,
+    align_on: TiltSeries | None,
     tilt_axis: float | None,
     refine_alignment: bool,
     alignment: Path | None,
+    alignment_binning: float | None,
     save_alignment: Path | None,
+    second_axis: TiltSeries | None,
     keep_tilts: bool,
     device: str,
     output: Output,
-    report: StepReport | None = None,
-) -> Prepared:
-    """As `recon.prepare` with files of alignments, and print the alignment that was found."""
-    prepared = prepare_series(
-        tilt_series,
-        tilt_axis=tilt_axis,
-        refine_alignment=refine_alignment,
-        alignment=None if alignment is None else read_alignment(alignment, tilt_series),
-        keep_tilts=keep_tilts,
-        device=device,
-        progress=report,
-    )
-    if refine_alignment and prepared.alignment is not None:
-        output.line(prepared.alignment.in_words())
+    report: Progress | None = None,
+) -> dict[str, Prepared]:
+    """As `recon.prepare`, or `recon.prepare_channels`, with files of alignments, and print what was found."""
+    series = align_on or next(iter(channels.values()))
+    options: dict[str, Any] = {"tilt_axis": tilt_axis, "refine_alignment": refine_alignment, "keep_tilts": keep_tilts}
+    options |= {"device": device, "progress": report}
+    if alignment is not None:
+        options["alignment"] = read_alignment(alignment, series, binning=alignment_binning)
+    if "" in channels:
+        prepared = {"": prepare_series(series, second_axis=second_axis, **options)}
+    else:
+        prepared = prepare_channels(channels, align_on=align_on, **options)
+    found = next(iter(prepared.values()))
+    if refine_alignment and found.alignment is not None:
+        output.line(found.alignment.in_words())
+    if found.registration is not None:
+        output.line(found.registration.in_words())
     if save_alignment is not None:
-        if prepared.alignment is None:
+        if found.alignment is None:
             raise ValueError("--save-alignment: there is no alignment; find it with --refine-alignment")
-        for path in write_alignment(save_alignment, prepared.alignment):
+        for path in write_alignment(save_alignment, found.alignment):
             output.line(f"alignment: {path}")
     return prepared
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import time
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -16,48 +16,60 @@ from noiseflow.commands.console import (
     OverwriteOption,
     SeedOption,
     choose_device,
-    step_report,
 )
 from noiseflow.commands.option_files import option_groups
+from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
-    chosen_slices,
-    disk_line,
-    memory_line,
-    open_journal,
     require_blocks,
-    scratch_beside,
-    stoppable,
     warnings_as_lines,
 )
+from recon.fields._names import DEFAULT as FIELD
+from recon.fields._names import field_names
 from recon.fields.regularisers._names import DEFAULT, regulariser_names
 from recon.methods._names import method_names
-
-if TYPE_CHECKING:
-    from noiseflow.checks import Guard
-    from recon.joint.checkpoint import Journal
-    from recon.reconstruction import Reconstruction
-    from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
 @option_groups(
     {
-        "Input": ("angles", "channel", "alignment", "mask", "mask_nan", "invert_contrast"),
-        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus"),
-        "Method": ("preset", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
+        "Input": (
+            "angles",
+            "channel",
+            "align_on",
+            "second_axis",
+            "second_angles",
+            "pixel_size",
+            "exclude_views",
+            "alignment",
+            "alignment_binning",
+            "mask",
+            "mask_nan",
+            "invert_contrast",
+        ),
+        "Geometry": ("tilt_axis", "invert_tilt", "keep_tilts", "thickness", "defocus", "defocus_kernel"),
+        "Method": ("preset", "field", "regulariser", "weight", "steps", "window", "denoiser", "noise_model", "seed"),
         "Size": ("slices_at_once", "workers", "scheduler", "device"),
-        "Output": ("save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
+        "Output": ("voxel_size", "save_field", "save_noise_model", "fsc", "reference", "strict", "overwrite", "json"),
         "Advanced": ("resume", "checkpoint_interval", "dry_run"),
     }
 )
 def reconstruct(
     context: typer.Context,
     tilts: Annotated[
-        Path,
-        typer.Argument(help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images."),
+        list[Path],
+        typer.Argument(
+            help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images; or several channels of "
+            "one series, for one volume each."
+        ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "--output", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")
+        Path,
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="Volume to write: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.",
+        ),
     ],
     angles: Annotated[
         Path | None,
@@ -69,11 +81,20 @@ def reconstruct(
         str | None,
         typer.Option(help="Channel of a hyperstack, or image of a file that holds several: its name, or index from 0."),
     ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="Pixel size in Å, in place of that of the files.")] = None,
+    exclude_views: Annotated[
+        str, typer.Option(help="Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
+    ] = "",
     alignment: Annotated[
         Path | None,
         typer.Option(
-            help="Alignment to apply: a .json file of --save-alignment, also of another channel, or IMOD's .xf."
+            help="Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
+            "AreTomo's .aln or RELION's .star."
         ),
+    ] = None,
+    alignment_binning: Annotated[
+        float | None,
+        typer.Option(help="How many times smaller the images are than those that .xf, .aln or .star were made on."),
     ] = None,
     method: Annotated[
         str,
@@ -95,6 +116,13 @@ def reconstruct(
     regulariser: Annotated[
         str | None,
         typer.Option(help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {DEFAULT} by default."),
+    ] = None,
+    field: Annotated[
+        str | None,
+        typer.Option(
+            help=f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
+            f"{FIELD} by default."
+        ),
     ] = None,
     uncertainty: Annotated[
         int,
@@ -123,6 +151,15 @@ def reconstruct(
     save_noise_model: Annotated[
         Path | None, typer.Option(help="File for the learnt noise model (.safetensors).")
     ] = None,
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(
+            help="Voxel size of the written volume, Å; the field is evaluated between pixels. Those by default."
+        ),
+    ] = None,
+    save_field: Annotated[
+        Path | None, typer.Option(help="File for the fitted field (.safetensors), for `noiseflow export`.")
+    ] = None,
     invert_tilt: Annotated[bool, typer.Option("--invert-tilt", help="Flip the sign of the tilt angles.")] = False,
     invert_contrast: Annotated[
         bool, typer.Option("--invert-contrast", help="Invert the contrast of the images before all other steps.")
@@ -134,6 +171,12 @@ def reconstruct(
     refine_alignment: Annotated[
         bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
     ] = False,
+    align_on: Annotated[
+        str | None,
+        typer.Option(
+            help="What determines the alignment of several channels: a tilt series, or 'sum' of all (the default)."
+        ),
+    ] = None,
     save_alignment: Annotated[
         Path | None, typer.Option(help="File for the alignment: .json, or .xf (with .tlt) for IMOD.")
     ] = None,
@@ -144,6 +187,13 @@ def reconstruct(
             "--refine-alignment, a rough value."
         ),
     ] = None,
+    second_axis: Annotated[
+        Path | None,
+        typer.Option(
+            help="Tilt series of the same specimen about a second axis, about 90° from the first; one volume is fitted."
+        ),
+    ] = None,
+    second_angles: Annotated[Path | None, typer.Option(help="Tilt angles of --second-axis, as --angles.")] = None,
     keep_tilts: Annotated[
         bool, typer.Option("--keep-tilts", help="Keep tilts that are inconsistent with the others.")
     ] = False,
@@ -154,6 +204,13 @@ def reconstruct(
             "ignored below a quarter of a pixel."
         ),
     ] = 0.0,
+    defocus_kernel: Annotated[
+        str,
+        typer.Option(
+            help="What the blur depends on: depth of each voxel; or image: distance of the pixel from the tilt axis times "
+            "tan(tilt), as in Kniesel et al. 2022."
+        ),
+    ] = "depth",
     slices_at_once: Annotated[
         int | None,
         typer.Option(min=1, help="Reconstruct in blocks of this many slices; chosen automatically for large volumes."),
@@ -194,27 +251,55 @@ def reconstruct(
     """
     from noiseflow.io import locked, require_other
     from noiseflow.io.mapped import is_large
+    from recon.commands.channels import channels_of, file_name, joined_results, named
     from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
+    from recon.commands.volume_run import VolumeRun
     from recon.methods import find_method, settings_of
-    from recon.report.page import read_reference
-    from recon.scale.cluster import client_of
-    from recon.series.tilt_series import VolumeGrid
+    from recon.methods._registry import require_setting, require_two_axes
     from recon.uncertainty.result import error_bar_paths, shell_band_path
 
     output = Output(json)
-    targets = Targets(out, report=report, noise_model=save_noise_model, overwrite=overwrite, error_bars=uncertainty > 0)
+    channels, channel = channels_of(tilts, channel)
+    several = "" not in channels
+    reference_channel = None if align_on in (None, "sum") else Path(str(align_on))
+    if align_on is not None and not several:
+        raise ValueError(
+            f"--align-on {align_on} is for several channels; remove it, or give more series or --channel all"
+        )
+    if second_axis is not None and several:
+        raise ValueError("--second-axis is for one channel; reconstruct channels one by one")
+    inputs = (*channels.values(), reference_channel, angles, alignment, second_axis, second_angles, mask, reference)
     if save_alignment is not None:
-        check_alignment_file(save_alignment, alignment, tilts, overwrite=overwrite)
-    for path in (out, *error_bar_paths(out).values(), shell_band_path(out)):
-        require_other(path, tilts, angles, alignment, mask, reference, noise_model)
-    if save_noise_model is not None:
-        require_other(save_noise_model, noise_model, tilts)
+        check_alignment_file(save_alignment, *inputs, overwrite=overwrite)
+    targets = {
+        name: Targets(
+            named(out, name),
+            report=report if report is None or not name else report / file_name(name),
+            noise_model=None if save_noise_model is None else named(save_noise_model, name),
+            field=None if save_field is None else named(save_field, name),
+            voxel_size=voxel_size,
+            overwrite=overwrite,
+            error_bars=uncertainty > 0,
+        )
+        for name in channels
+    }
+    for target in targets.values():
+        volume = target.volume
+        for path in (volume, *error_bar_paths(volume).values(), shell_band_path(volume)):
+            require_other(path, *inputs, noise_model)
+        for beside in (path for path in (target.noise_model, target.field) if path is not None):
+            require_other(beside, noise_model, *channels.values())
     method, chosen_device = method_of(method, preset), choose_device(device)
     options: dict[str, Any] = {"method": method, "weight": weight, "num_steps": steps, "seed": seed}
-    options |= {"regulariser": regulariser, "uncertainty": uncertainty}
-    options |= {"window": window, "denoiser": denoiser, "defocus": defocus}
+    options |= {"regulariser": regulariser, "field": field, "uncertainty": uncertainty}
+    options |= {"window": window, "denoiser": denoiser, "defocus": defocus, "defocus_kernel": defocus_kernel}
     settings_of(**options)
+    if voxel_size is not None or save_field is not None:
+        require_setting(method, "voxel-size" if save_field is None else "save-field")
+    if second_axis is not None:
+        blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
+        require_two_axes(find_method(method), blocks=blocks)
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler provides the workers; remove --workers")
     if workers is not None or scheduler is not None:
@@ -223,148 +308,62 @@ def reconstruct(
         raise ValueError("--fsc needs a report; name its folder with --report")
     if save_noise_model is not None and not find_method(method).learns_noise:
         raise ValueError(f"--save-noise-model: method {method} does not fit a noise model; use --method joint")
-    with locked(out), warnings_as_lines(output) as warned:
+    with ExitStack() as locks, warnings_as_lines(output) as warned:
+        for target in targets.values():
+            locks.enter_context(locked(target.volume))
         fixed = load_noise_model(noise_model)
-        tilt_series = load_tilt_series(
-            tilts,
-            angles=angles,
+        read = partial(
+            load_tilt_series,
             mode=mode,
             invert_tilt=invert_tilt,
             invert_contrast=invert_contrast,
-            mask=mask,
             mask_nan=mask_nan,
             channel=channel,
-            mapped=slices_at_once is not None or workers is not None or scheduler is not None or is_large(tilts),
+            pixel_size=pixel_size,
         )
-        with step_report(json_mode=json) as progress:
+        blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
+        use: dict[str, Any] = {"angles": angles, "mask": mask, "exclude_views": exclude_views}
+        series = {name: read(path, mapped=blocks or is_large(path), **use) for name, path in channels.items()}
+        with progress_shown(json_mode=json) as progress:
             prepared = prepare(
-                tilt_series,
+                series,
+                align_on=None if reference_channel is None else read(reference_channel, **use),
                 tilt_axis=tilt_axis,
                 refine_alignment=refine_alignment,
                 alignment=alignment,
+                alignment_binning=alignment_binning,
                 save_alignment=save_alignment,
+                second_axis=None if second_axis is None else read(second_axis, angles=second_angles, mask=None),
                 keep_tilts=keep_tilts,
                 device=chosen_device,
                 output=output,
                 report=progress,
             )
-        tilt_series = prepared.tilt_series
-        grid = VolumeGrid.of(tilt_series, thickness)
-        truth = None if reference is None else read_reference(reference, grid)
-        settings = _settings(tilt_series, grid, {**options, "fsc": fsc, "slices at once": slices_at_once}, noise_model)
-        options |= {"noise_model": fixed, "device": chosen_device}
-        journal = open_journal(out, settings, resume=resume, interval=checkpoint_interval, output=output)
-        if slices_at_once is None:
-            many = workers if scheduler is None else 2
-            slices_at_once = chosen_slices(journal, tilt_series, grid, method, chosen_device, many)
-        memory = memory_line(tilt_series, grid, method, chosen_device, slices_at_once, workers or 1)
-        output.line(memory)
-        disk = disk_line(tilt_series, grid, slices_at_once, error_bars=uncertainty > 0, halves=fsc)
-        if slices_at_once is not None or dry_run:
-            output.line(disk)
-        if dry_run:
-            _show_plan(tilt_series, grid, options, slices_at_once, {"memory": memory, "disk": disk}, output)
-            return
-        started = time.perf_counter()
-        with stoppable(journal, context), scratch_beside(out) as scratch, client_of(workers, scheduler) as client:
-            if slices_at_once is not None:
-                options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
-                options |= {"keep": journal.keep, "forget": journal.forget}
-            with step_report(json_mode=json) as journal.report:
-                outcome, halves = _solve(tilt_series, grid, options, journal, fsc=fsc, guard=prepared.guard)
-            verdict = targets.write(
-                output,
-                tilt_series,
-                outcome,
-                seconds=time.perf_counter() - started,
-                inputs=files_read(tilts, angles, alignment, mask, noise_model, reference),
-                seed=seed,
-                prepared=prepared,
-                halves=halves,
-                reference=truth,
-                warned=warned,
-                filled=None if slices_at_once is None else scratch,
-            )
-        journal.discard()
-    if strict and verdict.grade == "bad":
-        raise ValueError(f"--strict: the verdict is bad ({out} is written). {verdict.reasons[0]}")
-
-
-def _solve(
-    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], journal: Journal, *, fsc: bool, guard: Guard
-) -> tuple[Reconstruction, tuple[Volume, Volume] | None]:
-    """The reconstruction, and those of the even and the odd tilts if requested."""
-    from recon.methods import reconstruct
-    from recon.report.page import even_odd
-
-    def progress(done: int, total: int, note: str) -> None:
-        if journal.report is not None:
-            journal.report("reconstructing", done, total, note)
-
-    def halves() -> tuple[Volume, Volume]:
-        even, odd = (
-            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
-            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
+        run = VolumeRun(
+            context,
+            output,
+            options,
+            chosen_device,
+            noise_model=(fixed, noise_model),
+            thickness=thickness,
+            reference=reference,
+            fsc=fsc,
+            resume=resume,
+            checkpoint_interval=checkpoint_interval,
+            slices_at_once=slices_at_once,
+            workers=workers,
+            scheduler=scheduler,
+            dry_run=dry_run,
+            warned=warned,
         )
-        return even, odd
-
-    options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": progress}
-    outcome = reconstruct(tilt_series, grid, **options)
-    return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
-
-
-def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
-    """The options that differ for a half of the tilts."""
-    scratch = options.get("scratch")
-    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
-
-
-def _show_plan(
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    options: dict[str, Any],
-    slices_at_once: int | None,
-    needed: dict[str, str],
-    output: Output,
-) -> None:
-    """Print the plan, and its JSON form."""
-    from dataclasses import asdict
-
-    from recon.joint.plan import describe
-    from recon.methods import find_method, settings_of
-    from recon.scale.blocks import fitted_slices
-    from recon.scale.cost import expected_seconds
-
-    method = find_method(options["method"])
-    result: dict[str, Any] = {"method": method.name, **needed, "slices_at_once": slices_at_once}
-    result |= {"stages": [], "expected_seconds": None}
-    if method.plan is None:
-        output.line(f"{method.name}: {method.description} This method has no plan of stages.")
-    else:
-        made = {name: value for name, value in options.items() if name != "method"}
-        stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
-        fitted = None if slices_at_once is None else fitted_slices(grid.height, slices_at_once)
-        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted)
-        output.line(f"slab: {slab} of {grid.height} slices")
-        output.line(describe(stages))
-        output.line(f"expected: about {seconds:.0f} s on this machine")
-        result |= {"stages": [asdict(stage) for stage in stages], "expected_seconds": seconds}
-    output.result(result)
-
-
-def _settings(
-    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], noise_model: Path | None
-) -> dict[str, Any]:
-    """All settings that determine the volume, with digests of the data."""
-    import numpy as np
-
-    digest = hashlib.blake2b(digest_size=16)
-    for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam):
-        if array is not None:
-            digest.update(f"{array.dtype}{array.shape}".encode())
-            for part in array:
-                digest.update(np.ascontiguousarray(part).tobytes())
-    data = {"tilt series": digest.hexdigest(), "mode": tilt_series.mode, "grid": list(grid.shape)}
-    known = noise_model is not None and noise_model.is_file()
-    model = hashlib.blake2b(noise_model.read_bytes(), digest_size=16).hexdigest() if noise_model and known else None
-    return {**options, **data, "noise model": model}
+        shared = (angles, alignment, second_axis, second_angles, mask, noise_model, reference)
+        results = {
+            name: run(each, targets[name], files_read(channels[name], *shared)) for name, each in prepared.items()
+        }
+        written = joined_results(results, report, output) if several else results[""]
+    output.result(written)
+    worst = next((result for result in results.values() if result.get("verdict", {}).get("grade") == "bad"), None)
+    if strict and worst is not None:
+        raise ValueError(
+            f"--strict: the verdict is bad ({worst['volume']} is written). {worst['verdict']['reasons'][0]}"
+        )

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +15,16 @@ from numpy.typing import NDArray
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.files import put_in_place
 from noiseflow.io.model_files import MODEL_SUFFIXES
-from noiseflow.io.ownership import is_own
+from noiseflow.runs.outputs import put_in_place
+from noiseflow.runs.ownership import is_own
 from recon.commands.inputs import Prepared
+from recon.fields.files import FIELD_SUFFIXES, save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.result import error_bar_paths, shell_band_path
 from recon.verdict.judge import judge
-from recon.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Targets:
         volume: file of the volume.
         report: folder of the HTML report, or None.
         noise_model: file for the learnt noise model, or None.
+        field: file for the fitted field, or None.
+        voxel_size: voxel size of the written volume, Å; None for that of the fit.
         overwrite: replace existing files even if this program did not write them.
         error_bars: whether error bars are written next to the volume.
 
@@ -44,6 +47,8 @@ class Targets:
     volume: Path
     report: Path | None = None
     noise_model: Path | None = None
+    field: Path | None = None
+    voxel_size: float | None = None
     overwrite: bool = False
     error_bars: bool = False
 
@@ -55,9 +60,31 @@ class Targets:
             io.check_output(shell_band_path(self.volume), suffixes=frozenset({".csv"}), overwrite=self.overwrite)
         if self.noise_model is not None:
             io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
+        if self.field is not None:
+            io.check_output(self.field, suffixes=FIELD_SUFFIXES, overwrite=self.overwrite)
+        if self.voxel_size is not None and self.error_bars:
+            raise ValueError(
+                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
+            )
         if self.report is not None:
-            files = (self.volume, self.noise_model)
+            files = (self.volume, self.noise_model, self.field)
             io.check_folder(self.report, holds=["index.html"], beside=files, overwrite=self.overwrite)
+
+    def check(self, tilt_series: TiltSeries, slices_at_once: int | None) -> None:
+        """Check that the outputs are possible for this series.
+
+        Raises:
+            ValueError: a volume in blocks has no field, or the voxel size would be relative to an unknown one.
+        """
+        if slices_at_once is not None and (self.field is not None or self.voxel_size is not None):
+            what = "--save-field" if self.voxel_size is None else "--voxel-size"
+            raise ValueError(
+                f"{what}: a volume in blocks has no single field; remove {what}, or bin or crop the images"
+            )
+        if self.voxel_size is not None and tilt_series.pixel_size is None:
+            raise ValueError(
+                "--voxel-size: the pixel size is not in the file of the tilts; write it there, or remove the option"
+            )
 
     def write(
         self,
@@ -73,15 +100,15 @@ class Targets:
         reference: Volume | None = None,
         warned: Sequence[str] = (),
         filled: Path | None = None,
-    ) -> Verdict:
-        """Write the requested files, print the results, and return the verdict. A volume that is already `filled`, in a
+    ) -> dict[str, Any]:
+        """Write the requested files, print the results, and return those for programs. A volume that is already `filled`, in a
         file of the same format next to its target, is renamed to it."""
         outcome = replace(outcome, choices=outcome.choices | prepared.choices)
         rows = _figures(tilt_series, outcome, seconds)
         if filled is not None and filled.suffix == self.volume.suffix:
             put_in_place(filled, self.volume)
         else:
-            outcome.volume.write(self.volume)
+            (outcome.volume if self.voxel_size is None else outcome.sampled(self.voxel_size)).write(self.volume)
         bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
         self._remove_former(bars, output)
         verdict = judge(
@@ -89,6 +116,9 @@ class Targets:
         )
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])
+        if self.field is not None and outcome.field is not None:
+            save_field(outcome.field, self.field, provenance={"tilt_series": inputs[0].name, "method": outcome.method})
+            output.line(f"field: {self.field}")
         output.table(("figure", "value"), list(rows.items()))
         output.line(f"volume: {self.volume}")
         for path in bars.values():
@@ -117,7 +147,7 @@ class Targets:
         for line in verdict.lines():  # after the report, whose parts may fail
             output.line(line)
         fit = outcome.fit_result
-        output.result(
+        return (
             {"volume": self.volume, "report": page, "method": outcome.method, "choices": outcome.choices}
             | {"figures": rows, "weights_tried": outcome.weights_tried, "warnings": list(warned)}
             | {"response": {"tilt_angles": tilt_series.tilt_angles, **outcome.response} if outcome.response else None}
@@ -127,7 +157,6 @@ class Targets:
             | {"seconds": seconds, "verdict": verdict.as_dict()}
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
-        return verdict
 
     def _remove_former(self, written: dict[str, Path], output: Output) -> None:
         """Remove error bars of the previous volume, which would be read as those of the new one."""

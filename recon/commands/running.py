@@ -87,7 +87,7 @@ def resume_command(context: typer.Context) -> str:
     for parameter in context.command.params:
         value, name = context.params.get(parameter.name or ""), max(parameter.opts, key=len)
         if parameter.param_type_name == "argument":
-            words.append(str(value))
+            words += map(str, value if isinstance(value, list | tuple) else [value])
         elif value is True and name != "--resume":
             words.append(name)
         elif not isinstance(value, bool | None) and value != parameter.default:
@@ -119,6 +119,8 @@ def memory_line(
     device: Any,
     slices_at_once: int | None = None,
     workers: int = 1,
+    *,
+    field: str | None = None,
 ) -> str:
     """One line about required and available memory.
 
@@ -126,19 +128,27 @@ def memory_line(
         MemoryError: the memory does not suffice.
     """
     from noiseflow.io.mapped import is_mapped
+    from recon.methods import find_method
     from recon.scale.blocks import block_memory
     from recon.scale.memory import needed_memory, require_memory
 
-    fitted = not method.startswith(("sirt", "wbp"))
+    fitted, more = find_method(method).fitted, find_method(method).more_memory(field)
     if slices_at_once is None:
-        return require_memory(needed_memory(tilt_series, grid, fitted=fitted), device)
+        return require_memory(needed_memory(tilt_series, grid, fitted=fitted, more=more), device)
     block = block_memory(tilt_series, grid, slices_at_once, fitted=fitted)
     held = 0 if is_mapped(tilt_series.images) else tilt_series.images.nbytes
-    return require_memory(needed_memory(*block, fitted=fitted) * workers + held, device)
+    return require_memory(needed_memory(*block, fitted=fitted, more=more) * workers + held, device)
 
 
 def chosen_slices(
-    journal: Journal, tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None
+    journal: Journal,
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    method: str,
+    device: Any,
+    workers: int | None,
+    *,
+    field: str | None = None,
 ) -> int | None:
     """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None.
 
@@ -149,7 +159,7 @@ def chosen_slices(
         ValueError: workers are requested for a run that started with the whole volume in one piece.
     """
     found: int | None = journal.choose(
-        "slices at once", lambda: _slices_for(tilt_series, grid, method, device, workers)
+        "slices at once", lambda: _slices_for(tilt_series, grid, method, device, workers, field)
     )
     if found is None and journal.resumed and (workers or 1) > 1:
         raise ValueError(
@@ -174,7 +184,9 @@ def require_blocks(method: str, option: str) -> None:
         )
 
 
-def _slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None) -> int | None:
+def _slices_for(
+    tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None, field: str | None
+) -> int | None:
     from recon.methods import find_method
     from recon.scale.memory import PLENTY, available_memory, choose_slices
 
@@ -184,7 +196,8 @@ def _slices_for(tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: 
     if available is None:
         return None if workers is None else -(-grid.height // workers)
     plenty = PLENTY if str(device).startswith("cpu") else available  # block sizes were not tuned on GPUs
-    return choose_slices(tilt_series, grid, available, fitted=found.fitted, workers=workers or 1, plenty=plenty)
+    needs: dict[str, Any] = {"fitted": found.fitted, "more": found.more_memory(field)}
+    return choose_slices(tilt_series, grid, available, workers=workers or 1, plenty=plenty, **needs)
 
 
 def disk_line(

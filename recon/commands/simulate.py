@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, progress_bar
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ def simulate(
             help="Blur of the tilts by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."
         ),
     ] = 0.0,
+    dual_axis: Annotated[
+        bool, typer.Option("--dual-axis", help="Also write tilts_second.mrc, a series about a second axis at 90°.")
+    ] = False,
     mode: Annotated[
         str | None, typer.Option(help="Image formation: transmission or linear; by default that of the noise.")
     ] = None,
@@ -74,19 +78,22 @@ def simulate(
         "validation": angles_between(angles, _VALIDATION, share=1 / 3),
         "test": angles_between(angles, _TEST, share=2 / 3),
     }
+    if dual_axis:
+        stacks["clean_second"] = angles
     if (folder / "tilts.mrc").exists() and not (folder / "truth.mrc").exists() and not overwrite:
         raise ValueError(
             f"{folder} holds a tilts.mrc that was not simulated and would be lost; name another folder, or give --overwrite"
         )
-    num_images = sum(map(len, stacks.values())) + len(angles)
-    holds = [f"{name}{suffix}" for name in (*stacks, "tilts") for suffix in (".mrc", ".rawtlt")]
+    noisy = ("tilts", "tilts_second") if dual_axis else ("tilts",)
+    num_images = sum(map(len, stacks.values())) + len(noisy) * len(angles)
+    holds = [f"{name}{suffix}" for name in (*stacks, *noisy) for suffix in (".mrc", ".rawtlt")]
     num_bytes = 4 * size**2 * (size + num_images)
     io.check_folder(folder, num_bytes=num_bytes, holds=["truth.mrc", *holds], overwrite=overwrite)
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
-    with progress_bar("simulate", simulation.num_steps, json_mode=json) as progress:
+    with progress_shown(json_mode=json) as progress:
         simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
-    names = ("tilts", "clean", "validation", "test", "truth")
+    names = (*noisy, *stacks, "truth")
     output.result(
         {"folder": folder, "num_tilts": len(angles), "mode": acquisition.mode}
         | {name: folder / f"{name}.mrc" for name in names}

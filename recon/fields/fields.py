@@ -1,27 +1,34 @@
-"""Volume parameterisations (fields): ``field()`` returns the attenuation on the voxel grid in the projector's layout."""
+"""`Field`, the base class of volume parameterisations: what a fit sees of one, and what its result can do."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
+from noiseflow.arrays import Given, alike, as_tensor
 from noiseflow.models.base import Described
-from recon.fields.upsampling import upsample
 from recon.projection.projector import from_columns
 from recon.projection.tiles import Tiles
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
-_LEAST = 0.003  # attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam
+_POINTS_TOGETHER = 2**21  # points that are sampled at a time
+EMPTY = 0.003
+"""Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
 
 class Field(Described, ABC):
     """Base class of fields: trainable volumes of non-negative attenuation.
+
+    A subclass defines `units` and `start_from`. A field that is a function of continuous coordinates also defines `units_at`;
+    by default, values between voxels are interpolated linearly. Fits use `units`, `of_voxels` and `on`. `at`, `sampled` and
+    `volume` give the result of a fit: vacuum outside `occupied`, in the orientation of the given series.
 
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
@@ -38,6 +45,18 @@ class Field(Described, ABC):
     scale: Tensor
     relative_rate = 1.0
     """Learning rate of the field relative to that of a voxel field."""
+    num_steps: int | None = None
+    """Steps of a fit of the whole volume; None for those of the schedule."""
+    step_cost = 1.0
+    """Time of a step relative to that of grids."""
+    more_memory = 0
+    """Bytes that a fit of this field needs besides those of a fit of voxels."""
+    voxel_size: float | None = None
+    """Edge length of a voxel, Å; None if unknown."""
+    occupied: Tensor | None = None
+    """(depth, width, height) False where a fit skipped voxels as vacuum; None if it skipped none."""
+    flipped: tuple[int, ...] = ()
+    """Axes of (z, y, x) along which the fit saw the series reversed."""
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
         super().__init__()
@@ -52,14 +71,96 @@ class Field(Described, ABC):
     def units(self) -> Tensor:
         """Non-negative attenuation in units of the scale, (depth, width, height)."""
 
-    def at(self, places: Tensor) -> Tensor:
-        """Attenuation, in units of the scale, at (N,) flat indices of the voxel grid (z, x, y)."""
+    def of_voxels(self, places: Tensor) -> Tensor:
+        """Attenuation, in units of the scale, of voxels with (N,) flat indices in the grid (z, x, y)."""
         return self.units().reshape(-1).index_select(0, places)
 
     def on(self, tiles: Tiles) -> Tensor:
         """Attenuation on the list of `tiles`, (N,), in units of the scale; zero at unoccupied voxels."""
-        values = self.at(tiles.voxels)
+        values = self.of_voxels(tiles.voxels)
         return values.new_zeros(tiles.filled.numel()).index_copy(0, tiles.occupied, values)
+
+    def units_at(self, points: Tensor) -> Tensor:
+        """Attenuation in units of the scale, (N,), at (N, 3) points (z, y, x) in voxels, with voxel centres at integers."""
+        sizes = points.new_tensor([self.depth, self.height, self.width])
+        relative = (2 * points + 1) / sizes - 1  # edges of the box at ±1
+        lattice = self.units().transpose(1, 2)[None, None]
+        options: dict[str, Any] = {"mode": "bilinear", "padding_mode": "border", "align_corners": False}
+        found = functional.grid_sample(lattice, relative.flip(-1)[None, None, None].to(lattice), **options)
+        return found.reshape(-1)
+
+    def at(self, points: Given, *, unit: str = "voxels") -> Given:
+        """Attenuation per voxel at any points of the volume.
+
+        Args:
+            points: (N, 3) coordinates (z, y, x), floating-point. The first voxel has its centre at 0.
+            unit: ``voxels``, or ``Å`` if `voxel_size` is known.
+
+        Returns:
+            (N,) values, differentiable with respect to the parameters of the field.
+
+        Raises:
+            ValueError: wrong shape, type or unit, or a point outside the volume.
+
+        Example:
+            >>> import recon, torch
+            >>> field = recon.VoxelField((4, 6, 8))
+            >>> field.at(torch.tensor([[0.0, 0.0, 0.0], [1.5, 2.25, 7.0]])).shape
+            torch.Size([2])
+        """
+        places = as_tensor(points)
+        if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():
+            kind = str(places.dtype).removeprefix("torch.")
+            raise ValueError(
+                f"points {tuple(places.shape)} of type {kind}: give (N, 3) floating-point coordinates (z, y, x)"
+            )
+        if unit not in ("voxels", "Å"):
+            raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
+        if unit == "Å":
+            if self.voxel_size is None:
+                raise ValueError(
+                    "the voxel size of this field is not known; give points in voxels, or set field.voxel_size"
+                )
+            places = places / self.voxel_size
+        places = places.to(self.scale.device)
+        last = places.new_tensor([self.depth, self.height, self.width]) - 1
+        outside = ~((places >= -0.5) & (places <= last + 0.5)).all(1)
+        if bool(outside.any()):
+            raise ValueError(
+                f"{int(outside.sum())} of {len(places)} points lie outside the volume, which extends over -0.5 to "
+                f"{self.depth - 0.5:g}, {self.height - 0.5:g} and {self.width - 0.5:g} voxels along z, y and x"
+            )
+        reverse = places.new_tensor([float(axis in self.flipped) for axis in range(3)])
+        places = reverse * (last - places) + (1 - reverse) * places
+        values = self.units_at(places.to(self.scale.dtype)) * self.scale
+        if self.occupied is not None:
+            z, y, x = places.round().long().clamp(min=torch.zeros_like(last.long()), max=last.long()).unbind(1)
+            values = values * self.occupied[z, x, y]
+        return alike(values, points)
+
+    @torch.no_grad()
+    def sampled(self, ratio: float) -> Tensor:
+        """The volume (z, y, x) on another grid with the same centre, attenuation per voxel of that grid.
+
+        Args:
+            ratio: size of its voxels relative to those of this field. Larger voxels are means over several points.
+        """
+        if not 0 < ratio < math.inf:
+            raise ValueError(f"ratio {ratio} of voxel sizes must be positive and finite")
+        sizes = [max(1, math.floor(size / ratio + 1e-6)) for size in (self.depth, self.height, self.width)]
+        per_voxel = math.ceil(ratio - 1e-6)
+        axes = []
+        for size, own in zip(sizes, (self.depth, self.height, self.width), strict=True):
+            fine = (torch.arange(size * per_voxel, dtype=torch.float64) + 0.5) / per_voxel - size / 2
+            axes.append((fine * ratio + (own - 1) / 2).clamp(-0.5, own - 0.5))
+        found = torch.empty(sizes)
+        layers = max(1, _POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
+        for first in range(0, sizes[0], layers):
+            z = axes[0][first * per_voxel : (first + layers) * per_voxel]
+            points = torch.stack(torch.meshgrid(z, *axes[1:], indexing="ij"), -1)
+            values = self.at(points.view(-1, 3)).cpu().view(1, 1, *points.shape[:3])
+            found[first : first + layers] = functional.avg_pool3d(values.float(), per_voxel)[0, 0]
+        return found * ratio
 
     @abstractmethod
     def start_from(self, volume: Tensor) -> None:
@@ -98,7 +199,7 @@ class Field(Described, ABC):
         """Unconstrained values of a volume (z, y, x) resampled to `shape`, (depth, width, height)."""
         lattice = volume.transpose(1, 2)[None, None] / self.scale
         pooled = functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
-        return torch.log(torch.expm1(pooled.clamp(_LEAST, 20)))
+        return torch.log(torch.expm1(pooled.clamp(EMPTY, 20)))
 
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""
@@ -117,93 +218,9 @@ class Field(Described, ABC):
     def volume(self) -> Tensor:
         """The attenuation as (z, y, x), detached."""
         with torch.no_grad():
-            return from_columns(self(), self.depth).contiguous()
+            values = self() if self.occupied is None else self() * self.occupied.reshape(-1, self.height)
+            return from_columns(values, self.depth).flip(self.flipped).contiguous()
 
-
-class VoxelField(Field):
-    """One free parameter per voxel.
-
-    Example:
-        >>> import recon
-        >>> recon.VoxelField((4, 6, 8)).volume().shape  # (z, y, x)
-        torch.Size([4, 6, 8])
-    """
-
-    def __init__(self, shape: Sequence[int], *, scale: float = 1.0) -> None:
-        super().__init__(shape, scale=scale)
-        empty = math.log(math.expm1(_LEAST))
-        self.values = nn.Parameter(torch.full((self.depth, self.width, self.height), empty))
-
-    def start_from(self, volume: Tensor) -> None:
-        with torch.no_grad():
-            self.values.copy_(self._raw_of(volume, self.values.shape))
-
-    def units(self) -> Tensor:
-        return functional.softplus(self.values)
-
-    def on(self, tiles: Tiles) -> Tensor:
-        return functional.softplus(tiles.gathered(self.values)) * tiles.filled
-
-
-class MultiresolutionField(Field):
-    """The sum of dense grids at doubling resolutions: as general as `VoxelField`, but much better conditioned.
-
-    The coarse grids act as a multigrid preconditioner: one step of Adam changes all wavelengths.
-
-    Args:
-        coarsest: minimum number of voxels along the longest side of the coarsest grid.
-
-    Example:
-        >>> import recon
-        >>> field = recon.MultiresolutionField((8, 8, 8))
-        >>> field.volume().shape, len(list(field.parameters()))
-        (torch.Size([8, 8, 8]), 2)
-    """
-
-    def __init__(self, shape: Sequence[int], *, scale: float = 1.0, coarsest: int = 3) -> None:
-        super().__init__(shape, scale=scale)
-        if coarsest < 1:
-            raise ValueError(f"coarsest {coarsest} must be at least one voxel")
-        sizes = [(self.depth, self.width, self.height)]
-        while max(sizes[0]) >= 2 * coarsest:
-            sizes.insert(0, tuple((size + 1) // 2 for size in sizes[0]))  # type: ignore[arg-type]
-        self.grids = nn.ParameterList(nn.Parameter(torch.zeros(size)) for size in sizes)
-        nn.init.constant_(self.grids[0], math.log(math.expm1(_LEAST)))
-
-    def start_from(self, volume: Tensor) -> None:
-        """Initialise a grid four times coarser than the voxel grid, because finer detail of the volume is noise."""
-        with torch.no_grad():
-            for grid in self.grids:
-                grid.zero_()
-            grid = self.grids[max(0, len(self.grids) - 3)]
-            grid.copy_(self._raw_of(volume, grid.shape))
-
-    @property
-    def has_coarser(self) -> bool:
-        return len(self.grids) > 1 and type(self) is MultiresolutionField
-
-    def coarser(self) -> Field | None:
-        """The sum of all grids except the finest; None for derived classes that compute their volume differently."""
-        if not self.has_coarser:
-            return None
-        depth, width, height = self.grids[-2].shape
-        field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)
-        field.grids = self.grids[:-1]
-        return field
-
-    def units(self) -> Tensor:
-        return functional.softplus(_sum(list(self.grids)))
-
-    def on(self, tiles: Tiles) -> Tensor:
-        *coarse, finest = self.grids
-        values = tiles.gathered(finest)
-        if coarse:
-            values = values + tiles.upsampled(_sum(coarse))
-        return functional.softplus(values) * tiles.filled
-
-
-def _sum(grids: Sequence[Tensor]) -> Tensor:
-    total, *finer = grids
-    for grid in finer:
-        total = upsample(total, grid.shape, plus=grid)
-    return total
+    def config(self) -> dict[str, Any]:
+        """Arguments that recreate this field, besides shape and scale; JSON-serialisable."""
+        return {}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,11 +13,15 @@ from torch.nn import functional
 
 from noiseflow import Gaussian, fit
 from noiseflow.threads import num_threads
-from recon.fields.fields import Field, MultiresolutionField
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.signal_model import TomographySignal
+from recon.projection.base import Projector
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import attenuation_scale, rough_volume
+from recon.series.masks import binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _COARSE = 24
@@ -82,12 +84,12 @@ def coarse_start(
         The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`.
     """
     binning = max(1, min(max(_LEAST_BINNING, round(grid.width / _COARSE)), *(size // 4 for size in grid.shape[1:])))
-    binned, mask, projector = _binned(tilt_series, grid, binning)
-    start = rough_volume(binned, response, projector)
-    depth, height, width = projector.depth, binned.images.shape[1], projector.width
+    small, mask, projector = _binned(tilt_series, grid, binning)
+    start = rough_volume(small, response, projector)
+    depth, height, width = projector.depth, small.images.shape[1], projector.width
     field = MultiresolutionField((depth, height, width), scale=attenuation_scale(start), coarsest=2)
     field.start_from(start)
-    images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (binned.images, mask))
+    images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (small.images, mask))
     rate = learning_rate(start, field)
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
@@ -115,33 +117,17 @@ class _BestResponse(nn.Module):
         return signal
 
 
-def _binned(
-    tilt_series: TiltSeries, grid: VolumeGrid, binning: int
-) -> tuple[TiltSeries, NDArray[np.bool_], SliceProjector]:
+def _binned(tilt_series: TiltSeries, grid: VolumeGrid, binning: int) -> tuple[TiltSeries, NDArray[np.bool_], Projector]:
     """The binned series with a mask, and the projector of a grid with voxels of that size."""
-    images, share = (np.stack(parts) for parts in zip(*_binned_images(tilt_series, binning), strict=True))
-    mask = share > 0
-    images[~mask] = images[mask].mean()
+    small = binned(tilt_series, binning, binning)
+    if tilt_series.axes is not None:  # incomplete bins shift the centre by less than half a bin
+        grid = VolumeGrid(-(-grid.depth // binning), *small.images.shape[1:])
+        return replace(small, beam=None), small.used, projector_of(small, grid)
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=-(-grid.depth // binning),
         width=-(-grid.width // binning),
-        detector_width=images.shape[2],
-        detector_offset=-(tilt_series.images.shape[2] % binning) / 2 / binning,
+        detector_width=small.images.shape[2],
+        detector_offset=detector_offset(tilt_series, binning),
     )
-    return TiltSeries(images, tilt_series.tilt_angles, None, tilt_series.mode), mask, projector
-
-
-def _binned_images(tilt_series: TiltSeries, binning: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Means of the used pixels of each bin, and their share; image by image, because a series may be larger than memory."""
-    for number, image in enumerate(tilt_series.images):
-        use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
-        share = _means(use, binning)
-        yield _means(np.where(use, image, 0), binning) / share.clip(min=1e-6), share
-
-
-def _means(image: NDArray[Any], size: int) -> NDArray[np.float32]:
-    """Means of squares of `size` pixels; incomplete squares at the far edges are dropped."""
-    tensor = torch.from_numpy(np.asarray(image, dtype=np.float32))
-    means: NDArray[np.float32] = functional.avg_pool2d(tensor[None], size)[0].numpy()
-    return means
+    return replace(small, beam=None), small.used, projector

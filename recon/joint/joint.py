@@ -13,52 +13,45 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Gaussian
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
-from recon.fields.fields import Field, MultiresolutionField
+from noiseflow.progress import Progress
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import first_noise, learns, noise_candidates
+from recon.joint.candidates import Readings, first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
-from recon.joint.run import Progress, RunFit, Runner, run_fit
+from recon.joint.run import MakeCandidates, RunFit, Runner, run_fit
 from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
 from recon.projection.base import Projector
-from recon.projection.defocused_projector import with_defocus
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
-from recon.projection.projector import SliceProjector, from_rays
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _FIRST_WEIGHT = 0.4
-_WIDTH_OF_FIRST = (
-    128  # voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
-)
-_QUIET_FIRST = (
-    6.4  # four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
-)
-_HELD_OUT, _HELD_OUT_TO_CHOOSE = (
-    0.1,
-    0.2,
-)  # shares of the pixels; larger on a slab, which has few pixels to distinguish weights
-_SLAB, _SLAB_VOXELS = (
-    24,
-    16 * 96**2,
-)  # slices; more if they are small: this number of voxels suffices to distinguish weights
-_QUIET_SLAB = (
-    12  # for slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
-)
+# Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+_WIDTH_OF_FIRST = 128
+# Four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
+_QUIET_FIRST = 6.4
+# Shares of the pixels; larger on a slab, which has few pixels to distinguish weights
+_HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2
+# Slices; more if they are small: this number of voxels suffices to distinguish weights
+_SLAB, _SLAB_VOXELS = 24, 16 * 96**2
+# For slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
+_QUIET_SLAB = 12
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
-_WORTHWHILE = (
-    0.4  # largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
-)
+# Largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
+_WORTHWHILE = 0.4
 
 
 @dataclass(frozen=True)
@@ -81,6 +74,8 @@ class JointReconstructor:
             voxels wide (only without defocus).
         defocus: blur to model, pixels per voxel out of the focal plane, see
             `recon.projection.defocused_projector.DefocusedProjector`.
+        defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
+            `recon.projection.defocused_projector.ImageDefocusedProjector`.
         slab: number of slices of the slab; by default 24, or more if slices are small.
         schedule: numbers of steps and learning rates.
         seed: seed of all random choices.
@@ -109,6 +104,7 @@ class JointReconstructor:
     skip_vacuum: bool = True
     coarse_to_fine: bool = True
     defocus: float = 0.0
+    defocus_kernel: str = "depth"
     slab: int | None = None
     schedule: Schedule = field(default_factory=Schedule)
     seed: int = 0
@@ -161,14 +157,14 @@ class JointReconstructor:
             settled: result of `settle` for all slices.
             rows: position of these slices among all.
             projector: projector of the grid, if it exists already.
-            progress: called with completed steps, expected steps and a note.
+            progress: called with a task, completed and expected steps, and a note.
         """
         whole = self._model(settled.start, tilt_series, grid, rows=rows, settled=settled, projector=projector)
         # copies, so that a block does not change the start of the next one
         models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series, share=_HELD_OUT, place=(rows, settled.start.height))
-        run = self._run(facts, {"whole": task}, models, [], progress)
+        run = self._run(facts, {"whole": task}, models, progress)
         run.weight_choice = settled.weight_choice
         if stays_empty(task, run.noise_model):
             run.stages = []
@@ -182,7 +178,7 @@ class JointReconstructor:
         part, model = self._slabs(start, tilt_series, grid)
         facts, rows, _ = self._facts(part, model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
+        return plan(facts, num_steps=self._steps(model), schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -190,14 +186,7 @@ class JointReconstructor:
 
     def projector(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Projector:
         """Line integrals through any slices of the grid."""
-        in_focus = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles,
-            depth=grid.depth,
-            width=grid.width,
-            detector_width=tilt_series.images.shape[2],
-            device=self.device,
-        )
-        return with_defocus(in_focus, self.defocus)
+        return projector_of(tilt_series, grid, self.device, self.defocus, self.defocus_kernel)
 
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]
@@ -212,7 +201,7 @@ class JointReconstructor:
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[TiltSeries, TomographySignal]:
         """The slices with the highest and the lowest contrast, and their signal model."""
-        num_slices = self._num_slices(grid)
+        num_slices = self.num_slices(grid)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
         rows = np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
@@ -256,6 +245,7 @@ class JointReconstructor:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             made = self.make_field(grid.shape, scale=scale).to(self.device)
+        made.voxel_size = grid.voxel_size
         rate = learning_rate(rough, made)
         rough = rough if rows is None else start.rows(rows).to(self.device)
         made.start_from(rough)
@@ -282,7 +272,7 @@ class JointReconstructor:
         learning = given is None or (learns(given) and not isinstance(given, Gaussian))
         quiet = learning and noise < _QUIET
         described = quiet and given is None  # by a noise model that is fitted after the volume
-        rows = contrast_slab(tilt_series, self._num_slices(whole.field, quiet=quiet))
+        rows = contrast_slab(tilt_series, self.num_slices(whole.field, quiet=quiet))
         facts = Facts(
             choose_noise=given is None and not described,
             learn_noise=given is None or learns(given),
@@ -303,19 +293,29 @@ class JointReconstructor:
     ) -> PlannedRun:
         """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
-        simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed)
-            candidates = noise_candidates(tilt_series.images, quiet=facts.quiet) if given is None else []
+        readings = Readings.of(tilt_series.images)
+        found, saturated = readings.digitisation, readings.saturated
+        simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
+
+        def candidates(task: Task, signal: Tensor) -> list[nn.Module]:
+            digitisation = readings.given(task.observation, signal, task.use)
+            clipped = saturated + float((task.observation <= digitisation.low).float().mean())
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self.seed)
+                return noise_candidates(digitisation, clipped)
+
         if facts.quiet and given is None:
-            simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
+            simple, given = (
+                Gaussian().to(self.device),
+                noise_candidates(found, saturated, quiet=True)[0].to(self.device),
+            )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
         tasks = {"slab": to_choose, "whole": self._task(whole, tilt_series, share=_HELD_OUT)}
-        run = self._run(facts, tasks, models, candidates, progress)
+        run = self._run(facts, tasks, models, progress, candidates, readings.least_signal)
         run.choose()
         return run
 
@@ -324,14 +324,16 @@ class JointReconstructor:
         facts: Facts,
         tasks: dict[str, Task],
         models: dict[str, nn.Module],
-        candidates: list[nn.Module],
         progress: Progress | None,
+        candidates: MakeCandidates | None = None,
+        least_signal: Callable[[nn.Module], float] | None = None,
     ) -> PlannedRun:
-        stages = plan(facts, num_steps=self.num_steps, schedule=self.schedule)
+        stages = plan(facts, num_steps=self._steps(tasks["whole"].signal_model), schedule=self.schedule)
         runner = Runner(
             tasks,
             models,
             candidates=candidates,
+            least_signal=least_signal,
             first_weight=_QUIET_FIRST if facts.quiet else _first_weight(tasks["whole"].signal_model.field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
@@ -340,6 +342,9 @@ class JointReconstructor:
             progress=progress,
         )
         return PlannedRun(facts, stages, runner)
+
+    def _steps(self, whole: TomographySignal) -> int | None:
+        return whole.field.num_steps if self.num_steps is None else self.num_steps
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -370,7 +375,7 @@ class JointReconstructor:
     def _halvings(self, model: TomographySignal) -> int:
         return HalfResolution.times(model) if self.coarse_to_fine else 0
 
-    def _num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
+    def num_slices(self, made: Field | VolumeGrid, *, quiet: bool = False) -> int:
         """Number of slices of the slab. Small slices need more to distinguish weights, and gaps of tilts need twice as many
         voxels. Quiet series, with long trial fits, use no more than that."""
         if self.slab is not None:
@@ -384,11 +389,9 @@ class JointReconstructor:
         """Fit the volume with the choices made."""
         result, model = run.fit_whole(), run.runner.tasks["whole"].signal_model
         noise_model = run.noise_model
-        with torch.no_grad():
-            volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
-            shape = (model.projector.num_tilts * model.projector.detector_width, model.field.height)
-            images = from_rays(model.signal().view(shape), model.projector.num_tilts).contiguous().cpu().numpy()
-        found = Reconstruction(volume, images, "joint", noise_model, result, model, run.weight_choice)
+        model.field.occupied = None if model.occupancy is None else model.occupancy.mask
+        volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
+        found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.base import NoiseDistribution
+from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
 
 

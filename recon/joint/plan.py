@@ -8,7 +8,7 @@ from typing import Literal
 
 from noiseflow.described import described
 
-Kind = Literal["signal", "noise", "candidates", "finalists", "weights"]
+Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "fields"]
 Where = Literal["slab", "whole"]
 Noise = Literal["simple", "chosen"]
 
@@ -88,7 +88,8 @@ class FitStage:
         name: unique name within a plan; the journal stores the result of the stage under it.
         kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
-            one and with the most likely simpler one, and chooses one of the two; ``weights`` compares regulariser weights.
+            one and with the most likely simpler one, and chooses one of the two; ``weights`` compares regulariser weights;
+            ``fields`` compares fields, see `recon.joint.field_choice`.
         where: the slab or the whole volume.
         noise: the simple noise model of the first fits, or the chosen model.
         num_steps: optimisation steps of each fit.
@@ -215,7 +216,7 @@ def describe(stages: Sequence[FitStage]) -> str:
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
-        if stage.kind in ("signal", "finalists", "weights"):
+        if stage.kind in ("signal", "finalists", "weights", "fields"):
             how.append(f"rate {stage.rate:g}")
         if stage.hold_offset:
             how.append("offset held")

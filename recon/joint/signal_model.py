@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.models.base import Described
@@ -13,7 +15,7 @@ from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers.base import Regulariser
 from recon.fields.regularisers.total_variation import TotalVariation
-from recon.projection.base import Projector, from_columns
+from recon.projection.base import Projector, from_columns, from_rays
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.tiles import Tiles
 
@@ -132,6 +134,12 @@ class TomographySignal(Described):
             columns = values if self.occupancy is None else self.tiles.lattice(values)
             return from_columns(columns, self.field.depth).contiguous()
 
+    @torch.no_grad()
+    def images(self) -> NDArray[np.float32]:
+        """The signal of all pixels as images (tilt, y, u)."""
+        rays = self.signal().view(-1, self.field.height)
+        return np.ascontiguousarray(from_rays(rays, self.projector.num_tilts).cpu().numpy())
+
     def forward(self, pixels: Tensor) -> Tensor:
         """The signal of some pixels. Without gradients, all pixels are projected once per state of the parameters. The graph is
         kept between steps, because the next step starts from the same state."""
@@ -189,6 +197,12 @@ class TomographySignal(Described):
         """Current intensity and offset of every tilt; empty for other image formations."""
         formation = self.image_formation
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
+
+    def hold_above(self, least_signal: float) -> None:
+        """Set the lower bound of the signals without an object, detector units; linear images only, because bright field has no
+        offset to fit."""
+        if isinstance(self.image_formation, Linear):
+            self.image_formation.least_offset.fill_(least_signal)
 
     def parameter_groups(self, *, rate: float = 1.0, hold_response: bool = False) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam.

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from noiseflow.fitting.observation_table import TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
+from recon.series.views import Directions
 
 
 @dataclass
@@ -78,12 +79,11 @@ class Task:
 def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
     """Mask of pixels (tilt, u, y) to hold out: two contiguous gaps of tilts, a third of the range apart, each at least a tenth of
     the range and three tilts wide. Single tilts would be predicted by their neighbours."""
-    order = np.argsort(tilt_angles, kind="stable")
-    span = tilt_angles[order[-1]] - tilt_angles[order[0]]
+    directions = Directions.of(tilt_angles)
     held_out = torch.zeros_like(like)
-    for middle in (tilt_angles[order[0]] + span / 3, tilt_angles[order[0]] + 2 * span / 3):
-        distance = np.abs(tilt_angles - middle)
-        near = distance <= max(span / 20, float(np.sort(distance)[min(2, len(order) - 1)]))
+    for part in (1 / 3, 2 / 3):
+        distance = np.abs(directions.angles - directions.angles.min() - part * directions.span)
+        near = distance <= max(directions.span / 20, float(np.sort(distance)[min(2, len(distance) - 1)]))
         held_out[torch.from_numpy(near).to(like.device)] = True
     return held_out
 

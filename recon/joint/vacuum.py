@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from recon.joint.task import Task
 
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
+from recon.projection.base import Projector
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp
 from recon.reconstruction import Reconstruction
@@ -39,7 +40,7 @@ class LineIntegralProblem:
     """
 
     line_integrals: Tensor
-    projector: SliceProjector
+    projector: Projector
     response: Transmission | Linear
     level: float = 0.0
 
@@ -48,13 +49,7 @@ class LineIntegralProblem:
         """The problem of reconstructing `tilt_series` on `grid`."""
         tilt_series, level = without_level(tilt_series)
         response = estimate_response(tilt_series).to(device)
-        projector = SliceProjector(
-            tilt_angles=tilt_series.tilt_angles,
-            depth=grid.depth,
-            width=grid.width,
-            detector_width=tilt_series.images.shape[2],
-            device=device,
-        )
+        projector = projector_of(tilt_series, grid, device)
         images = torch.from_numpy(tilt_series.images).to(device)
         with torch.no_grad():
             return cls(response.invert(images).contiguous(), projector, response, level)
@@ -85,13 +80,7 @@ def in_blocks(
     """Block-wise reconstruction by a method with independent slices, with the response of the whole series."""
     level = level_of(tilt_series)
     response = estimate_response(tilt_series, level=level).to(device)
-    projector = SliceProjector(
-        tilt_angles=tilt_series.tilt_angles,
-        depth=grid.depth,
-        width=grid.width,
-        detector_width=tilt_series.images.shape[2],
-        device=device,
-    )
+    projector = projector_of(tilt_series, grid, device)
 
     def solve(part: TiltSeries, block: Block) -> tuple[Images, Images]:
         lowered = np.asarray(part.images - np.float64(level), dtype=np.float32)
@@ -182,13 +171,8 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     out = every_nth_view(tilt_series.tilt_angles, _LEAVE_OUT)
     slab = replace(grid, height=rows.stop - rows.start)
     rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
-    judge = SliceProjector(
-        tilt_angles=tilt_series.tilt_angles[out],
-        depth=grid.depth,
-        width=grid.width,
-        detector_width=tilt_series.images.shape[2],
-    )
     left = part_of(tilt_series, out, rows)
+    judge = projector_of(left, slab)
     measured = left.images.astype(np.float64).ravel()
     unseen = replace(rest, projector=judge, response=estimate_response(left))
 

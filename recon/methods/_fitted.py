@@ -11,17 +11,21 @@ import torch
 from torch import nn
 
 from noiseflow import AtLevel, Digitisation, Digitised
-from noiseflow.models.around import as_noise_model
 from noiseflow.models.at_level import at_level
+from noiseflow.models.wrapper import as_noise_model
+from noiseflow.progress import Progress
+from recon.fields._names import AUTO
+from recon.fields._registry import field_kinds
 from recon.fields.regularisers._registry import find_regulariser
+from recon.joint.field_choice import choose_field, trial_stages
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
-from recon.joint.run import Progress, run_fit
+from recon.joint.run import run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
@@ -51,16 +55,23 @@ def fitted(
 
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
         level = _level(tilt_series, settings)
-        result = reconstructor(settings, options)(lowered_by(tilt_series, level), grid, progress=settings.progress)
+        lowered = lowered_by(tilt_series, level)
+        settings, tried = _with_field(settings, options, lowered, grid)
+        result = reconstructor(settings, options)(lowered, grid, progress=settings.progress)
         result = _raised(result, level, chosen="noise_model" not in options(settings))
-        return replace(result, method=name, choices=_choices(result, settings, tilt_series))
+        return replace(result, method=name, choices=_choices(result, settings, tilt_series) | tried)
 
     def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int, float]:
-        return reconstructor(settings, options).plan(tilt_series, grid)
+        fit = reconstructor(settings, options)
+        stages, rows, share = fit.plan(tilt_series, grid)
+        return trial_stages(fit, settings.field) + stages, rows, share
 
     def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
-        fit, level = reconstructor(settings, options), _level(tilt_series, settings)
-        settled = fit.settle(lowered_by(tilt_series, level), grid, progress=settings.progress)
+        level = _level(tilt_series, settings)
+        lowered = lowered_by(tilt_series, level)
+        settings, tried = _with_field(settings, options, lowered, grid)
+        fit = reconstructor(settings, options)
+        settled = fit.settle(lowered, grid, progress=settings.progress)
         solve = FittedBlock(
             fit,
             settled.portable(),
@@ -77,7 +88,7 @@ def fitted(
             quiet = settled.facts.quiet and settled.facts.simple_is_final
             result = Reconstruction(volume, projections, name, *known, likelihood=settled.simple if quiet else None)
             result = _raised(result, level, chosen="noise_model" not in options(settings))
-            return replace(result, choices=_choices(result, settings, tilt_series))
+            return replace(result, choices=_choices(result, settings, tilt_series) | tried)
 
         def forget(block: Block) -> None:
             if settings.forget is not None:
@@ -107,7 +118,7 @@ class FittedBlock:
         settled: its choices for all slices.
         grid: grid of the whole volume.
         level: constant level that is subtracted from the images.
-        progress: called with completed steps, expected steps and a note; None on a remote worker.
+        progress: called with a task, completed and expected steps, and a note; None on a remote worker.
         near: a signal model whose projector can be reused; None on a remote worker.
         num_samples: number of posterior samples for error bars; 0 for none.
         run_stage: runs the sampling; remote workers do not save unfinished blocks.
@@ -150,11 +161,26 @@ class FittedBlock:
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit of a method with user settings."""
-    names = ("weight", "num_steps", "defocus", "seed", "device", "run_fit", "prefix")
+    names = ("weight", "num_steps", "defocus", "defocus_kernel", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
     if settings.regulariser is not None:
         shared["regulariser"] = find_regulariser(settings.regulariser)
+    if settings.field is not None:
+        shared["make_field"] = next(iter(field_kinds(settings.field).values()))
     return JointReconstructor(**(shared | options(settings)))
+
+
+def _with_field(
+    settings: Settings, options: Options, tilt_series: TiltSeries, grid: VolumeGrid
+) -> tuple[Settings, dict[str, float | str]]:
+    """The settings with the field that ``auto`` chooses, and what it is to tell of the choice."""
+    if settings.field != AUTO:
+        return settings, {} if settings.field is None else {"field": settings.field}
+    if tilt_series.axes is not None:
+        raise ValueError("--field auto compares fields on some slices, which two axes share; name a field")
+    fit, kinds = reconstructor(settings, options), field_kinds(AUTO)
+    choice = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
+    return replace(settings, field=choice.name), {"field": choice.in_words()}
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
@@ -200,7 +226,7 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
 
 def _describe_defocus(defocus: float, model: TomographySignal) -> str:
     what = "below a quarter of a pixel, ignored"
-    if isinstance(model.projector, DefocusedProjector):
+    if isinstance(model.projector, DefocusedProjector | ImageDefocusedProjector):
         what = f"blurs up to {model.projector.blurs[-1]:.2g} pixels"
     return f"{defocus:g}, {what}"
 

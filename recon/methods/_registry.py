@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,17 @@ import torch
 from torch import nn
 
 from noiseflow.described import described
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
-from noiseflow.plugins import load_plugin, plugins
+from noiseflow.plugins import provided
+from noiseflow.progress import Progress
+from recon.fields._registry import field_kinds
 from recon.fields.regularisers._registry import find_regulariser
 from recon.joint.plan import FitStage
-from recon.joint.run import Progress, RunFit, run_fit
+from recon.joint.run import RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._names import GROUP, method_names
+from recon.projection.defocused_projector import KERNELS
 from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
@@ -40,15 +42,18 @@ class Settings:
         weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`.
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
+        field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
+            held-out pixels; None for the default of the method.
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
         window: window of the back-projection, one of `recon.projection.wbp.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
+        defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
         seed: seed of all random choices.
         device: torch device.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
         prefix: prefix of the names of fits, if one run makes several volumes.
         keep: function from the prefix to the folder for finished blocks, so that a run can resume; by default they are deleted
             when the volume is complete.
@@ -58,17 +63,19 @@ class Settings:
 
     Raises:
         ValueError: a value is out of range: weight, number of steps, defocus (0 to 1), number of samples (0, or 2 and more); or
-            window or regulariser is unknown.
+            window, regulariser or field is unknown.
     """
 
     weight: float | None = None
     regulariser: str | None = None
+    field: str | None = None
     uncertainty: int = 0
     num_steps: int | None = None
     noise_model: nn.Module | None = None
     window: str | None = None
     denoiser: str | None = None
     defocus: float = 0.0
+    defocus_kernel: str = "depth"
     seed: int = 0
     device: torch.device | str = "cpu"
     progress: Progress | None = None
@@ -85,8 +92,11 @@ class Settings:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
+        if self.defocus_kernel not in KERNELS:
+            raise ValueError(f"--defocus-kernel {self.defocus_kernel}: choose {' or '.join(KERNELS)}")
         if self.regulariser is not None:
             find_regulariser(self.regulariser)
+        field_kinds(self.field)
         if self.uncertainty < 0 or self.uncertainty == 1:
             raise ValueError(f"--uncertainty {self.uncertainty}: give at least 2 samples (typically 16)")
         if self.window is not None and self.window not in WINDOWS:
@@ -98,7 +108,10 @@ MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], in
 SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
-_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty")
+_SECOND_AXIS = "second axis"
+_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty", "field")
+# relative difference; sizes in file headers are rounded to four digits and more
+_SAME_SIZE = 1e-3
 
 
 @described()
@@ -117,6 +130,8 @@ class Method:
         plan: function that returns the stages of its fit, the number of slices of the slab, and the share of voxels that are not
             skipped; None if there is no plan.
         blockwise: function that makes the choices for all slices; None if blocks are not supported.
+        memory: bytes that it needs besides those for the grid and the images.
+        continuous: whether its volume is a field, which has values between voxels; always true of fitted methods.
 
     Example:
         >>> from recon.methods import find_method
@@ -134,10 +149,20 @@ class Method:
     refuses: tuple[str, ...] = ()
     plan: MakePlan | None = None
     blockwise: SettleBlocks | None = None
+    memory: int = 0
+    continuous: bool = False
 
     def takes(self, setting: str) -> bool:
-        """Whether it supports a setting."""
+        """Whether it supports a setting, or output of ``voxel-size`` or ``save-field``."""
+        if setting in ("voxel-size", "save-field"):
+            return self.fitted or self.continuous
         return setting not in self.refuses and (self.fitted or setting not in _OF_FITS)
+
+    def more_memory(self, field: str | None = None) -> int:
+        """Bytes for the method and the named field besides those for the grid and the images."""
+        return self.memory + (
+            max(kind.more_memory for kind in field_kinds(field).values()) if self.takes("field") else 0
+        )
 
 
 _Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
@@ -152,8 +177,7 @@ def find_method(name: str) -> Method:
     """
     if name not in method_names():
         raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
-    other = plugins(GROUP).get(name)
-    found = import_module(f"recon.methods.{name.replace('-', '_')}").METHOD if other is None else load_plugin(other)
+    found = provided(name, "recon.methods", GROUP, "METHOD")
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; it must be a recon.methods.Method")
     return found
@@ -177,15 +201,26 @@ def settings_of(method: str, **settings: Any) -> Settings:
         "defocus": bool(chosen.defocus),
         "weight": chosen.weight is not None,
         "regulariser": chosen.regulariser is not None,
+        "field": chosen.field is not None,
         "uncertainty": bool(chosen.uncertainty),
         "steps": chosen.num_steps is not None,
         "window": chosen.window is not None,
         "denoiser": chosen.denoiser is not None,
     }
-    for name in (name for name, is_given in given.items() if is_given and not found.takes(name)):
+    for name in (name for name, is_given in given.items() if is_given):
+        require_setting(method, name)
+    return chosen
+
+
+def require_setting(method: str, name: str) -> None:
+    """Check that a method supports a setting.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if not find_method(method).takes(name):
         able = [other for other in method_names() if find_method(other).takes(name)]
         raise ValueError(f"--{name}: method {method} does not support it; use --method {', '.join(able)}")
-    return chosen
 
 
 @kept_memory()
@@ -227,7 +262,8 @@ def reconstruct(
         True
     """
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
-    order = np.argsort(tilt_series.tilt_angles, kind="stable")
+    _require_pixels(tilt_series, grid)
+    order = tilt_series.rising
     if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
         result = reconstruct(
             tilt_series.select(order),
@@ -240,6 +276,8 @@ def reconstruct(
         )
         return replace(result, projections=result.projections[np.argsort(order)])
     chosen, found = settings_of(method, **settings), find_method(method)
+    if tilt_series.axes is not None:
+        require_two_axes(found, blocks=slices_at_once is not None)
     run: _Run = partial(_at_once, found)
     if slices_at_once is not None:
         if slices_at_once < 1:
@@ -258,6 +296,41 @@ def reconstruct(
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+
+
+def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
+    """Check that voxels are as large as pixels.
+
+    Raises:
+        ValueError: they are not.
+    """
+    height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
+    if grid.height != height:
+        raise ValueError(
+            f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights; for other "
+            "voxels, use sampled() of the result"
+        )
+    if pixel is not None and grid.voxel_size is not None and not np.isclose(grid.voxel_size, pixel, rtol=_SAME_SIZE):
+        raise ValueError(
+            f"the grid has voxels of {grid.voxel_size:g} Å and the images pixels of {pixel:g} Å; give a grid of pixels; "
+            "for other voxels, use sampled() of the result"
+        )
+
+
+def require_two_axes(method: Method, *, blocks: bool) -> None:
+    """Check that a method reconstructs from two tilt axes.
+
+    Raises:
+        ValueError: it does not, or the volume is to be reconstructed in blocks of slices.
+    """
+    if not method.takes(_SECOND_AXIS):
+        able = [name for name in method_names() if find_method(name).takes(_SECOND_AXIS)]
+        raise ValueError(f"--second-axis: method {method.name} does not support it; use --method {', '.join(able)}")
+    if blocks:
+        raise ValueError(
+            "--second-axis: rays about the second axis cross all slices, so blocks are not possible; remove "
+            "--slices-at-once, --workers and --scheduler, or bin the images if memory does not suffice"
+        )
 
 
 def _of_distinct_tilts(

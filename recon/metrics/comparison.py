@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
-from noiseflow.commands.console import Progress
+from noiseflow.progress import Progress
 from noiseflow.report import Report, new_figure, show_image
 from recon.metrics.metrics import (
     SCALINGS,
@@ -21,6 +21,7 @@ from recon.metrics.metrics import (
     matching_line,
     resolution,
 )
+from recon.metrics.orientation import OtherOrientation, better_orientation
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
 
@@ -45,6 +46,7 @@ class Comparison:
         frequency, correlation: (N,) Fourier shell correlation, cycles per voxel.
         crossings: threshold → frequency, cycles per voxel.
         expected: correlation with the truth that is expected from the error bars of the volume, if known.
+        orientation: a flip or an axis order of the volume that fits much better, if there is one.
     """
 
     volume: dict[str, Errors]
@@ -53,6 +55,7 @@ class Comparison:
     correlation: Array
     crossings: dict[float, float]
     expected: ShellBand | None = None
+    orientation: OtherOrientation | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-serialisable values."""
@@ -61,7 +64,8 @@ class Comparison:
         crossings = {f"fsc_{threshold:g}": value for threshold, value in self.crossings.items()}
         if self.expected is not None:
             errors |= {"fsc_expected": {"low": self.expected.low, "high": self.expected.high}}  # type: ignore[dict-item]
-        return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation}
+        other = None if self.orientation is None else asdict(self.orientation)
+        return errors | crossings | {"frequency": self.frequency, "fsc": self.correlation, "better_orientation": other}
 
 
 def compare_volumes(
@@ -70,7 +74,7 @@ def compare_volumes(
     *,
     tilt_angles: Array | None = None,
     mode: Mode = "linear",
-    progress: Progress = lambda done, note: None,
+    progress: Progress = lambda task, done, total, note: None,
 ) -> Comparison:
     """Compare a volume with its reference.
 
@@ -79,7 +83,7 @@ def compare_volumes(
         reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: type of the projections: line integrals (``linear``), or exp(−line integral) (``transmission``).
-        progress: called with the completed steps (of `NUM_STEPS`) and a note.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: shapes or voxel sizes differ, voxels are not finite, or the reference is constant.
@@ -88,17 +92,18 @@ def compare_volumes(
     first, second = volume.attenuation, reference.attenuation
     errors: dict[str, Errors] = {}
     for done, scaling in enumerate(SCALINGS):
-        progress(done + 1, f"volumes, {scaling}")
+        progress("comparing", done + 1, NUM_STEPS, f"volumes, {scaling}")
         errors[scaling] = compare(first, second, scaling=scaling)
     projections: dict[str, Errors] = {}
     if tilt_angles is not None:
-        progress(len(SCALINGS) + 1, "projections")
+        progress("comparing", len(SCALINGS) + 1, NUM_STEPS, "projections")
         images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
         projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
-    progress(NUM_STEPS, "shell correlation")
+    progress("comparing", NUM_STEPS, NUM_STEPS, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
-    return Comparison(errors, projections, frequency, correlation, crossings)
+    orientation = better_orientation(first, second)
+    return Comparison(errors, projections, frequency, correlation, crossings, orientation=orientation)
 
 
 def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
@@ -122,9 +127,9 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
             raise ValueError(f"the {name} has shape {array.shape}; give a volume (z, y, x)")
     if first.shape != second.shape:
         sizes = [" x ".join(map(str, array.shape)) for array in (first, second)]
-        raise ValueError(
-            f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; crop or resample one to the grid of the other"
-        )
+        other = better_orientation(first, second)
+        advice = "crop or resample one to the grid of the other" if other is None else other.in_words()
+        raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
             f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "

@@ -38,7 +38,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     if image.data.ndim == 3:
         try:
             metadata["tilt_angles"] = io.tilt_angles_of(source, image)
-        except FileNotFoundError:
+        except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
             scale[0] = scale[-1]

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow import io
+from recon.fields._names import DEFAULT, field_names
 from recon.napari.files import LayerData, error_bar_layer
 
 if TYPE_CHECKING:
-    from recon.joint.run import Progress
+    from noiseflow.progress import Progress
 
 _STEPS = 0  # the default number of the method
 _BUTTON = "Reconstruct"
@@ -30,6 +31,7 @@ def reconstruct_layers(
     angles: Path | None = None,
     mode: str = "linear",
     method: str = "auto",
+    field: str = DEFAULT,
     thickness: int = 0,
     num_steps: int = _STEPS,
     invert_tilt: bool = False,
@@ -44,11 +46,12 @@ def reconstruct_layers(
         angles: angle file, instead of the angles of the layer.
         mode: ``linear`` or ``transmission``.
         method: one of `recon.methods.method_names`.
+        field: one of `recon.fields.field_names`; the default for methods with a field of their own.
         thickness: voxels along the beam; 0 for the image width.
         num_steps: steps of the fit; 0 for the default of the method.
         invert_tilt: flip the sign of the angles.
         uncertainty: number of posterior samples for error bars; 0 for none.
-        progress: called with completed steps, expected steps and a note.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: there are no tilt angles, or the series cannot be reconstructed with these settings.
@@ -69,6 +72,7 @@ def reconstruct_layers(
     series = prepare(series).tilt_series
     grid = VolumeGrid.of(series, thickness or None)
     options: dict[str, Any] = {"num_steps": num_steps or None, "uncertainty": uncertainty, "progress": progress}
+    options["field"] = None if field == DEFAULT else field
     outcome = reconstruct(series, grid, method=method, **options)
     scale = [pixel_size or 1.0] * 3
     result = {"voxel_size": tuple(scale)} if pixel_size else {}
@@ -95,13 +99,14 @@ def reconstruct_widget() -> Any:
         angles: Path | None = None,
         mode: str = "linear",
         method: str = "auto",
+        field: str = DEFAULT,
         thickness: int = 0,
         num_steps: int = _STEPS,
         invert_tilt: bool = False,
         uncertainty: int = 0,
     ) -> None:
         options = {"angles": angles, "mode": mode, "method": method, "thickness": thickness, "invert_tilt": invert_tilt}
-        options["uncertainty"] = uncertainty
+        options |= {"uncertainty": uncertainty, "field": field}
         worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
         button = form.call_button
         button.enabled, button.text = False, "Reconstructing …"
@@ -117,6 +122,7 @@ def reconstruct_widget() -> Any:
         angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "required if the layer has no angles"},
         mode={"choices": ["linear", "transmission"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
         method={"choices": [name for name in method_names() if name != "joint-supervised"]},
+        field={"choices": field_names(), "tooltip": "what a fitted volume is made of"},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
         num_steps={"min": 0, "max": 10_000, "label": "steps (0: default)"},
         uncertainty={"min": 0, "max": 1000, "label": "samples for error bars (0: none)"},
@@ -144,9 +150,6 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
         steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         found: list[list[LayerData] | Exception] = []
 
-        def report(done: int, total: int, note: str) -> None:
-            steps.put(round(_SHARES * done / total))
-
         def fit() -> None:
             try:
                 found.append(
@@ -154,7 +157,7 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
                         images,
                         metadata,
                         num_steps=num_steps,
-                        progress=lambda done, total, note: steps.put(round(_SHARES * done / total)),
+                        progress=lambda task, done, total, note: steps.put(round(_SHARES * done / total)),
                         **options,
                     )
                 )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Projector(ABC):
-    """Base class of linear operators from volumes to line integrals of a single-axis tilt series.
+    """Base class of linear operators from volumes to the line integrals of a tilt series.
 
     A subclass defines `project` and `backproject` in the native layout, in which slices are columns and no copies are needed.
     Everything else has defaults; `has_parts` and `half` indicate optional capabilities.
@@ -25,12 +25,14 @@ class Projector(ABC):
         tilt_angles: (tilts,) degrees.
         depth, width: voxels along z and x.
         detector_width: pixels along u.
+        fixed_height: voxels along y if slices are not projected independently; None if any number of them is accepted.
     """
 
     tilt_angles: NDArray[np.float64]
     depth: int
     width: int
     detector_width: int
+    fixed_height: int | None = None
 
     @property
     @abstractmethod

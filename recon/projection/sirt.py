@@ -6,16 +6,17 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.projection.projector import SliceProjector
+from recon.projection.base import Projector
 
 
 def sirt(
     line_integrals: Given,
-    projector: SliceProjector,
+    projector: Projector,
     *,
     num_iterations: int = 100,
     start: Given | None = None,
     minimum: float | None = 0.0,
+    used: Given | None = None,
 ) -> Given:
     """Reconstruct by x ← x + C Aᵀ R (y − A x), with R and C the inverse row and column sums of A.
 
@@ -25,6 +26,7 @@ def sirt(
         num_iterations: number of iterations; noise increases with it.
         start: (z, y, x) initial volume; zero if None. Thirty iterations are equivalent to ten followed by twenty.
         minimum: lower bound applied after every iteration, or None.
+        used: (tilt, y, u) weights, 1 for pixels to use and 0 for the others; None for all.
 
     Returns:
         (z, y, x) attenuation per voxel, of the same array type as the input.
@@ -40,9 +42,10 @@ def sirt(
     """
     A = projector
     y = as_tensor(line_integrals, like=A)
-    ones = torch.ones((A.depth, 1, A.width), dtype=y.dtype, device=y.device)
+    ones = torch.ones((A.depth, A.fixed_height or 1, A.width), dtype=y.dtype, device=y.device)
     R = _inverse(A(ones))
-    C = _inverse(A.T(torch.ones_like(R)))
+    weights = torch.ones_like(R) if used is None else as_tensor(used, like=A)
+    R, C = R * weights, _inverse(A.T(weights))
     empty = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device)
     x = empty if start is None else as_tensor(start, like=A)
     for _ in range(num_iterations):

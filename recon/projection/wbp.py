@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.projection.projector import SliceProjector
+from recon.projection.base import Projector
 
 WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
     "ramp": torch.ones_like,
@@ -22,7 +22,7 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
 """Window functions by name; their argument is frequency over cutoff, in [0, 1]."""
 
 
-def wbp(line_integrals: Given, projector: SliceProjector, *, window: str = "ramp", cutoff: float = 1.0) -> Given:
+def wbp(line_integrals: Given, projector: Projector, *, window: str = "ramp", cutoff: float = 1.0) -> Given:
     """Reconstruct by filtered back-projection.
 
     The ramp is the Fourier transform of the band-limited kernel of Ramachandran and Lakshminarayanan, which preserves constants.

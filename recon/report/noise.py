@@ -21,10 +21,10 @@ _HISTOGRAMS = 5
 _LEAST_PIXELS = 200
 _MOST_PIXELS = 2_000_000
 
-Pixels = NDArray[np.float32]
+Values = NDArray[np.float32]
 
 
-def noise_charts(noise_model: nn.Module, signal: Pixels, observation: Pixels) -> list[Figure]:
+def noise_charts(noise_model: nn.Module, signal: Values, observation: Values) -> list[Figure]:
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
@@ -39,7 +39,7 @@ def noise_charts(noise_model: nn.Module, signal: Pixels, observation: Pixels) ->
     return charts
 
 
-def _by_signal(signal: Pixels, count: int) -> list[NDArray[np.intp]]:
+def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
     """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
     low, high = (float(end) for end in np.quantile(signal, (0.001, 0.999)))
     edges = np.linspace(low, high, count + 1)
@@ -49,7 +49,7 @@ def _by_signal(signal: Pixels, count: int) -> list[NDArray[np.intp]]:
 
 
 def _quantile_chart(
-    noise_model: nn.Module, signal: Pixels, observation: Pixels, groups: list[NDArray[np.intp]]
+    noise_model: nn.Module, signal: Values, observation: Values, groups: list[NDArray[np.intp]]
 ) -> Figure:
     level = np.array([signal[group].mean() for group in groups])
     data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
@@ -74,7 +74,7 @@ def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any
     return torch.stack(quantiles, 1).cpu().numpy()
 
 
-def _histogram(noise_model: nn.Module, signal: Pixels, observation: Pixels, *, legend: bool) -> Figure:
+def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, legend: bool) -> Figure:
     residual = observation - signal
     low, high = np.quantile(residual, (0.001, 0.999))
     inner = np.linspace(low, max(float(high), float(low) + 1e-6 * (1 + abs(float(low)))), 49)

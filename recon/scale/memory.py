@@ -13,9 +13,8 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
-_TILE = (
-    0.3  # share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
-)
+# Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
+_TILE = 0.3
 _BASE = 400 * 2**20
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
@@ -23,18 +22,18 @@ _STEP = 8  # slices: smaller differences in height do not affect the cost
 PLENTY = 4 * 2**30
 """Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
 time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
-_TALL = (
-    64  # slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
-)
+# Slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
+_TALL = 64
 
 
-def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True) -> int:
+def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True, more: int = 0) -> int:
     """Peak memory of a reconstruction, bytes, within about 20 % (measured for 48³ to 1000³ voxels).
 
     Args:
         tilt_series: the images.
         grid: the voxel grid.
         fitted: whether a field is fitted, with optimiser moments and best state; otherwise SIRT or back-projection.
+        more: bytes of the method or field that depend neither on the grid nor on the images.
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
@@ -42,7 +41,7 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     volume = depth * height * width
     tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
     matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
-    return int(_BASE + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
+    return int(_BASE + more + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
 
 
 def choose_slices(
@@ -51,6 +50,7 @@ def choose_slices(
     available: int,
     *,
     fitted: bool = True,
+    more: int = 0,
     workers: int = 1,
     plenty: float = math.inf,
 ) -> int | None:
@@ -60,7 +60,7 @@ def choose_slices(
         tilt_series: the images.
         grid: grid of the whole volume.
         available: available memory, bytes.
-        fitted: as in `needed_memory`.
+        fitted, more: as in `needed_memory`.
         workers: number of simultaneous blocks.
         plenty: largest memory of a whole volume, bytes, even if more is available.
 
@@ -68,12 +68,12 @@ def choose_slices(
         MemoryError: even a few slices do not fit.
     """
     room = int(_MOST * available / workers)
-    if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted) <= min(room, plenty):
+    if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted, more=more) <= min(room, plenty):
         return None
     most = min(_TALL, -(-grid.height // workers))
     heights = range(most - most % _STEP or most, 0, -_STEP)
     needed = {
-        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted)
+        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted, more=more)
         for slices in heights
     }
     for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):

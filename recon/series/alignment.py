@@ -99,11 +99,15 @@ class Alignment:
         size = None if self.pixel_size is None else self.pixel_size / factor
         return replace(self, shifts=self.shifts * factor, image_shape=shape, pixel_size=size)
 
-    def joined(self, tilt_series: TiltSeries) -> Alignment:
-        """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
+    def moved(self, moves: NDArray[np.float64]) -> Alignment:
+        """The alignment whose images are shifted: a position p (y, x) in them shows what was at p + `moves`, (tilt, 2)."""
+        return replace(self, shifts=self.shifts + np.einsum("tij,tj->ti", self._back, moves))
+
+    def order_of(self, tilt_series: TiltSeries) -> list[int]:
+        """For each tilt of a series, the index of the tilt of this alignment with the same angle; full turns do not matter.
 
         Raises:
-            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
+            ValueError: a tilt of the series is not in the alignment.
         """
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
@@ -122,8 +126,23 @@ class Alignment:
                 f"{self.tilt_angles.min():g}° to {self.tilt_angles.max():g}°, and the series has {len(angles)}; give the "
                 "alignment of these tilts, or --exclude-views"
             )
+        return order
+
+    def joined(self, tilt_series: TiltSeries) -> Alignment:
+        """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
+
+        Raises:
+            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
+        """
+        order = self.order_of(tilt_series)
         stretches, refined = (None if each is None else each[order] for each in (self.stretches, self.refined_angles))
-        here = replace(self, shifts=self.shifts[order], tilt_angles=angles, stretches=stretches, refined_angles=refined)
+        here = replace(
+            self,
+            shifts=self.shifts[order],
+            tilt_angles=tilt_series.tilt_angles,
+            stretches=stretches,
+            refined_angles=refined,
+        )
         return here.scaled(self._factor(tilt_series))
 
     def _factor(self, tilt_series: TiltSeries) -> float:
@@ -210,6 +229,9 @@ class Alignment:
         )
         if self.residual is not None:
             words += f"; {1 - self.residual:.1%} of held-out gaps of tilts explained"
+        if self.stretches is not None:
+            sizes = np.sqrt(np.abs(np.linalg.det(self.stretches)))
+            words += f"; size of the specimen from {sizes.min():.3f} to {sizes.max():.3f}"
         if self.margin is not None:
             words += f", {1 - self.evidence[1].residual:.1%} at {self.evidence[1].axis:.1f}°"
         return words
@@ -220,6 +242,9 @@ class Alignment:
         if self.residual is not None:
             found["axis offset (pixels)"] = f"{self.axis_offset:.2f}"
             found["largest shift (pixels)"] = f"{np.abs(self.shifts).max():.2f}"
+        if self.stretches is not None:
+            sizes = np.sqrt(np.abs(np.linalg.det(self.stretches)))
+            found["size of the specimen"] = f"{sizes.min():.3f} to {sizes.max():.3f}"
         return found
 
     def as_dict(self) -> dict[str, Any]:

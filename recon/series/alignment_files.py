@@ -1,19 +1,26 @@
-"""Alignments as files: JSON with everything, or IMOD's ``.xf`` with a ``.tlt`` next to it."""
+"""Alignments as files: JSON with everything, IMOD's ``.xf`` with a ``.tlt``, AreTomo's ``.aln``, RELION's ``.star``."""
 
 from __future__ import annotations
 
 import json
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.io.ownership import signature
+from noiseflow.io.imod import adjusted
+from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
+_FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
+_AS_WRITTEN = 0.01  # degrees, as files round them
+_RAW = (".st", ".mrc", ".mrcs")
 
 
 def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
@@ -55,12 +62,16 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
     return [path, write_angles(path.with_suffix(".tlt"), refined)]
 
 
-def read_alignment(path: str | Path, tilt_series: TiltSeries | None = None) -> Alignment:
-    """Read an alignment that `write_alignment` or IMOD wrote.
+def read_alignment(
+    path: str | Path, tilt_series: TiltSeries | None = None, *, binning: float | None = None
+) -> Alignment:
+    """Read an alignment that `write_alignment` or another program wrote.
 
     Args:
-        path: ``.json``, or ``.xf``; a ``.tlt`` file of the same name gives the refined tilt angles.
-        tilt_series: the raw series, in the order of the lines of an ``.xf`` file, which holds no angles.
+        path: ``.json``; IMOD's ``.xf``, where a ``.tlt`` file of the same name gives the refined tilt angles, and a raw stack
+            of the same name (``.st``, ``.mrc``) the size of the images it was made on; AreTomo's ``.aln``; RELION's ``.star``.
+        tilt_series: the raw series, in the order of the stack that was aligned.
+        binning: how many times smaller the images are than those that were aligned, if no file states it. Not for ``.json``.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -71,12 +82,12 @@ def read_alignment(path: str | Path, tilt_series: TiltSeries | None = None) -> A
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "series.xf"
         >>> _ = path.write_text("1 0 0 1 2.5 0\\n" * 3)
         >>> series = recon.TiltSeries(np.random.default_rng(0).random((3, 8, 8)), [-30.0, 0.0, 30.0], mode="linear")
-        >>> recon.read_alignment(path, series).shifts[0].tolist()  # (y, x) of the raw images
-        [0.0, -2.5]
+        >>> recon.read_alignment(path, series).shifts[0, 1].item()  # pixels along x
+        -2.5
     """
     path = Path(path)
     if path.suffix.lower() != ".json":
-        return _of_imod(path, tilt_series)
+        return _of_table(path, tilt_series, binning)
     try:
         known = json.loads(path.read_text(encoding="utf-8"))["alignment"]
         return Alignment(
@@ -94,21 +105,82 @@ def read_alignment(path: str | Path, tilt_series: TiltSeries | None = None) -> A
         raise ValueError(f"{path} is not an alignment that --save-alignment wrote ({error})") from error
 
 
-def _of_imod(path: Path, tilt_series: TiltSeries | None) -> Alignment:
+def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None) -> Alignment:
+    """The alignment of a file with one transform for each image of a stack."""
+    tables = (".aln", ".star", ".tomostar", ".mdoc", ".com")  # others are transforms, such as .xf and .prexg of IMOD
+    table = io.read_tilts(path) if path.suffix.lower() in tables else _xf_with_angles(path, tilt_series)
+    if table.transforms is None:
+        raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
+    table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
+    known: dict[str, Any] = {"image_shape": table.image_shape, "pixel_size": table.pixel_size}
+    if binning is not None:
+        if not 0 < binning < np.inf:
+            raise ValueError(f"--alignment-binning {binning:g}: give a positive number, such as 4")
+        moved = table.transforms / np.array([1, 1, binning])
+        table, known = replace(table, transforms=moved), {}
+    if tilt_series is None:
+        return Alignment.of_transforms(_transforms(table), table.angles, **known)
+    views = np.arange(tilt_series.num_tilts) if tilt_series.views is None else tilt_series.views
+    total = tilt_series.num_views or tilt_series.num_tilts
+    sections = np.arange(len(table.angles)) if table.sections is None else table.sections
+    if (table.sections is None and len(sections) != total) or sections.max() >= total:
+        raise ValueError(
+            f"{path} has {len(sections)} transforms, and the series has {total} images; give the alignment of this series"
+        )
+    rows = {int(section): row for row, section in enumerate(sections)}
+    used = [tilt for tilt, view in enumerate(views) if int(view) in rows]
+    table = table.rows([rows[int(views[tilt])] for tilt in used])
+    refined = None if np.isnan(table.angles).any() else table.angles
+    raw = tilt_series.tilt_angles[used]
+    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > _AS_WRITTEN:
+        warnings.warn(
+            f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
+            stacklevel=3,
+        )
+    alignment = Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
+    return alignment
+
+
+def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, stated: bool) -> None:
+    """Warn of shifts that may be those of larger images, if no file says which images were aligned."""
+    largest, edge = float(np.abs(alignment.shifts).max(initial=0.0)), min(tilt_series.images.shape[1:])
+    if not stated and largest > _FAR * edge:
+        warnings.warn(
+            f"{path} shifts images of {edge} pixels by up to {largest:.0f} pixels; if it was made on larger images, give "
+            "--alignment-binning, or put the stack that was aligned next to it",
+            stacklevel=4,
+        )
+
+
+def _transforms(table: io.TiltTable) -> NDArray[np.float64]:
+    assert table.transforms is not None
+    return table.transforms
+
+
+def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
+    """Transforms of IMOD, with the refined angles of the ``.tlt`` and the size of the raw stack of the same name."""
     transforms, angle_file = io.read_transforms(path), path.with_suffix(".tlt")
     refined = io.read_angles(angle_file) if angle_file.is_file() else None
-    if tilt_series is None and refined is None:
+    if refined is None and tilt_series is None:
         raise FileNotFoundError(
             f"{path} holds no tilt angles and there is no {angle_file.name} next to it; add this file"
         )
-    raw = refined if tilt_series is None else tilt_series.tilt_angles
-    assert raw is not None
-    for other, name in ((raw, "the series"), (refined, angle_file.name)):
-        if other is not None and len(other) != len(transforms):
-            raise ValueError(
-                f"{path} has {len(transforms)} transforms, and {name} has {len(other)} tilts; give the .xf of this series"
-            )
-    return Alignment.of_transforms(transforms, raw, refined_angles=refined)
+    if refined is not None and len(refined) != len(transforms):
+        raise ValueError(
+            f"{path} has {len(transforms)} transforms, and {angle_file} has {len(refined)} angles; give the files of one series"
+        )
+    unknown = io.TiltTable(np.full(len(transforms), np.nan))
+    known = unknown if refined is None else adjusted(io.TiltTable(refined), path, path.stem)  # the offset of tilt.com
+    table = replace(unknown, angles=known.angles, transforms=transforms)
+    stack = next((each for suffix in _RAW if (each := path.with_suffix(suffix)).is_file()), None)
+    if stack is None:
+        return table
+    raw = io.read(stack, mapped=True)
+    if len(raw.data) != len(transforms) or raw.data.ndim != 3:
+        return table
+    size = raw.voxel_size
+    return replace(table, image_shape=raw.data.shape[1:], pixel_size=None if size is None else size[2])
 
 
 def _array(values: Any) -> Any:

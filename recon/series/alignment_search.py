@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
+from recon.series.masks import plausible
 from recon.series.matching import Match, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
 
-Progress = Callable[[str, int, int, str], None]
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
 _SPACING = 15.0
 _KEPT = (6, 3)  # number of directions kept after the smallest size, and after the next ones
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
 _EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
 _ROUNDS, _FEWER_ROUNDS = 15, 5
-_AGAIN = (
-    3  # refinements before equally good directions are declared equal, because wrong ones move towards the true one
-)
+# Refinements before equally good directions are declared equal, because wrong ones move towards the true one
+_AGAIN = 3
 
 
 class AxisUndetermined(ValueError):
@@ -112,7 +112,7 @@ class _Search:
     ) -> None:
         self.angles, self.given, self.progress = series.tilt_angles, tilt_axis, progress
         self.known = series.tilt_axis if tilt_axis is None else tilt_axis
-        self.images = _line_integrals(series).to(device)
+        self.images = line_integrals_of(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
         size = max(series.images.shape[1:])
         self.binnings = _binnings(size)
@@ -269,9 +269,9 @@ def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
     return _weighed(matcher, best, candidate.known)
 
 
-def _line_integrals(tilt_series: TiltSeries) -> Tensor:
+def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     """Images as line integrals, of order one."""
-    lowered, _ = without_level(tilt_series)
+    lowered, _ = without_level(plausible(tilt_series))
     integrals = estimate_response(lowered).invert(torch.from_numpy(lowered.images)).detach()
     return integrals / integrals.std().clamp_min(1e-30)
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from noiseflow.io import mapped
 from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
-from recon.series.tilt_series import TiltSeries, block_means
+from recon.series.masks import coarse, used_values
+from recon.series.tilt_series import TiltSeries
 
 _COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
 _MARGIN = 0.05  # the explained shares of correct and inverted phantoms differ by at least 0.12
@@ -22,9 +22,10 @@ _BRIGHTER = 1.5
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
-    """Invert the contrast: every pixel value becomes largest + smallest − value, in the same data type."""
-    images = tilt_series.images
-    largest, smallest = images.max(), images.min()
+    """Invert the contrast: every pixel value becomes largest + smallest − value of those used, in the same data type."""
+    images, mask = tilt_series.images, tilt_series.mask
+    whole = images if mask is None else images[mask]
+    largest, smallest = whole.max(), whole.min()
     # this order avoids integer overflow
     swapped = ((largest - image) + smallest for image in images)
     return replace(
@@ -35,8 +36,7 @@ def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
 def check_contrast(tilt_series: TiltSeries) -> None:
     """Warn if a coarse non-negative volume explains the images better with inverted contrast, or if parts of bright-field
     images are much brighter than vacuum."""
-    images = _coarse(tilt_series.images)
-    series = replace(tilt_series, images=images, mask=None)
+    series = coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH)
     as_given, swapped = explained(series), explained(invert_contrast(series))
     if swapped > as_given + _MARGIN:
         given, other = ("bright field", "--mode linear if these are HAADF or EDX images")
@@ -54,6 +54,7 @@ def check_contrast(tilt_series: TiltSeries) -> None:
 def explained(tilt_series: TiltSeries) -> float:
     """Share of the variance of the images that a non-negative volume explains after a few iterations of SIRT."""
     images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    used = torch.from_numpy(tilt_series.used).float()
     try:
         response = estimate_response(tilt_series)
     except ValueError:  # no positive incident intensity, so there is no such volume
@@ -61,9 +62,10 @@ def explained(tilt_series: TiltSeries) -> float:
     width = images.shape[2]
     projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=width, width=width)
     with torch.no_grad():
-        volume = sirt(response.invert(images).contiguous(), projector, num_iterations=30)
+        volume = sirt(response.invert(images).contiguous(), projector, num_iterations=30, used=used)
         predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
-    return 1 - float((predicted - images).square().mean() / images.var())
+    mean = (images * used).sum() / used.sum()
+    return 1 - float(((predicted - images).square() * used).sum() / ((images - mean).square() * used).sum())
 
 
 def _check_intensity(tilt_series: TiltSeries) -> None:
@@ -71,16 +73,10 @@ def _check_intensity(tilt_series: TiltSeries) -> None:
     if not isinstance(response, Transmission):
         return
     intensity = float(response.intensity.max())
-    brightest = float(np.quantile(tilt_series.images, 0.999))
+    brightest = float(np.quantile(used_values(tilt_series), 0.999))
     if brightest > _BRIGHTER * intensity:
         warnings.warn(
             f"parts of the images reach {brightest:.4g}, but the incident intensity is about {intensity:.4g}; bright-field "
             "images cannot be brighter than vacuum: give --mode linear for HAADF or EDX images, or mask those parts",
             stacklevel=3,
         )
-
-
-def _coarse(images: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Binned images of limited width and height."""
-    _, height, width = images.shape
-    return block_means(images, -(-height // _COARSE_HEIGHT), -(-width // _COARSE_WIDTH))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from recon.projection.defocused_projector import gaussian_matrix
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
-from recon.series.views import view_numbers
+from recon.series.views import Directions, view_numbers
 
 _GAP = 15.0  # degrees; closer neighbours predict each other for any axis
 _FEWEST_GAPS = 5  # three between the outer two, the smallest number with a spread
@@ -20,9 +20,8 @@ _FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
 _DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
 _MORE_COMPACT = 1.2  # volumes of one object with equally good axes differ by up to 1.1
 _CONVERGED = 90  # iterations of SIRT; after 30, the best axis is still wrong by more than a degree
-_SMOOTHED = (
-    2.0  # pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
-)
+# Pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
+_SMOOTHED = 2.0
 _SEEN = 0.95  # visible share of a row that is required for its sum
 
 
@@ -92,14 +91,16 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
     which smooth the noise least and fit it best, would be preferred. The outer gaps are held out like the others, but are not
     counted, because they are extrapolated.
     """
-    angles = np.asarray(matcher.projector.tilt_angles)
-    gaps, view = _gaps(angles), _View.of(matcher, found)
-    unexplained, unchanged = np.zeros((2, len(angles)))
+    directions = Directions.of(np.asarray(matcher.projector.tilt_angles))
+    gaps, view = _gaps(directions.angles), _View.of(matcher, found)
+    mirrored = torch.from_numpy(directions.mirrored).to(view.images.device)[:, None, None]
+    facing = torch.where(mirrored, view.images.flip(2), view.images)
+    unexplained, unchanged = np.zeros((2, len(gaps)))
     for fold in range(_FOLDS):
         out = gaps % _FOLDS == fold
-        across = torch.from_numpy(_interpolation(angles, out)).to(view.images)
+        across = torch.tensordot(torch.from_numpy(_interpolation(directions.angles, out)).to(facing), facing, 1)
         unexplained[out] = view.errors(view.predicted_without(out))[out]
-        unchanged[out] = view.errors(torch.tensordot(across, view.images, 1))[out]
+        unchanged[out] = view.errors(torch.where(mirrored, across.flip(2), across))[out]
     conserved = _unconserved(view.images, view.seen)
     return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, gaps)
 

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
+from recon.projection.base import Projector
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
-from recon.series.tilt_series import TiltSeries, block_means
+from recon.series.masks import binned, used_values
+from recon.series.tilt_series import TiltSeries, filled
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
@@ -30,14 +30,15 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     images = tilt_series.images
     beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
     block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
-    means: NDArray[np.floating[Any]] = block_means(images, block, block)
+    small = binned(tilt_series, block, block)
+    means: NDArray[np.floating[Any]] = small.images
     if tilt_series.mode == "linear":
-        dark, bright = (float(level) for level in np.quantile(means, (0.02, 0.98)))
+        dark, bright = (float(level) for level in np.quantile(used_values(small, means), (0.02, 0.98)))
         span = bright - dark if bright > dark else 1.0
         return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate)
     if tilt_series.beam is not None:
         means = means / tilt_series.beam[:, None, None]
-    intensity = float(np.quantile(means, 0.95))
+    intensity = float(np.quantile(used_values(small, means), 0.95))
     if intensity <= 0:
         raise ValueError(
             "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
@@ -45,12 +46,13 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 
-def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: SliceProjector) -> Tensor:
-    """A few iterations of SIRT on bands of four slices, (z, y/4, x)."""
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    bands = functional.avg_pool2d(images[:, None], (min(4, images.shape[1]), 1))[:, 0].to(projector.device)
+def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: Projector) -> Tensor:
+    """A few iterations of SIRT on bands of four slices, (z, y/4, x); of single slices, if they are not independent."""
+    bands = binned(tilt_series, 1 if projector.fixed_height else min(4, tilt_series.images.shape[1]), 1)
+    images = torch.from_numpy(bands.images).to(projector.device)
+    used = None if bands.mask is None else torch.from_numpy(bands.mask).to(images)
     with torch.no_grad():
-        return sirt(response.invert(bands).contiguous(), projector, num_iterations=30)
+        return sirt(response.invert(images).contiguous(), projector, num_iterations=30, used=used)
 
 
 def attenuation_scale(volume: Tensor) -> float:
@@ -60,9 +62,9 @@ def attenuation_scale(volume: Tensor) -> float:
 
 
 def contrast_slab(tilt_series: TiltSeries, num_slices: int) -> slice:
-    """The `num_slices` neighbouring slices with the largest variation of the images."""
+    """The `num_slices` neighbouring slices with the largest variation of the images; all of a series about two axes."""
     height = tilt_series.images.shape[1]
-    if num_slices >= height:
+    if num_slices >= height or tilt_series.axes is not None:
         return slice(0, height)
     start = int(_variation(tilt_series, num_slices).argmax())
     return slice(start, start + num_slices)
@@ -81,5 +83,11 @@ def calm_slab(tilt_series: TiltSeries, num_slices: int, apart_from: slice) -> sl
 
 def _variation(tilt_series: TiltSeries, num_slices: int) -> NDArray[np.float64]:
     """Variation of the mean image in every range of `num_slices` neighbouring slices, by its first slice."""
-    energy = tilt_series.images.mean(0, dtype=np.float32).var(1)
-    return np.convolve(energy, np.ones(num_slices), mode="valid")
+    if tilt_series.mask is None:
+        mean = tilt_series.images.mean(0, dtype=np.float32)
+    else:
+        pairs = zip(tilt_series.images, tilt_series.mask, strict=True)
+        total = sum((np.where(use, image, 0).astype(np.float32) for image, use in pairs), np.float32(0))
+        count = tilt_series.mask.sum(0)
+        mean = filled(total / np.maximum(count, 1), count > 0)
+    return np.convolve(mean.var(1), np.ones(num_slices), mode="valid")

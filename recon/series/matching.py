@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from recon.projection.projector import SliceProjector
+from recon.projection.sirt import sirt
 
 ITERATIONS = 10
 _FARTHEST = 3.0  # pixels per step; for larger shifts the linearisation of an image blurred by one pixel is not valid
@@ -53,14 +54,21 @@ class Matcher:
         tilt_angles: (tilt,) degrees.
         binning: binning factor.
         used: (tilt, y, x) 1 for pixels to use, 0 for others; None for all.
+        size: width of the cube, binned pixels; that of the images if None.
     """
 
     def __init__(
-        self, images: Tensor, tilt_angles: NDArray[np.float64], binning: int, used: Tensor | None = None
+        self,
+        images: Tensor,
+        tilt_angles: NDArray[np.float64],
+        binning: int,
+        used: Tensor | None = None,
+        *,
+        size: int | None = None,
     ) -> None:
         self.images = _blurred(functional.avg_pool2d(images[:, None], binning))[:, 0]
         self.used = None if used is None else functional.avg_pool2d(used[:, None], binning)[:, 0]
-        self.binning, self.size = binning, max(self.images.shape[1:])
+        self.binning, self.size = binning, size or max(self.images.shape[1:])
         cut = torch.tensor([images.shape[1] % binning, images.shape[2] % binning], dtype=torch.float32)
         self._middle = (cut / 2).to(images.device)
         self.projector = SliceProjector(
@@ -129,15 +137,7 @@ class Matcher:
 
     def sirt(self, images: Tensor, seen: Tensor, volume: Tensor | None, num_iterations: int) -> Tensor:
         """SIRT iterations with non-negativity that ignore pixels outside the raw images."""
-        A = self.projector
-        if volume is None:
-            volume = torch.zeros(A.depth, images.shape[1], A.width, device=images.device)
-        lengths, weights = A(torch.ones_like(volume[:, :1])), A.T(seen)
-        inverse = torch.where(weights > 1e-3, 1 / weights, 0.0)
-        rows = torch.where(lengths > 0, 1 / lengths, 0.0) * seen
-        for _ in range(num_iterations):
-            volume = (volume + inverse * A.T(rows * (images - A(volume)))).clamp_min(0)
-        return volume
+        return sirt(images, self.projector, num_iterations=num_iterations, start=volume, used=seen)
 
 
 def frame(axis: float, like: Tensor) -> Tensor:

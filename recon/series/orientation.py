@@ -33,8 +33,10 @@ class Orientation:
         """The flips that move the highest contrast to larger y, larger u and positive angles.
 
         Contrast is the squared deviation of used pixels from the mean. The result does not depend on an added constant, a scale,
-        the order of the tilts, or full turns of their angles.
+        the order of the tilts, or full turns of their angles. A series about two axes is not flipped.
         """
+        if tilt_series.axes is not None:
+            return cls()
         _, height, width = tilt_series.images.shape
         total, count = np.sum([(part.sum(), used.sum()) for part, used in _used(tilt_series)], axis=0)
         down, across = (np.arange(size) - (size - 1) / 2 for size in (height, width))
@@ -69,8 +71,14 @@ class Orientation:
         return _flipped(images, {0: self.negated, 1: self.upside_down, 2: self.mirrored})
 
     def volume(self, volume: NDArray[Any]) -> NDArray[Any]:
-        """Flip a volume (z, y, x), in either direction (u = x cos θ + z sin θ). A mapped volume is flipped in its file."""
-        return _flipped(volume, {0: self.mirrored != self.negated, 1: self.upside_down, 2: self.mirrored})
+        """Flip a volume (z, y, x), in either direction. A mapped volume is flipped in its file."""
+        return _flipped(volume, dict.fromkeys(self.axes, True))
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The axes of a volume (z, y, x) that are flipped (u = x cos θ + z sin θ)."""
+        flips = (self.mirrored != self.negated, self.upside_down, self.mirrored)
+        return tuple(axis for axis, flip in enumerate(flips) if flip)
 
 
 def _used(tilt_series: TiltSeries) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
@@ -85,7 +93,7 @@ def _flipped(array: NDArray[Any], axes: dict[int, bool]) -> NDArray[Any]:
     if array.ndim < 3 or not (is_mapped(array) and array.flags.writeable):
         return np.ascontiguousarray(np.flip(array, flips))
     inner = tuple(axis - 1 for axis in flips if axis)
-    for place in range((len(array) + 1) // 2 if axes[0] else len(array)) if flips else ():
-        other = len(array) - 1 - place if axes[0] else place
+    for place in range((len(array) + 1) // 2 if 0 in flips else len(array)) if flips else ():
+        other = len(array) - 1 - place if 0 in flips else place
         array[other], array[place] = (np.flip(array[section], inner).copy() for section in (place, other))
     return array

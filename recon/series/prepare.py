@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,20 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Guard
 from noiseflow.described import described
+from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
 from recon.series.contrast import check_contrast
+from recon.series.dual_axis import stacked
+from recon.series.masks import plausible
 from recon.series.orientation import Orientation
+from recon.series.registration import Registration, register
 from recon.series.screening import Screening, require_specimen, screen
+from recon.series.shrinkage import FEWEST_TILTS, Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
 _ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
-
-Progress = Callable[[str, int, int, str], None]
-"""``progress(title, done, total, note)``."""
 
 
 @described()
@@ -37,6 +40,8 @@ class Prepared:
         screening: consistency of every tilt with the others, in the order of the given series.
         alignment: alignment of the raw images, in the order of the given series; None if they were not transformed.
         guard: checks that failed, with their reasons.
+        second: the prepared series about a second tilt axis, which `tilt_series` then includes; None without one.
+        registration: the position of the second axis; None without one.
 
     Example:
         >>> import numpy as np, recon
@@ -52,17 +57,26 @@ class Prepared:
     screening: Screening
     alignment: Alignment | None
     guard: Guard = field(default_factory=Guard)
+    second: Prepared | None = None
+    registration: Registration | None = None
 
     @property
     def choices(self) -> dict[str, float | str]:
         """Values for a table of results."""
-        return ({} if self.alignment is None else self.alignment.choices()) | self.screening.choices()
+        found = ({} if self.alignment is None else self.alignment.choices()) | self.screening.choices()
+        if self.second is None or self.registration is None:
+            return found
+        second = {f"{name}, second axis": value for name, value in self.second.choices.items()}
+        return found | second | {"second axis (°)": f"{self.registration.axis:.2f}"}
 
     def as_dict(self) -> dict[str, Any]:
         """All results per tilt, JSON-serialisable."""
         return {
             "screening": self.screening.as_dict(),
             "alignment": None if self.alignment is None else self.alignment.as_dict(),
+            "second_axis": None
+            if self.second is None or self.registration is None
+            else self.second.as_dict() | {"registration": self.registration.as_dict()},
         }
 
 
@@ -72,6 +86,7 @@ def prepare(
     tilt_axis: float | None = None,
     refine_alignment: bool = False,
     alignment: Alignment | None = None,
+    second_axis: TiltSeries | None = None,
     keep_tilts: bool = False,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
@@ -85,6 +100,8 @@ def prepare(
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x; None for y, or to search it.
         refine_alignment: find the axis and the shift of every image.
         alignment: the alignment of the same tilts, such as that of another channel, in place of a search.
+        second_axis: a series of the same specimen about a second tilt axis, about 90° from the first. It is prepared in the
+            same way, registered, and becomes a part of the prepared series; see `recon.series.registration.register`.
         keep_tilts: keep tilts that are inconsistent with the others, with a warning.
         device: torch device.
         progress: called at each step of the alignment.
@@ -104,7 +121,21 @@ def prepare(
     """
     if tilt_axis is not None and not abs(tilt_axis) <= 360:  # more than a full turn is a mistake
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
-    guard = Guard()
+    if second_axis is not None:
+        if alignment is not None:
+            raise ValueError(
+                "--alignment is of one series; give aligned stacks with --second-axis, or --refine-alignment"
+            )
+        return _about_two_axes(
+            tilt_series,
+            second_axis,
+            tilt_axis=tilt_axis,
+            refine_alignment=refine_alignment,
+            keep_tilts=keep_tilts,
+            device=device,
+            progress=progress,
+        )
+    guard, tilt_series = Guard(), plausible(tilt_series)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:
@@ -113,8 +144,13 @@ def prepare(
         alignment = alignment.joined(tilt_series)
     else:
         alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    raw = tilt_series
     if alignment is not None:
-        tilt_series = alignment.apply(tilt_series)
+        tilt_series = alignment.apply(raw)
+    shrinkage = guard("shrinkage", partial(_shrinkage, tilt_series), otherwise=None)
+    if shrinkage is not None and refine_alignment and alignment is not None:
+        alignment = shrinkage.correct(alignment)
+        tilt_series = alignment.apply(raw)
     require_specimen(tilt_series)
     guard("contrast", lambda: check_contrast(tilt_series), otherwise=None)
     # the standard orientation gives identical results for mirror images
@@ -126,6 +162,26 @@ def prepare(
     _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)
+
+
+def _shrinkage(tilt_series: TiltSeries) -> Shrinkage | None:
+    """A change of the specimen's size that matters, if there are enough tilts to measure it."""
+    if tilt_series.num_tilts < FEWEST_TILTS:
+        return None
+    found = estimate_shrinkage(tilt_series)
+    return found if found.found else None
+
+
+def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Prepared:
+    one, other = prepare(first, **options), prepare(second, **options)
+    found = register(one.tilt_series, other.tilt_series, device=options["device"], progress=options["progress"])
+    height, width = one.tilt_series.images.shape[1:]
+    # the images of the second series are interpolated once, with the shifts of both steps
+    known = other.alignment or Alignment(0.0, np.zeros((second.num_tilts, 2)), second.tilt_angles)
+    moved = found.of_second(known).apply(second, shape=(width, height))
+    part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
+    whole = stacked(found.of_first(one.tilt_series), part, axis=found.stored_axis)
+    return replace(one, tilt_series=whole, second=other, registration=found)
 
 
 def _alignment(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,20 @@ from scipy.ndimage import median_filter
 from torch import Tensor
 
 from noiseflow.described import described
+from noiseflow.statistics import robust_deviation
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
-from recon.series.tilt_series import TiltSeries, block_means
-from recon.series.views import without_level
+from recon.series.masks import coarse, used_values
+from recon.series.tilt_series import TiltSeries
+from recon.series.views import Directions, without_level
 
 _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
 _NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-_LEAST_DRIFT = (
-    0.04  # constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-)
+# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
+_LEAST_DRIFT = 0.04
 _FEWEST = 8
 _EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
@@ -65,6 +67,12 @@ class Screening:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
         return self.drift > _LEAST_DRIFT
 
+    def of(self, order: Sequence[int]) -> Screening:
+        """The screening of some of the tilts, by index."""
+        chosen = list(order)
+        found = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return Screening(**found)
+
     def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
         """The good tilts, or all if `keep`, with their beam if it drifts."""
         series = replace(tilt_series, beam=self.beam) if self.beam_drifts else tilt_series
@@ -101,15 +109,16 @@ def screen(tilt_series: TiltSeries) -> Screening:
         return Screening.of_all(count)
     none = np.zeros(count, dtype=np.bool_)
     lowered, _ = without_level(tilt_series)
-    coarse = replace(lowered, images=coarse_images(lowered, _WIDTH, _HEIGHT), mask=None, beam=None)
+    small = replace(coarse(lowered, height=_HEIGHT, width=_WIDTH), beam=None)
     bad = none
     while True:
-        beam, residual, predicted = _fit_beam(coarse, bad)
-        nll = _negative_log_likelihood(residual, predicted, ~bad)
+        beam, residual, predicted = _fit_beam(small, bad)
+        nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
-        spread = 1.4826 * float(np.median(np.abs(excess[~bad])))
+        spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
-        unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2)) / max(float(coarse.images.var()), 1e-30)
+        whole = max(float(used_values(small).var()), 1e-30)
+        unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2), where=small.used) / whole
         if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
             many = bad.sum() > max(1, count * _EXCEPTIONS)
             return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
@@ -131,17 +140,12 @@ def require_specimen(tilt_series: TiltSeries) -> None:
         )
 
 
-def coarse_images(tilt_series: TiltSeries, width: int, height: int) -> NDArray[np.float32]:
-    """Binned images of limited width and height."""
-    _, rows, columns = tilt_series.images.shape
-    return block_means(tilt_series.images, -(-rows // height), -(-columns // width))
-
-
 def _fit_beam(
     series: TiltSeries, bad: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Relative intensities of all tilts, residuals of their normalised images, and predictions by a volume of the good tilts."""
     images, good = torch.from_numpy(series.images), torch.from_numpy(~bad)
+    used = torch.from_numpy(series.used).float()
     width = images.shape[2]
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
@@ -150,10 +154,11 @@ def _fit_beam(
         even = _even(images, beam, pedestal := _pedestal(series))
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
-            volume = sirt(response.invert(even[good]).contiguous(), some, num_iterations=_ITERATIONS, start=volume)
+            lines = response.invert(even[good]).contiguous()
+            volume = sirt(lines, some, num_iterations=_ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
         above = images - pedestal
-        beam = (above * predicted).sum((1, 2)) / (predicted**2).sum((1, 2)).clamp_min(1e-30)
+        beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
@@ -165,38 +170,42 @@ def _even(images: Tensor, beam: Tensor, pedestal: float) -> Tensor:
 
 def _pedestal(series: TiltSeries) -> float:
     """The pixel value without beam; in HAADF it is estimated from the darkest areas."""
-    return float(np.quantile(series.images, 0.02)) if series.mode == "linear" else 0.0
+    return float(np.quantile(used_values(series), 0.02)) if series.mode == "linear" else 0.0
 
 
 def _first_beam(series: TiltSeries) -> Tensor:
     """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
-    flat = series.images.reshape(series.num_tilts, -1)
-    level = np.quantile(flat, 0.95, axis=1) if series.mode == "transmission" else flat.mean(1) - _pedestal(series)
+    flat = [image[use] for image, use in zip(series.images, series.used, strict=True)]
+    if series.mode == "transmission":
+        level = np.array([np.quantile(each, 0.95) for each in flat])
+    else:
+        level = np.array([each.mean() for each in flat]) - _pedestal(series)
     middle = float(np.median(level))
     start = np.clip(level / middle, 0.3, 3) if middle > 0 else np.ones_like(level)
     return torch.from_numpy(start.astype(np.float32))
 
 
 def _negative_log_likelihood(
-    residual: NDArray[np.float32], predicted: NDArray[np.float32], good: NDArray[np.bool_]
+    residual: NDArray[np.float32], predicted: NDArray[np.float32], used: NDArray[np.bool_], good: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """NLL of each tilt, nats per pixel, under Gaussian noise with the signal-dependent variance of the good tilts."""
-    edges = np.quantile(predicted[good], np.linspace(0, 1, 9)[1:-1])
+    """NLL of each tilt, nats per used pixel, under Gaussian noise with the signal-dependent variance of the good tilts."""
+    known = used & good[:, None, None]
+    edges = np.quantile(predicted[known], np.linspace(0, 1, 9)[1:-1])
     group = np.searchsorted(edges, predicted)
     squares = residual.astype(np.float64) ** 2
     variance = np.array(
-        [np.mean(squares[good][group[good] == k]) if (group[good] == k).any() else np.nan for k in range(8)]
+        [np.mean(squares[known & (group == k)]) if (known & (group == k)).any() else np.nan for k in range(8)]
     )
-    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[good].mean()), 1e-30))
+    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[known].mean()), 1e-30))
     terms = 0.5 * (squares / variance[group] + np.log(2 * math.pi * variance[group]))
-    return np.asarray(terms.mean((1, 2)))
+    return np.asarray(terms.mean((1, 2), where=used))
 
 
 def _running_median(
     values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The median of each tilt's neighbours in angle, without bad tilts."""
-    order = np.argsort(angles, kind="stable")
-    good = order[~bad[order]]
+    """The median of each tilt's neighbours in direction, without bad tilts."""
+    directions = Directions.of(angles)
+    good = directions.order[~bad[directions.order]]
     smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")
-    return np.asarray(np.interp(angles, angles[good], smooth))
+    return np.asarray(np.interp(directions.angles, directions.angles[good], smooth))

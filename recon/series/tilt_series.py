@@ -12,12 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow import io
+from noiseflow import io, statistics
 from noiseflow.described import described, size_of
 from noiseflow.io import mapped
 from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
+_SAME_SIZE = 0.01
+"""Relative difference of pixel sizes that rounding in headers explains."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,14 @@ class TiltSeries:
         mask: (tilt, y, u), True for pixels to use; None for all. Fits exclude the other pixels; classical methods use their
             values in `images`, which should be plausible.
         beam: (tilt,) incident intensity relative to the median if the beam drifts; the initial value of a fit.
+        axes: (tilt,) direction of each tilt axis in the specimen, degrees from y towards −x, if there are two: 0, or a number
+            near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
+            orientation at zero tilt. See `recon.DualAxisProjector`.
+        dose: (tilt,) dose before each image, or its time, in any unit; None if unknown. Used for shrinkage only.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
+        views: (tilt,) index of each image among the `num_views` of its file, if some of these were left out; else None.
+        num_views: number of images of the file, if some were left out.
 
     Raises:
         ValueError: `images` is not a stack or is constant, angles, mask or beam do not match it, or pixels or angles are not
@@ -53,6 +61,10 @@ class TiltSeries:
     mask: NDArray[np.bool_] | None = None
     beam: NDArray[np.float64] | None = None
     tilt_axis: float | None = None
+    axes: NDArray[np.float64] | None = None
+    views: NDArray[np.int64] | None = None
+    num_views: int | None = None
+    dose: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -74,11 +86,15 @@ class TiltSeries:
             )
         if self.beam is not None and (self.beam.shape != self.tilt_angles.shape or not (self.beam > 0).all()):
             raise ValueError(f"beam needs one positive number for each of the {len(self.images)} tilts")
+        if self.mask is not None and not self.mask.any():
+            raise ValueError("the mask excludes every pixel; it must be True for pixels to use")
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
         _require_several_views(self.images)
-        _check_angles(self.tilt_angles)
+        if self.axes is not None and np.shape(self.axes) != self.tilt_angles.shape:
+            raise ValueError(f"axes needs one direction for each of the {len(self.images)} tilts")
+        self._check_angles()
 
     def __repr__(self) -> str:
         size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
@@ -98,7 +114,7 @@ class TiltSeries:
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
     def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
-        """Some rows (y) of all images; they may be constant."""
+        """Some rows (y) of all images; they may be constant. Of a series about two axes, all rows belong together."""
         return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
 
     def with_images(self, images: NDArray[Any], mask: NDArray[np.bool_] | None) -> TiltSeries:
@@ -120,8 +136,23 @@ class TiltSeries:
         part = self.with_images(images, mask)
         object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
         object.__setattr__(part, "beam", beam)
-        _check_angles(part.tilt_angles)
+        object.__setattr__(part, "views", (np.arange(self.num_tilts) if self.views is None else self.views)[tilts])
+        object.__setattr__(part, "num_views", self.num_views or self.num_tilts)
+        object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
+        object.__setattr__(part, "dose", None if self.dose is None else self.dose[tilts])
+        part._check_angles()
         return part
+
+    @property
+    def rising(self) -> NDArray[np.int64]:
+        """Indices of the tilts by axis, then by rising angle; stable."""
+        axes = np.zeros(self.num_tilts) if self.axes is None else self.axes
+        return np.lexsort((self.tilt_angles, axes))
+
+    def _check_angles(self) -> None:
+        axes = np.zeros(self.num_tilts) if self.axes is None else self.axes
+        for axis in np.unique(axes):
+            _check_angles(self.tilt_angles[axes == axis])
 
 
 def _sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:
@@ -212,18 +243,22 @@ def read_tilt_series(
     mask_nan: bool = False,
     mapped: bool = False,
     channel: str | int | None = None,
+    pixel_size: float | None = None,
+    exclude_views: str = "",
 ) -> TiltSeries:
-    """Read a stack and its tilt angles.
+    """Read a stack and its tilt angles. Flat and dark fields in the file are applied; a warning says so.
 
     Args:
         path: the stack, in any format that `noiseflow.io.read` supports.
-        angles: text file with one angle in degrees per line, or ``.mdoc``; by default the ``.rawtlt``, ``.tlt`` or
-            ``.mdoc`` next to the stack, or else the angles in the stack file.
+        angles: a file that `noiseflow.io.read_tilts` reads; by default the ``.rawtlt``, ``.tlt`` or ``.mdoc`` next to the
+            stack, or else the angles in the stack file. For the rules that join images and angles, see `noiseflow.io.tilts_of`.
         mode: image formation.
         mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
         mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
         channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
+        pixel_size: Å, in place of that of the files.
+        exclude_views: images to leave out, numbered from 1 in the order of the file as in IMOD, such as ``1,5-8``.
 
     Raises:
         noiseflow.io.SeveralImages: there are several channels and none was chosen; a ValueError with their names.
@@ -241,21 +276,83 @@ def read_tilt_series(
         raise ValueError(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
         )
-    tilt_angles = io.tilt_angles_of(path, image_file) if angles is None else io.read_angles(angles)
-    images, mask = _masked(image_file.data, mask, mask_nan, str(path))
+    table, count = io.tilts_of(path, image_file, angles), len(image_file.data)
+    size = _pixel_size(pixel_size, image_file, table, path)
+    excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
+    views = np.setdiff1d(np.arange(count), sorted(excluded))
+    if excluded and len(views) < 2:
+        raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
+    if mask is not None and mask.shape == image_file.data.shape:
+        mask = mask[views]
+    images = _sections(image_file.data, evenly(views, count))
+    images, mask = _masked(flat_fielded(images, image_file, path), mask, mask_nan, str(path))
     io.require_contrast(images, path)
-    pixel_size = None if image_file.voxel_size is None else image_file.voxel_size[2]
     tilt_axis = io.tilt_axis_of(path, image_file)
-    if mask is None:
-        return TiltSeries(images, tilt_angles, pixel_size, mode, tilt_axis=tilt_axis)
-    empty = ~mask.any((1, 2))
-    if empty.any() and len(tilt_angles) == len(images):
-        named = ", ".join(f"{angle:g}°" for angle in tilt_angles[empty][:8])
-        warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
-        return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis).select(
-            np.flatnonzero(~empty)
+    series = TiltSeries(
+        images,
+        table.angles[views],
+        size,
+        mode,
+        mask,
+        tilt_axis=table.tilt_axis if tilt_axis is None else tilt_axis,
+        views=views if excluded else None,
+        num_views=count if excluded else None,
+        dose=None if table.acquired is None else table.acquired[views],
+    )
+    empty = np.zeros(len(images), np.bool_) if mask is None else ~mask.any((1, 2))
+    if not empty.any():
+        return series
+    named = ", ".join(f"{angle:g}°" for angle in series.tilt_angles[empty][:8])
+    warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
+    return series.select(np.flatnonzero(~empty))
+
+
+def _pixel_size(given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path) -> float | None:
+    """Å: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
+
+    Raises:
+        ValueError: pixels are not square, or the given size is not positive.
+    """
+    if given is not None:
+        if not 0 < given < np.inf:
+            raise ValueError(f"--pixel-size {given:g}: give a positive number of Å")
+        return given
+    if image.voxel_size is None:
+        return table.pixel_size
+    y, x = image.voxel_size[1:]
+    if abs(y / x - 1) > _SAME_SIZE:
+        raise ValueError(
+            f"{path} has pixels of {x:.5g} x {y:.5g} Å (x, y); square pixels are required: resample the images, or give the "
+            "correct size with --pixel-size if the header is wrong"
         )
-    return TiltSeries(images, tilt_angles, pixel_size, mode, mask, tilt_axis=tilt_axis)
+    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= _SAME_SIZE:
+        return x
+    chosen = table.pixel_size if x == 1 else x
+    warnings.warn(
+        f"{path} states pixels of {x:.5g} Å, and the file of its angles {table.pixel_size:.5g} Å; {chosen:.5g} Å are used: "
+        "give --pixel-size if this is wrong",
+        stacklevel=3,
+    )
+    return chosen
+
+
+def flat_fielded(images: NDArray[Any], image_file: io.ImageFile, path: str | Path) -> NDArray[Any]:
+    """Images with the flat and dark fields of their file applied: (image − dark) / (flat − dark); NaN where that is unknown.
+
+    Args:
+        images: (tilt, y, x), raw.
+        image_file: the file with its fields; without them, the images are returned unchanged.
+        path: its name, for the warning that says what was applied.
+    """
+    flat, dark = image_file.flat, image_file.dark
+    if flat is None and dark is None:
+        return images
+    black = np.zeros(images.shape[1:]) if dark is None else dark
+    scale = np.ones(images.shape[1:]) if flat is None else np.where(flat > black, flat - black, np.nan)
+    names = [name for name, field in (("flat", flat), ("dark", dark)) if field is not None]
+    warnings.warn(f"the {' and '.join(names)} fields of {path} are applied to its images", stacklevel=3)
+    parts = (((image - black) / scale).astype(np.float32) for image in images)
+    return mapped.mapped_copy(parts, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
 
 
 def _masked(
@@ -280,6 +377,7 @@ def _masked(
     if bad and not mask_nan:
         raise ValueError(f"{name} has {bad} NaN or infinite pixels, the first at {first}; exclude them with --mask-nan")
     if use.all():
+        warnings.warn(f"the mask of {name} excludes no pixel; pixels to exclude must be 0 in a mask file", stacklevel=3)
         return images, None
     if not use.any():
         raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
@@ -299,12 +397,10 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
     return np.asarray(image[tuple(nearest)])
 
 
-def block_means(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of pixels, image by image; incomplete blocks are dropped, evenly at both edges."""
-    height, width = images.shape[1] // down, images.shape[2] // across
-    top, left = (images.shape[1] - height * down) // 2, (images.shape[2] - width * across) // 2
-    whole = (image[top : top + height * down, left : left + width * across].astype(np.float64) for image in images)
-    return np.stack([image.reshape(height, down, width, across).mean((1, 3)).astype(np.float32) for image in whole])
+def block_mean(image: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
+    """Means of blocks of pixels of an image (y, u); incomplete blocks are dropped, evenly at both edges."""
+    inner = image[image.shape[0] % down // 2 :, image.shape[1] % across // 2 :].astype(np.float64)
+    return statistics.block_means(inner, down, across).astype(np.float32)
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
@@ -320,7 +416,7 @@ def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:
     """
     path = Path(path)
     size = tilt_series.pixel_size
-    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size))
+    io.write(path, tilt_series.images, voxel_size=None if size is None else (size, size, size), stack=True)
     return write_angles(path.with_suffix(".rawtlt"), tilt_series.tilt_angles)
 
 
@@ -361,10 +457,12 @@ def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
         warnings.warn(
-            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=4
+            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=5
         )
-    if np.abs(angles).max() < 1.6:
+    span = float(np.ptp(angles))
+    # ±90° is ±1.57 in radians; a half and a full turn lack at most one of ten or more steps
+    if np.abs(angles).max() < 1.6 or 0.9 * np.pi < span < 1.01 * np.pi or 0.9 < span / (2 * np.pi) < 1.01:
         warnings.warn(
-            f"all tilt angles are within ±{np.abs(angles).max():.2f}, as if in radians; give them in degrees",
-            stacklevel=4,
+            f"the tilt angles span {span:.2f}, as if in radians; give them in degrees",
+            stacklevel=5,
         )

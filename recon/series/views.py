@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,60 @@ def in_order(tilt_series: TiltSeries) -> TiltSeries:
     if np.abs(angles).max() > 180:
         angles = (angles + 180) % 360 - 180
         tilt_series = replace(tilt_series, tilt_angles=angles)
-    order = np.argsort(angles, kind="stable")
+    order = tilt_series.rising
     return tilt_series if (np.diff(order) == 1).all() else tilt_series.select(order)
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Tilts as directions modulo 180°: images 180° apart are mirror images of each other.
+
+    Attributes:
+        angles: (tilt,) degrees, within 180° from one side of the missing wedge to the other.
+        mirrored: (tilt,) whether an image at this direction is the given image mirrored along u.
+        order: (tilt,) indices of the tilts by rising direction.
+    """
+
+    angles: NDArray[np.float64]
+    mirrored: NDArray[np.bool_]
+    order: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, tilt_angles: NDArray[np.float64]) -> Directions:
+        """The directions of tilt angles (tilt,), degrees; as few images as possible are mirrored."""
+        values, back = _half_turn(tilt_angles)
+        start = values[(_wedge(values) + 1) % len(values)]
+        angles = start + (values[back] - start) % 180
+        half_turns = np.round((tilt_angles - angles) / 180).astype(np.int64)
+        usual = int(np.median(half_turns))
+        mirrored = (half_turns - usual) % 2 == 1
+        if mirrored.mean() > 0.5:
+            usual, mirrored = usual + 1, ~mirrored
+        angles = angles + 180 * usual
+        return cls(angles, mirrored, np.argsort(angles, kind="stable"))
+
+    @property
+    def span(self) -> float:
+        """Degrees between the outer directions."""
+        return float(np.ptp(self.angles))
+
+    def arranged(self, images: NDArray[Any]) -> NDArray[Any]:
+        """Images (tilt, y, u) by rising direction, mirrored where necessary."""
+        turned = np.where(self.mirrored[:, None, None], images[:, :, ::-1], images)
+        return np.asarray(turned[self.order])
+
+
+def _half_turn(tilt_angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sorted different directions within [0°, 180°), and the index of that of each tilt."""
+    values, back = np.unique(np.round(tilt_angles % 180, 6) % 180, return_inverse=True)
+    return values, back
+
+
+def _wedge(values: NDArray[np.float64]) -> int:
+    """Index of the last direction before the widest gap; if steps are equal, the one around 90° is taken as the wedge."""
+    steps = np.diff(np.r_[values, values[0] + 180])
+    centres = np.abs((values + steps / 2) % 180 - 90)
+    return max(range(len(values)), key=lambda i: (round(steps[i], 4), -round(centres[i], 4)))
 
 
 def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -32,13 +85,10 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     Args:
         tilt_angles: (tilt,) degrees.
     """
-    half_turn = np.round(tilt_angles % 180, 6) % 180
-    values, back = np.unique(half_turn, return_inverse=True)
-    steps = np.diff(np.r_[values, values[0] + 180])
-    centres = np.abs((values + steps / 2) % 180 - 90)  # if steps are equal, the one around 90° is taken as the wedge
-    wedge = max(range(len(values)), key=lambda i: (round(steps[i], 4), -round(centres[i], 4)))
-    rolled = np.roll(steps, -wedge - 1)[:-1]
-    apart = rolled > _TWINS * rolled.sum() / len(tilt_angles)
+    values, back = _half_turn(tilt_angles)
+    wedge = _wedge(values)
+    steps = np.roll(np.diff(np.r_[values, values[0] + 180]), -wedge - 1)[:-1]
+    apart = steps > _TWINS * steps.sum() / len(tilt_angles)
     numbers = np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)
     return np.asarray(numbers[back], dtype=np.int64)
 

@@ -9,13 +9,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.base import (
-    LatentDistribution,
-    NoiseDistribution,
-    bisect_quantile,
-    log_normal_interval,
-    normal_quadrature,
-)
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)

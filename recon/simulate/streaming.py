@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,19 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.io import locked, output_folder, partial_folder
-from noiseflow.io.files import reserve
-from noiseflow.io.ownership import signature
-from noiseflow.io.partials import link_target
+from noiseflow.io.mapped import finish_mrc
+from noiseflow.progress import Progress
+from noiseflow.runs.outputs import reserve
+from noiseflow.runs.ownership import signature
+from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
+from recon.series.dual_axis import own_images
 from recon.series.tilt_series import write_angles
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import Acquisition, draw_noise, stored_type
 
 Array = NDArray[Any]
-Progress = Callable[[int, str], None]
 _BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
 
 
@@ -35,11 +37,11 @@ class Simulation:
     Attributes:
         phantom: one of `recon.simulate.phantoms.PHANTOMS`.
         size: voxels along each edge.
-        angles: degrees by name of the stack: ``clean`` and optionally ``validation`` and ``test``.
+        angles: degrees by name of the stack: ``clean`` and optionally ``clean_second``, ``validation`` and ``test``.
         acquisition: acquisition settings.
-        noise_model: noise model for the ``clean`` stack, or None.
+        noise_model: noise model for the ``clean`` stacks, or None.
         seed: seed of the phantom and of the noise.
-        defocus: depth-dependent blur of the ``clean`` stack, see
+        defocus: depth-dependent blur of the ``clean`` stacks, see
             `recon.projection.defocused_projector.DefocusedProjector`; the other stacks are in focus.
     """
 
@@ -66,10 +68,11 @@ class Simulation:
         step = max(1, _BLOCK_VOXELS // self.size**2)
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
-    def write(self, folder: Path, progress: Progress = lambda done, note: None) -> float:
+    def write(self, folder: Path, progress: Progress = lambda task, done, total, note: None) -> float:
         """Write ``truth.mrc``, the clean stacks by name and the noisy ``tilts.mrc``, with their angles, to a folder.
 
-        The files appear when all are complete; a failed run leaves none.
+        ``clean_second`` shows the volume turned in its plane by 90°, about a second tilt axis; its noisy stack is
+        ``tilts_second.mrc``. The files appear when all are complete; a failed run leaves none.
 
         Returns:
             The factor from the density of the phantom to the attenuation of the truth.
@@ -83,6 +86,8 @@ class Simulation:
             partial_folder(folder / "simulate") as partial,
         ):
             unit = _Writer(self, partial, progress).run()
+            for path in partial.glob("*.mrc"):
+                finish_mrc(path, stack=path.stem != "truth")
             for path in sorted(partial.iterdir()):
                 path.replace(link_target(folder / path.name))
         return unit
@@ -111,12 +116,13 @@ class _Writer:
 
     def _project(self, name: str, truth: Array) -> float:
         """Write the line integrals of one stack, and return the largest one in focus; that of the first stack sets the unit."""
+        truth = own_images(truth) if name == "clean_second" else truth
         plan, angles, highest = self.simulation, self.simulation.angles[name], 0.0
         with self._new(name, (len(angles), plan.size, plan.size), np.float32) as stack:
             for start in range(0, len(angles), plan._together):
                 part = angles[start : start + plan._together]
                 projector = SliceProjector(tilt_angles=part, depth=plan.size, width=plan.size)
-                blurred = with_defocus(projector, plan.defocus if name == "clean" else 0.0)
+                blurred = with_defocus(projector, plan.defocus if name.startswith("clean") else 0.0)
                 for rows in plan._blocks():
                     images = sharp = projector(torch.from_numpy(np.array(truth[:, rows])))
                     if isinstance(blurred, DefocusedProjector):
@@ -133,16 +139,16 @@ class _Writer:
             for image in clean.data:
                 image[:] = plan.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
                 self._step("reading out")
-            if name == "clean":
-                self._add_noise(clean.data)
+            if name.startswith("clean"):
+                self._add_noise(name.replace("clean", "tilts"), clean.data)
 
-    def _add_noise(self, clean: Array) -> None:
-        plan = self.simulation
-        with self._new("tilts", clean.shape, stored_type(plan.noise_model)) as noisy:
-            drawn = clean if plan.noise_model is None else draw_noise(clean, plan.noise_model, seed=plan.seed)
+    def _add_noise(self, name: str, clean: Array) -> None:
+        plan, seed = self.simulation, self.simulation.seed + (name != "tilts")
+        with self._new(name, clean.shape, stored_type(plan.noise_model)) as noisy:
+            drawn = clean if plan.noise_model is None else draw_noise(clean, plan.noise_model, seed=seed)
             for target, image in zip(noisy.data, drawn, strict=True):
                 target[:] = image
-        write_angles(self.folder / "tilts.rawtlt", plan.angles["clean"])
+        write_angles(self.folder / f"{name}.rawtlt", plan.angles["clean"])
 
     def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
         path = self.folder / f"{name}.mrc"
@@ -153,7 +159,7 @@ class _Writer:
 
     def _step(self, note: str) -> None:
         self.done += 1
-        self.progress(self.done, note)
+        self.progress("simulate", self.done, self.simulation.num_steps, note)
 
 
 def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:

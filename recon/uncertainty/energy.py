@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.picked import needs_image
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.observation_table import ObservationTable
 from recon.joint.signal_model import TomographySignal
 from recon.projection.base import from_columns

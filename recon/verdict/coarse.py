@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.first_guess import estimate_response
-from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means
+from recon.series.masks import binned, detector_offset
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.views import Directions
 
 Array = NDArray[Any]
 WIDTH = 32  # width of the coarse images; each test then takes milliseconds
@@ -25,6 +28,7 @@ class Coarse:
 
     Attributes:
         images: (tilt, y, u) line integrals, in coarse voxels.
+        used: (tilt, y, u) True for pixels to use.
         tilt_angles: (tilt,) degrees.
         tilts: (tilt,) indices of these tilts in the whole series.
         binning: binning factor.
@@ -33,6 +37,7 @@ class Coarse:
     """
 
     images: Array
+    used: Array
     tilt_angles: Array
     tilts: Array
     binning: int
@@ -40,35 +45,55 @@ class Coarse:
     width: int
     detector_offset: float
 
+    @cached_property
+    def directions(self) -> Directions:
+        """The tilts as directions modulo 180°."""
+        return Directions.of(self.tilt_angles)
+
+    def arranged(self, images: Array | None = None) -> Array:
+        """Its images, or others (tilt, y, u), zero where masked, by rising direction, mirrored where necessary."""
+        return self.directions.arranged((self.images if images is None else images) * self.used)
+
     @property
-    def order(self) -> Array:
-        """Indices of tilts sorted by angle."""
-        return np.argsort(self.tilt_angles, kind="stable")
+    def flat(self) -> Array:
+        """(tilt, y, u) images minus the mean of their used pixels; zero where masked."""
+        return self.centred(self.images)
+
+    def centred(self, images: Array) -> Array:
+        """Any images (tilt, y, u) minus the mean of their used pixels; zero where masked."""
+        count = np.maximum(self.used.sum((1, 2), keepdims=True), 1)
+        return np.asarray((images - (images * self.used).sum((1, 2), keepdims=True) / count) * self.used)
+
+    @property
+    def centred_on_all(self) -> Array:
+        """(tilt, y, u) images minus the mean of all used pixels; zero where masked."""
+        return np.asarray((self.images - self.images[self.used].mean()) * self.used)
 
 
 def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, *, width: int = WIDTH) -> Coarse:
     """The series as line integrals, at most `width` pixels wide and `_MOST_TILTS` tilts long."""
     stride = -(-tilt_series.num_tilts // _MOST_TILTS)
-    tilts = np.argsort(tilt_series.tilt_angles, kind="stable")[::stride]
-    some = tilt_series.select(np.sort(tilts))
+    tilts = np.sort(Directions.of(tilt_series.tilt_angles).order[::stride])
+    some = tilt_series.select(tilts)
     binning = -(-tilt_series.images.shape[2] // width)
     binning = max(1, min(binning, tilt_series.images.shape[1]))
-    images = line_integrals(some, some.images, binning)
+    images, used = line_integrals(some, some.images, binning)
     return Coarse(
         images,
+        used,
         some.tilt_angles,
-        np.sort(tilts),
+        tilts,
         binning,
         max(1, -(-grid.depth // binning)),
         max(1, -(-grid.width // binning)),
-        -(some.images.shape[2] % binning) / 2 / binning,
+        detector_offset(some, binning),
     )
 
 
-def line_integrals(tilt_series: TiltSeries, images: Array, binning: int) -> Array:
-    """Images (tilt, y, u), binned and converted to line integrals with the estimated response of the series."""
-    response = estimate_response(replace(tilt_series, mask=None))
-    return inverted(response, block_means(images, binning, binning))
+def line_integrals(tilt_series: TiltSeries, images: Array, binning: int) -> tuple[Array, Array]:
+    """Images (tilt, y, u), binned and converted to line integrals with the estimated response of the series, and their mask."""
+    small = binned(tilt_series.with_images(images, tilt_series.mask), binning, binning)
+    return inverted(estimate_response(tilt_series), small.images), small.used
 
 
 def inverted(response: Transmission | Linear, images: Array) -> Array:

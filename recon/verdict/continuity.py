@@ -29,10 +29,10 @@ _WIDE = 1.5  # median steps: images further apart need not be similar
 
 def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
     """Single tilts that are predicted far worse than neighbouring tilts; tilts at the ends have few neighbours."""
-    images, left = coarse.images[coarse.order], errors[coarse.order]
+    images, left = coarse.directions.arranged(coarse.flat), coarse.arranged(errors)
     if images.shape[1] < 2 or len(images) < 2 * _BESIDE:
         raise NotTested(f"needs two rows and {2 * _BESIDE} tilts")
-    structure = float(np.median([neighbours(image[None] - image.mean(), 1) for image in images]))
+    structure = float(np.median([neighbours(image[None], 1) for image in images]))
     shared = np.array([neighbours(each[None], 1) for each in left])
     beyond = shared - ndimage.median_filter(shared, _BESIDE, mode="nearest")
     usual = 1.4826 * float(np.median(np.abs(beyond)))
@@ -41,7 +41,7 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
     evidence = {"lone tilts": int(far.sum())}
     if not far.any():
         return evidence, []
-    named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[coarse.order][far][:5])
+    named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[coarse.directions.order][far][:5])
     words = f"the image at {named} is inconsistent with its neighbours: it belongs to another tilt or another object"
     strength = float(min(2.9, (beyond / max(usual, 1e-30))[far].max() / _LONE))
     return evidence, [Finding("tilts", strength, words, "check its angle, or exclude it")]
@@ -49,11 +49,10 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
 
 def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     """A single break: neighbouring images with much less common structure than all other neighbours."""
-    images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
+    flat, angles = coarse.directions.arranged(coarse.flat), np.sort(coarse.directions.angles)
     steps = np.diff(angles)
-    if len(images) < 2 * _AROUND:
+    if len(flat) < 2 * _AROUND:
         raise NotTested(f"needs {2 * _AROUND} tilts")
-    flat = images - images.mean((1, 2), keepdims=True)
     power = (flat**2).mean((1, 2))
     shared = (flat[1:] * flat[:-1]).mean((1, 2))
     chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)

@@ -78,9 +78,10 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
         columns = (down, right, along * down + across * right, along * right - across * down)
+        use = residuals.used[tilt].ravel()
         brightness = image - image.mean()
         parts = [*columns, by_angle[tilt], brightness, np.ones_like(image)]
-        yield np.stack([part.ravel() for part in parts], 1), residual.ravel().astype(np.float64)
+        yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64)
 
 
 def _slope_over_tilts(residuals: Residuals) -> Array:

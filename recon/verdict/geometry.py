@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,11 @@ Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
 _SINGLE = 0.3  # smoothness for single held-out tilts; with less, noise would hide inconsistent tilts
 _TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
-_SMALL = (
-    20.0  # degrees: smaller rotations are compared with their opposite, because both have the same interpolation error
-)
-_LIKE_A_TURN = 0.211  # pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
+# pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
+_LIKE_A_TURN = 0.211
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
+# share of used neighbours of an interpolated pixel
+_SEEN = 0.99
 # degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
 _WIDEST = 190.0
 
@@ -51,15 +53,18 @@ class Geometry:
 
     def __init__(self, coarse: Coarse) -> None:
         self.coarse = coarse
-        self.smoothness = min(_SMOOTHNESS, key=lambda each: float(np.mean(self._fit(each).errors(coarse.images) ** 2)))
+        self.smoothness = min(_SMOOTHNESS, key=lambda each: float(np.mean(self._errors(self._fit(each)) ** 2)))
         self.fit = self._fit(self.smoothness)
-        self.errors = self.fit.errors(coarse.images)
+        self.errors = self._errors(self.fit)
 
     def single_errors(self) -> Array:
         """(tilt, y, u) errors of the smoothest fit when single angles are held out and predicted by their neighbours."""
-        angles = self.coarse.tilt_angles
-        each = float(np.ptp(angles)) / len(np.unique(np.round(angles, 3)))
-        return self._fit(_SINGLE, gap=each).errors(self.coarse.images)
+        directions = self.coarse.directions
+        each = directions.span / len(np.unique(np.round(directions.angles, 3)))
+        return self._errors(self._fit(_SINGLE, gap=each))
+
+    def _errors(self, fit: GapFit) -> Array:
+        return fit.errors(self.coarse.images, self.coarse.used)
 
     def _fit(self, smoothness: float, *, offset: float = 0.0, gap: float = GAP, **changes: Any) -> GapFit:
         coarse = replace(self.coarse, **changes)
@@ -74,37 +79,48 @@ class Geometry:
         )
 
     def axis(self) -> Gain:
-        """The best other direction of the tilt axis."""
-        images = self.coarse.images
-        moved = np.stack([ndimage.shift(i, (_LIKE_A_TURN,) * 2, order=1, mode="nearest") for i in images])
-        as_given = self._fit(self.smoothness, offset=_LIKE_A_TURN).errors(moved)
+        """The best other direction of the tilt axis.
+
+        Interpolation alone reduces the noise, so each turn is compared with its opposite and with a shift.
+        """
+        shifted = self._moved(
+            lambda image: ndimage.shift(image, (_LIKE_A_TURN,) * 2, order=1, mode="nearest"),
+            self._fit(self.smoothness, offset=_LIKE_A_TURN),
+        )
         gains = []
         for size in _TURNS:
-            both = {turn: self.fit.errors(_turned(images, turn)) for turn in (-size, size)}
+            both = {turn: self._moved(partial(_turned, turn), self.fit) for turn in (-size, size)}
             for turn, errors in both.items():
-                gain = self._gain(errors, as_given, f"turned by {turn:g}°")
-                mirrored = self._gain(errors, both[-turn], f"turned by {turn:g}°")
-                gains.append(gain if size > _SMALL else _smaller(gain, mirrored))
-        if images.shape[1] == images.shape[2]:
-            gains.append(self._gain(self.fit.errors(images.transpose(0, 2, 1)), self.errors, "turned by 90°"))
-        return max(gains, key=lambda gain: gain.share)
+                what = f"turned by {turn:g}°"
+                gains.append(min((self._gain(errors, other, what) for other in (shifted, both[-turn])), key=_share))
+        if self.coarse.images.shape[1] == self.coarse.images.shape[2]:
+            across = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
+            gains.append(self._gain(across, self.errors, "turned by 90°"))
+        return max(gains, key=_share)
+
+    def _moved(self, move: Callable[[Array], Array], fit: GapFit) -> Array:
+        """Errors of moved images."""
+        images, used = (
+            np.stack([move(image.astype(np.float64)) for image in stack])
+            for stack in (self.coarse.images, self.coarse.used)
+        )
+        return fit.errors(images, used > _SEEN)
 
     def angles(self) -> Gain:
         """The best other scale of the tilt angles."""
-        span = float(np.ptp(self.coarse.tilt_angles))
-        scales = [scale for scale in _SCALES if scale < 1 or scale * span <= _WIDEST]
-        return max(
-            (self._with(f"multiplied by {scale:g}", tilt_angles=self.coarse.tilt_angles * scale) for scale in scales),
-            key=_share,
-        )
+        angles = self.coarse.tilt_angles
+        scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
+        return max((self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales), key=_share)
 
     def thicker(self) -> Gain:
         """A volume with a depth equal to the width, if it is thinner."""
-        return self._with("as deep as wide", depth=max(self.coarse.depth, self.coarse.width))
+        if self.coarse.depth >= self.coarse.width:
+            return Gain(0.0, 0.0, "as deep as wide")
+        return self._with("as deep as wide", depth=self.coarse.width)
 
     def two_objects(self) -> Gain:
         """Separate volumes for parts of the series: halves, and every other tilt."""
-        order = self.coarse.order
+        order = self.coarse.directions.order
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         parts = {"halves": rank < len(order) // 2, "every other tilt": rank % 2 == 0}
@@ -113,12 +129,12 @@ class Geometry:
     def _apart(self, first: Array, name: str) -> Gain:
         errors = np.empty_like(self.errors)
         for part in (first, ~first):
-            images, angles = self.coarse.images[part], self.coarse.tilt_angles[part]
-            errors[part] = self._fit(self.smoothness, tilt_angles=angles, images=images).errors(images)
+            fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part])
+            errors[part] = fit.errors(self.coarse.images[part], self.coarse.used[part])
         return self._gain(errors, self.errors, name)
 
     def _with(self, what: str, **changes: Any) -> Gain:
-        return self._gain(self._fit(self.smoothness, **changes).errors(self.coarse.images), self.errors, what)
+        return self._gain(self._errors(self._fit(self.smoothness, **changes)), self.errors, what)
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Gain:
         """Reduction of the errors relative to the given geometry; its standard error is that of the mean over the gaps."""
@@ -133,10 +149,5 @@ def _share(gain: Gain) -> float:
     return gain.share
 
 
-def _smaller(*gains: Gain) -> Gain:
-    return min(gains, key=_share)
-
-
-def _turned(images: Array, degrees: float) -> Array:
-    turned = [ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest") for image in images]
-    return np.stack(turned)
+def _turned(degrees: float, image: Array) -> Array:
+    return np.asarray(ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,14 @@ from recon.verdict.geometry import Gain, Geometry
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
 
-_AXIS, _AXIS_SCORE = 0.02, 1.8  # of the error of held-out tilts; standard scenes gain at most 0.006
-_ANGLES, _ANGLES_SCORE = 0.055, 3.0  # smaller angles make any object smoother; standard scenes gain up to 0.04
-_OBJECTS, _OBJECTS_SCORE = 0.06, 1.0  # halves have less data; for one object they lose 0.07 to 0.13
-_THICKER, _THICKER_SCORE = 0.05, 2.0
+# smallest relevant gain, share of the error of held-out tilts: 60 independent good series gain at most 0.05
+_GAIN = 0.06
+# the same for other angles, because smaller ones make any object smoother: 60 independent good series gain at most 0.1
+_ANGLES = 0.1
+# standard errors over the gaps, of which there may be few
+_SCORE = 2.5
+# views: fewer leave too few gaps for a standard error
+_VIEWS = 20
 _SLACK, _TIMES = 0.06, 3.0  # share of the structure; factor relative to the volume's own projections
 _EDGE = 0.4  # line integral at the sides relative to the mean: above it, the object extends beyond the sides
 _STRUCTURE = 8.0  # standard errors of the structure common to neighbouring rows
@@ -27,22 +32,19 @@ def geometry_findings(
     """Evidence and findings of the coarse series."""
     tolerable = _TIMES * max(expected.share, 0.0) + _SLACK
     beyond = float((gap.share - 2 * gap.error) / tolerable)
-    axis, objects = geometry.axis(), geometry.two_objects()
-    angles, thicker = geometry.angles(), geometry.thicker()
+    few = len(np.unique(np.round(geometry.coarse.directions.angles, 3))) < _VIEWS
+    gains = [] if few else list(_gains(geometry))
     edge, structure = _edge(geometry), _structure(geometry)
     evidence = {
         "gap": {"unexplained": gap.share, "error": gap.error, "expected": expected.share},
         "structure over chance": structure,
-        "other axis": _as_dict(axis),
-        "other angles": _as_dict(angles),
-        "two objects": _as_dict(objects),
-        "thicker": _as_dict(thicker),
+        **{name: _as_dict(gain) for name, gain, _ in gains},
         "signal at the sides": edge,
     }
     if structure < _STRUCTURE:
         words = "neighbouring pixels of the images are not correlated: no object is visible"
         return evidence, [Finding("noise", 10.0, words, "use a longer exposure, or check the file")]
-    findings = [*_axis(axis), *_angles(angles), *_objects(objects), *_thicker(thicker)]
+    findings = [finding for *_, finding in gains]
     if edge > _EDGE and beyond > 0.5:
         words = f"the object extends beyond the sides of the images, with {edge:.0%} of the mean signal there"
         findings.append(
@@ -64,54 +66,43 @@ def geometry_findings(
     return evidence, findings
 
 
-def _axis(gain: Gain) -> list[Finding]:
-    if gain.share < _AXIS or gain.score < _AXIS_SCORE:
-        return []
-    words = f"images {gain.what} explain each other better: the error of held-out tilts decreases by {gain.share:.0%}"
-    return [Finding("axis", min(6.0, 1 + gain.share / _AXIS), words, "give --tilt-axis, or use --refine-alignment")]
+def _gains(geometry: Geometry) -> Iterator[tuple[str, Gain, Finding]]:
+    """Yield the name, the gain, and the finding, of every other geometry."""
+    axis, angles, objects, thicker = (
+        geometry.axis(),
+        geometry.angles(),
+        geometry.two_objects(),
+        geometry.thicker(),
+    )
 
+    def finding(subject: str, gain: Gain, limit: float, words: str, advice: str) -> Finding:
+        fires = gain.share >= limit and gain.score >= _SCORE
+        words = f"{words}: the error of held-out tilts decreases by {gain.share:.0%}"
+        return Finding(subject, min(6.0, 1 + gain.share / limit) if fires else 0.0, words, advice)
 
-def _angles(gain: Gain) -> list[Finding]:
-    if gain.share < _ANGLES or gain.score < _ANGLES_SCORE:
-        return []
-    words = f"tilt angles {gain.what} explain held-out tilts better: their error decreases by {gain.share:.0%}"
-    return [Finding("angles", min(6.0, 1 + gain.share / _ANGLES), words, "check the list of tilt angles")]
-
-
-def _objects(gain: Gain) -> list[Finding]:
-    if gain.share < _OBJECTS or gain.score < _OBJECTS_SCORE:
-        return []
-    words = f"two parts of the series contradict each other ({gain.what}): each alone is explained better, by {gain.share:.0%}"
-    return [
-        Finding(
-            "specimen",
-            min(6.0, 1 + gain.share / _OBJECTS),
-            words,
-            "reconstruct the parts separately; the specimen moved or changed between them",
-        )
-    ]
-
-
-def _thicker(gain: Gain) -> list[Finding]:
-    if gain.share < _THICKER or gain.score < _THICKER_SCORE:
-        return []
-    words = f"the volume is too thin: one {gain.what} explains held-out tilts better by {gain.share:.0%}"
-    return [
-        Finding("thickness", min(6.0, 1 + gain.share / _THICKER), words, "remove --thickness, or give a larger value")
-    ]
+    words, advice = f"images {axis.what} explain each other better", "give --tilt-axis, or use --refine-alignment"
+    yield "other axis", axis, finding("axis", axis, _GAIN, words, advice)
+    words, advice = f"tilt angles {angles.what} explain held-out tilts better", "check the list of tilt angles"
+    yield "other angles", angles, finding("angles", angles, _ANGLES, words, advice)
+    words = f"two parts of the series contradict each other ({objects.what})"
+    advice = "reconstruct the parts separately; the specimen moved or changed between them"
+    yield "two objects", objects, finding("specimen", objects, _GAIN, words, advice)
+    words, advice = f"the volume is too thin for one {thicker.what}", "remove --thickness, or give a larger value"
+    yield "thicker", thicker, finding("thickness", thicker, _GAIN, words, advice)
 
 
 def _edge(geometry: Geometry) -> float:
     """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
-    profile = geometry.coarse.images.mean((0, 1))
+    coarse = geometry.coarse
+    profile = (coarse.images * coarse.used).sum((0, 1)) / np.maximum(coarse.used.sum((0, 1)), 1)
+    profile = profile[coarse.used.any((0, 1))]
     raised = profile - profile.min()
     return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
 
 def _structure(geometry: Geometry) -> float:
     """Structure common to neighbouring pixels, in standard errors: the larger value of y and u."""
-    images = geometry.coarse.images
-    flat = images - images.mean((1, 2), keepdims=True)
+    flat = geometry.coarse.flat
     chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
     return max(neighbours(flat, axis) for axis in (1, 2)) / chance
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.series.tilt_series import block_means
+from recon.series.tilt_series import block_mean
 from recon.verdict.distortions import Distortion
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
@@ -84,7 +84,7 @@ def _smooth_part(residuals: Residuals) -> float:
         neighbours(residuals.residual, 1),
         float(np.mean(residuals.residual**2)) / np.sqrt(residuals.residual.size),
     )
-    blocks = block_means(residuals.residual, _BLOCK, _BLOCK)
+    blocks = np.stack([block_mean(each, _BLOCK, _BLOCK) for each in residuals.residual])
     own = neighbours(blocks, 1) - max(0.0, neighbours(blocks, 0))
     return float(own / max(whole, chance, 1e-30))
 

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from noiseflow.checks import Guard
 from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
+from recon.series.dual_axis import about, own_images
 from recon.series.first_guess import contrast_slab
+from recon.series.masks import coarse
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, VolumeGrid, block_means, evenly
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, evenly
 from recon.verdict import continuity, fits, pixels, tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -27,6 +29,7 @@ from recon.verdict.image_findings import image_findings
 from recon.verdict.limits import cliff, saturation
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharpness_findings
+from recon.verdict.size_findings import size_findings
 from recon.verdict.verdict import Finding, Result, Verdict, verdict_of
 
 Array = NDArray[Any]
@@ -91,17 +94,21 @@ class Case:
         """Predictions of held-out gaps of tilts."""
         return Geometry(self.coarse)
 
+    def _integrals(self, images: Array) -> tuple[Array, Array]:
+        """Coarse line integrals and mask of any images of the series."""
+        tilts = evenly(self.coarse.tilts, len(images))
+        return line_integrals(self.series.select(self.coarse.tilts), images[tilts], self.coarse.binning)
+
     @cached_property
     def gap(self) -> Unexplained:
         """Unexplained structure of held-out gaps."""
-        return unexplained(self.coarse.images, self.geometry.errors)
+        return unexplained(self.coarse.centred_on_all, self.geometry.errors)
 
     @cached_property
     def own_gap(self) -> Unexplained:
         """The same for the projections of the volume, which are consistent with each other."""
-        some = self.series.select(self.coarse.tilts)
-        own = line_integrals(some, self.expected[evenly(self.coarse.tilts, len(self.expected))], self.coarse.binning)
-        return unexplained(own, self.geometry.fit.errors(own))
+        own, used = self._integrals(self.expected)
+        return unexplained((own - own[used].mean()) * used, self.geometry.fit.errors(own, used))
 
 
 def _of_pixels(check: Callable[[TiltSeries, Array, Residuals], Part]) -> Callable[[Case], Part]:
@@ -111,8 +118,7 @@ def _of_pixels(check: Callable[[TiltSeries, Array, Residuals], Part]) -> Callabl
 def _contrast(case: Case) -> Part:
     """Whether a coarse non-negative volume explains the images better with inverted contrast."""
     tilt_series = case.series
-    height, width = tilt_series.images.shape[1:]
-    small = replace(tilt_series, images=block_means(tilt_series.images, -(-height // 16), -(-width // 32)), mask=None)
+    small = coarse(tilt_series, height=16, width=32)
     as_given, swapped = explained(small), explained(invert_contrast(small))
     evidence = {"contrast": {"as given": as_given, "swapped": swapped}}
     if swapped < as_given + _CONTRAST:
@@ -169,6 +175,7 @@ CHECKS: dict[str, Callable[[Case], Part]] = {
     "tilts unlike the others": lambda case: tilts.foreign(case.coarse, case.geometry.errors),
     "single tilts": lambda case: continuity.single_tilts(case.coarse, case.geometry.single_errors()),
     "breaks": lambda case: continuity.breaks(case.coarse),
+    "size of the specimen": lambda case: size_findings(case.series),
     "excluded tilts": lambda case: tilts.screened(case.screening),
     **{name: _of_pixels(check) for name, check in PIXELS.items()},
     "sharpness": lambda case: sharpness_findings(case.series, case.residuals),
@@ -209,6 +216,8 @@ def judge(
             "that the volume was made from"
         )
     case, guard = Case(tilt_series, result, screening, alignment), Guard() if guard is None else guard
+    if tilt_series.axes is not None:
+        return _of_both_axes(case, guard)
     evidence: dict[str, Any] = {}
     findings: list[Finding] = []
     for name, check in CHECKS.items():
@@ -217,6 +226,39 @@ def judge(
         evidence |= part
         findings += found
     return verdict_of(findings, evidence, good=guard("summary", lambda: _good(case), otherwise=_NOTHING), guard=guard)
+
+
+def _of_both_axes(case: Case, guard: Guard) -> Verdict:
+    """The verdicts of both axes as one; each judges the tilts about it with the geometry of one axis."""
+    result, verdicts = case.result, list[Verdict]()
+    assert case.tilt_series.axes is not None
+    for second in (False, True):
+        images, volume = result.projections[(case.tilt_series.axes != 0) == second], result.volume.attenuation
+        if second:
+            images, volume = own_images(images), own_images(volume)
+        shown = _Shown(replace(result.volume, attenuation=volume), images, result.fit_result, result.noise_model)
+        screening, alignment = (None, None) if second else (case.screening, case.alignment)
+        verdicts.append(judge(about(case.tilt_series, second=second), shown, screening=screening, alignment=alignment))
+    evidence = dict(zip(("first axis", "second axis"), (verdict.evidence for verdict in verdicts), strict=True))
+    findings = [
+        replace(finding, sentence=f"{name}: {finding.sentence}")
+        for name, verdict in zip(evidence, verdicts, strict=True)
+        for finding in verdict.findings
+    ]
+    for name, verdict in zip(evidence, verdicts, strict=True):
+        guard.not_tested.update({f"{name}: {check}": why for check, why in verdict.not_tested.items()})
+    good = "; ".join(f"{name}: {verdict.reasons[0]}" for name, verdict in zip(evidence, verdicts, strict=True))
+    return verdict_of(findings, evidence, good=good, guard=guard)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """The part of a result about one axis."""
+
+    volume: Volume
+    projections: Array
+    fit_result: Any
+    noise_model: Any
 
 
 def _good(case: Case) -> str:

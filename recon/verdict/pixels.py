@@ -30,6 +30,7 @@ _STREAK = (
 )
 _STREAKS = 0.002  # of all lines: one in five hundred is harmless
 _REGION = 0.002  # of the pixels: one in five hundred is harmless, and no pixel is constant by chance
+_CHANCE = 1e-3  # of a line of equal counts
 _BORDERS = 0.1  # of the images: fewer are single defects, which screening removes
 _SEAM, _SEAM_STEP = (
     12.0,
@@ -109,15 +110,11 @@ def streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, A
     return {"streaks": counts}, [Finding("lines", 1 + min(2.0, 50 * share), sentence, advice, "seen")]
 
 
-def borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], list[Finding]]:
+def borders(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
     """Borders of single images with a constant value, unlike the adjacent pixels, as left by an alignment."""
-    if tilt_series.mask is not None:  # borders are masked
-        return {}, []
     span = float(np.quantile(images, 0.99) - np.quantile(images, 0.01))
-    sides = [
-        images.transpose(0, 2, 1),
-        images.transpose(0, 2, 1)[:, ::-1],
-    ]  # (tilt, lines from the side, pixels along it)
+    seen = np.where(residuals.used, images, np.nan)  # what is masked was filled on purpose
+    sides = seen.transpose(0, 2, 1), seen.transpose(0, 2, 1)[:, ::-1]  # (tilt, lines from the side, pixels along it)
     filled = np.mean([_filled(side, span) for side in sides], axis=0)
     share = float((filled > 0).mean())
     evidence = {"filled borders": share}
@@ -130,8 +127,11 @@ def borders(tilt_series: TiltSeries, images: Array, __: Residuals) -> tuple[dict
 
 
 def _filled(lines: Array, span: float) -> Array:
-    """(tilt,) number of leading lines with a constant value that differs clearly from the next line."""
+    """(tilt,) number of leading lines with a constant value that differs clearly from the next line, and that counts in an image
+    mostly without electrons would not have by chance."""
     flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
+    alike = (lines == lines[:, :1, :1]).mean((1, 2))  # of the pixels
+    flat &= (alike ** lines.shape[2] < _CHANCE)[:, None]
     count = np.argmin(flat, axis=1)
     after = lines[np.arange(len(lines)), count].mean(1)
     return np.where(np.abs(after - lines[:, 0, 0]) > _STEP * span, count, 0)

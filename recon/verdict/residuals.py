@@ -21,7 +21,8 @@ class Residuals:
     """Images and projections of the slices with the highest contrast, sorted by tilt angle.
 
     Attributes:
-        images, projections: (tilt, y, u) detector units; their difference is `residual`, zero where masked.
+        images, projections: (tilt, y, u) detector units, equal where masked; their difference is `residual`.
+        used: (tilt, y, u) True for pixels to use.
         tilt_angles: (tilt,) degrees, ascending.
         height: (y,) pixels from the centre of the whole images.
     """
@@ -29,6 +30,7 @@ class Residuals:
     images: Array
     projections: Array
     residual: Array
+    used: Array
     tilt_angles: Array
     height: Array
 
@@ -41,21 +43,20 @@ class Residuals:
         images = tilt_series.images[order, rows].astype(np.float32)
         of_rows = projections(rows) if callable(projections) else projections[:, rows]
         predicted = np.asarray(of_rows[order], dtype=np.float32)
-        residual = images - predicted
-        if tilt_series.mask is not None:
-            residual = np.where(tilt_series.mask[order, rows], residual, np.float32(0))
+        used = np.ones(images.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[order, rows]
+        images = np.where(used, images, predicted)
         position = np.arange(height, dtype=np.float32)[rows] - (height - 1) / 2
-        return cls(images, predicted, residual, tilt_series.tilt_angles[order], position)
+        return cls(images, predicted, images - predicted, used, tilt_series.tilt_angles[order], position)
 
     @property
     def contrast(self) -> float:
         """Standard deviation of the projections."""
-        return float(self.projections.std())
+        return float(self.projections[self.used].std())
 
     @property
     def noise(self) -> float:
         """Standard deviation of the residual."""
-        return float(self.residual.std())
+        return float(self.residual[self.used].std())
 
     def unexplained(self) -> tuple[float, float]:
         """Power common to neighbouring residuals, relative to that of the images, and its standard error for white noise.
@@ -63,7 +64,7 @@ class Residuals:
         White noise does not contribute. The larger value of both directions is returned, because structure that changes from
         row to row is correlated only along u.
         """
-        flat = self.images - self.images.mean()
+        flat = (self.images - self.images[self.used].mean()) * self.used
         power, chance = float(np.mean(self.residual**2)), np.sqrt(self.residual.size)
         found = []
         for axis in (1, 2):

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import NotTested
+from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
-from recon.verdict.coarse import line_integrals
+from recon.verdict.coarse import inverted
 from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Finding
 
@@ -78,11 +79,11 @@ def _magnified(masses: Array) -> list[Finding]:
 
 def _integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
     """(tilt, y, u) line integrals sorted by angle; masked pixels are replaced by the prediction of the volume."""
-    images = residuals.projections + residuals.residual
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     beam = None if tilt_series.beam is None else tilt_series.beam[order]
-    ordered = replace(tilt_series, images=images, tilt_angles=residuals.tilt_angles, mask=None, beam=beam)
-    return line_integrals(ordered, images, 1)
+    mask = None if residuals.used.all() else residuals.used
+    ordered = replace(tilt_series, images=residuals.images, tilt_angles=residuals.tilt_angles, mask=mask, beam=beam)
+    return inverted(estimate_response(ordered), residuals.images)
 
 
 def blurs(images: Array) -> tuple[Array, Array]:

@@ -36,7 +36,7 @@ def coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
     directions = np.unique(np.round(np.mod(angles, 180), 3))
     gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
     wedge, inner = float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0
-    steps = np.diff(np.unique(angles))
+    steps = np.diff(directions)
     evidence = {
         "tilts": len(angles),
         "degrees without data": wedge,
@@ -83,15 +83,11 @@ def repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
 
 def twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     """Images at the same angle must differ only by noise, which is independent between neighbouring rows."""
-    order = coarse.order
-    close = np.diff(coarse.tilt_angles[order]) < 0.02
+    close = np.diff(np.sort(coarse.directions.angles)) < 0.02
     if not close.any() or coarse.images.shape[1] < 2:
         return {}, []
-    difference = (coarse.images[order][1:] - coarse.images[order][:-1])[close]
-    whole = coarse.images - coarse.images.mean()
-    share = float(
-        np.mean(difference[:, 1:] * difference[:, :-1]) / 2 / max(float(np.mean(whole[:, 1:] * whole[:, :-1])), 1e-30)
-    )
+    difference = np.diff(coarse.arranged(), axis=0)[close]
+    share = neighbours(difference, 1) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30)
     evidence = {"twins differ by": share}
     if share < _TWINS:
         return evidence, []
@@ -106,7 +102,7 @@ def jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
 
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
-    images, angles = coarse.images[coarse.order], coarse.tilt_angles[coarse.order]
+    images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
     apart = np.diff(angles) > 0.02
     if apart.sum() < _AROUND or images.shape[1] < 2:
         raise NotTested(f"needs two rows and {_AROUND + 1} tilts")
@@ -114,7 +110,7 @@ def jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
     usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
-    whole = max(neighbours(images - images.mean(), 1), 1e-30)
+    whole = max(neighbours(coarse.centred_on_all, 1), 1e-30)
     large = shared * steps**2 > _JUMP_SHARE * whole
     ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # exact copies give usual = 0
     largest = int(np.argmax(ratios))
@@ -134,11 +130,11 @@ def foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding
     """Tilts that the others predict much worse than the rest, by the structure common to predicted and measured rows."""
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
-    measured, predicted = (each - each.mean((1, 2), keepdims=True) for each in (coarse.images, coarse.images - errors))
+    measured, predicted = coarse.flat, coarse.centred(coarse.images - errors)
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
-    order = coarse.order
+    order = coarse.directions.order
     beside = np.empty_like(own)
     beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
     blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _BLANK * beside

@@ -7,7 +7,7 @@ import torch
 from scipy import stats
 
 import noiseflow
-from noiseflow.distributions.base import log_normal_cdf, log_normal_interval
+from noiseflow.distributions.numerics.normal import log_normal_cdf, log_normal_interval
 from tests.contracts import check_noise_model, integrate_density
 
 FLOWS = {

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from noiseflow import io
 from recon.metrics import comparison, metrics
 from recon.metrics.comparison import compare_volumes, project
 from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, resolution
@@ -124,3 +125,30 @@ def test_volumes_larger_than_memory_are_compared_section_by_section(tmp_path, mo
     assert parts.volume["affine"] == pytest.approx(whole.volume["affine"])
     assert with_angles.projections["raw"].mse == pytest.approx(whole.projections["raw"].mse, rel=1e-5)
     np.testing.assert_allclose(parts.correlation, whole.correlation, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("turn", "axes", "flipped"),
+    [
+        (lambda v: v, None, None),
+        (lambda v: v[::-1], "zyx", "z"),
+        (lambda v: v[:, :, ::-1], "zyx", "x"),
+        (lambda v: v.transpose(1, 0, 2), "yzx", ""),
+        (lambda v: v.transpose(2, 0, 1)[:, ::-1], "yxz", "z"),
+    ],
+)
+def test_a_flip_or_an_axis_order_that_fits_much_better_is_named(tmp_path, turn, axes, flipped, run):
+    noise = np.random.default_rng(0)
+    z, y, x = np.mgrid[:30, :30, :30]
+    truth = np.exp(-((z - 8) ** 2 + (y - 12) ** 2 + (x - 20) ** 2) / 20).astype(np.float32)
+    io.write(tmp_path / "truth.mrc", truth)
+    io.write(tmp_path / "volume.mrc", np.ascontiguousarray(turn(truth + 0.02 * noise.normal(size=truth.shape))))
+    found = run("compare", tmp_path / "volume.mrc", tmp_path / "truth.mrc")["better_orientation"]
+    assert (axes, flipped) == (None, None) if found is None else (found["axes"], found["flipped"]) == (axes, flipped)
+
+
+def test_an_axis_order_of_another_shape_is_named(tmp_path, refused):
+    truth = np.random.default_rng(0).random((8, 12, 16)).astype(np.float32)
+    io.write(tmp_path / "truth.mrc", truth)
+    io.write(tmp_path / "volume.mrc", np.ascontiguousarray(truth.transpose(1, 0, 2)))
+    assert "(y, z, x)" in refused("compare", tmp_path / "volume.mrc", tmp_path / "truth.mrc")

@@ -1,17 +1,22 @@
 """Every projector, field and regulariser keeps the contract of its kind."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from recon.fields.coordinate_network import CoordinateNetwork
-from recon.fields.fields import Field, MultiresolutionField, VoxelField
+from recon.fields.fields import Field
+from recon.fields.kinds.gaussians import GaussianField
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.kniesel2022 import PaperField
+from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import DirectionalVariation, Regulariser, SecondOrderVariation, TotalVariation
 from recon.projection.base import Projector
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.projector import SliceProjector
 from recon.projection.tiles import Tiles
 
@@ -24,7 +29,11 @@ def in_focus():
     return SliceProjector(tilt_angles=_ANGLES, depth=6, width=9, detector_width=11, dtype=torch.float64)
 
 
-PROJECTORS = {"slices": in_focus, "defocused": lambda: DefocusedProjector(in_focus(), 0.2)}
+PROJECTORS = {
+    "slices": in_focus,
+    "defocused": lambda: DefocusedProjector(in_focus(), 0.2),
+    "defocused in the image": lambda: ImageDefocusedProjector(in_focus(), 0.2),
+}
 
 
 class SumOfAttenuation(Regulariser):
@@ -37,7 +46,9 @@ class SumOfAttenuation(Regulariser):
 FIELDS = {
     "voxels": VoxelField,
     "multiresolution": MultiresolutionField,
-    "network": lambda shape, scale: CoordinateNetwork(shape, scale=scale, width=8, layers=2, frequencies=3, skip=0),
+    "network": partial(CoordinateNetwork, width=16, layers=2),
+    "network of the paper": partial(PaperField, width=8, layers=2, frequencies=3, skip=0),
+    "gaussians": partial(GaussianField, count=40),
 }
 REGULARISERS = {
     "total variation": TotalVariation,
@@ -90,12 +101,88 @@ def test_field_contract(name):
     torch.testing.assert_close(field(), (units * field.scale).reshape(60, 8))
     torch.testing.assert_close(field.volume(), (units * field.scale).transpose(1, 2).detach())
     places = torch.tensor([0, 5, 479])
-    torch.testing.assert_close(field.at(places), units.reshape(-1)[places])
+    torch.testing.assert_close(field.of_voxels(places), units.reshape(-1)[places])
     field().square().sum().backward()
     assert all(p.grad is not None and math.isfinite(float(p.grad.sum())) for p in field.parameters())
     tiles = some_tiles()
     torch.testing.assert_close(tiles.spread(field.on(tiles)), field.units() * tiles.mask)
     assert (field.coarser() is not None) == field.has_coarser
+
+
+def test_coarser_network_is_the_same_function():
+    field = started("network", (8, 10, 12))
+    coarse = field.coarser()
+    assert coarse.network is field.network
+    z, y, x = torch.meshgrid(*(2 * torch.arange(float(size)) + 0.5 for size in (4, 5, 6)), indexing="ij")
+    between = field.at(torch.stack([z, y, x], -1).view(-1, 3)).detach()
+    torch.testing.assert_close(coarse.volume().view(-1), 2 * between)
+
+
+def started(name, shape=(6, 8, 10)):
+    torch.manual_seed(0)
+    field = FIELDS[name](shape, scale=0.3)
+    rough = torch.zeros(3, 4, 5)
+    rough[1:, 1:3, 2:4] = 0.3
+    field.start_from(rough)
+    return field
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_field_has_values_between_voxels(name):
+    field = started(name)
+    z, y, x = torch.meshgrid(*(torch.arange(float(size)) for size in (6, 8, 10)), indexing="ij")
+    points = torch.stack([z, y, x], -1).view(-1, 3)
+    volume = field.volume()
+    torch.testing.assert_close(field.at(points).view(6, 8, 10), volume, rtol=1e-4, atol=1e-5)
+    field.voxel_size = 2.5
+    torch.testing.assert_close(field.at(2.5 * points, unit="Å"), volume.view(-1), rtol=1e-4, atol=1e-5)
+    found = field.at(points.numpy())
+    assert isinstance(found, np.ndarray)
+    between = field.at(points[:1] + torch.tensor([[2.3, 3.4, 4.6]]))
+    near = volume[2:4, 3:5, 4:6]
+    between.sum().backward()
+    assert float(near.min()) - 0.05 <= between.item() <= float(near.max()) + 0.05
+    field.flipped = (0, 2)
+    torch.testing.assert_close(field.at(points).view(6, 8, 10), volume.flip(0, 2), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(field.volume(), volume.flip(0, 2))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_field_takes_points_only(name):
+    field = started(name)
+    for wrong, words in (
+        (torch.tensor([0, 1, 2]), "coordinates"),
+        (torch.zeros(4, 3, dtype=torch.long), "coordinates"),
+        (torch.zeros(4, 2), "coordinates"),
+        (torch.tensor([[0.0, 0.0, 9.6]]), "outside"),
+        (torch.tensor([[0.0, 7.6, 0.0]]), "outside"),
+        (torch.tensor([[0.0, math.nan, 0.0]]), "outside"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            field.at(wrong)
+    with pytest.raises(ValueError, match="voxel size"):
+        field.at(torch.zeros(1, 3), unit="Å")
+    with pytest.raises(ValueError, match="unit"):
+        field.at(torch.zeros(1, 3), unit="nm")
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_field_keeps_its_vacuum_and_its_mass_on_other_grids(name):
+    field = started(name)
+    field.occupied = torch.zeros(6, 10, 8, dtype=torch.bool)
+    field.occupied[2:, 4:, 2:6] = True
+    volume = field.volume()
+    assert not volume[:2].any()
+    assert bool(volume.any())
+    torch.testing.assert_close(field.sampled(1.0), volume, rtol=1e-4, atol=1e-5)
+    fine, coarse = field.sampled(0.5), field.sampled(2.0)
+    assert fine.shape == (12, 16, 20)
+    assert coarse.shape == (3, 4, 5)
+    # the sum of line integrals over pixels of equal size; a wrong power of the ratio would be a factor of two
+    assert float(coarse.sum() * 4) == pytest.approx(float(volume.sum()), rel=0.25)
+    assert float(fine.sum() / 4) == pytest.approx(float(volume.sum()), rel=0.25)
+    with pytest.raises(ValueError, match="ratio"):
+        field.sampled(0.0)
 
 
 class Swapped(VoxelField):

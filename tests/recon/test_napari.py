@@ -68,7 +68,7 @@ def test_layer_is_reconstructed_with_progress(needle):
         method="tv",
         thickness=16,
         num_steps=8,
-        progress=lambda done, total, note: steps.append((done, total)),
+        progress=lambda task, done, total, note: steps.append((done, total)),
     )
     assert volume.shape == (16, 6, 64)
     assert result["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][-1]] * 3)

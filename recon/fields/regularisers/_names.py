@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from pkgutil import iter_modules
 
-from noiseflow.plugins import plugins
+from noiseflow.plugins import names_of
 
 GROUP = "noiseflow.regularisers"
 DEFAULT = "directional"
@@ -14,6 +13,4 @@ DEFAULT = "directional"
 
 def regulariser_names() -> list[str]:
     """All regularisers of this package, then those of other packages (entry points ``noiseflow.regularisers``)."""
-    own = [module.name for module in iter_modules([str(Path(__file__).parent)])]
-    names = sorted(name.replace("_", "-") for name in own if not name.startswith("_") and name != "base")
-    return [DEFAULT, *(name for name in names if name != DEFAULT), *sorted(plugins(GROUP))]
+    return names_of(Path(__file__).parent, GROUP, first=DEFAULT)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
-from noiseflow.plugins import load_plugin, plugins
+from noiseflow.plugins import provided
 from recon.fields.regularisers._names import GROUP, regulariser_names
 from recon.fields.regularisers.base import Regulariser
 
@@ -18,9 +16,7 @@ def find_regulariser(name: str) -> Regulariser:
     """
     if name not in regulariser_names():
         raise ValueError(f"--regulariser {name}: choose one of {', '.join(regulariser_names())}")
-    other = plugins(GROUP).get(name)
-    own = f"recon.fields.regularisers.{name.replace('-', '_')}"
-    made = import_module(own).REGULARISER() if other is None else load_plugin(other)()
+    made = provided(name, "recon.fields.regularisers", GROUP, "REGULARISER")()
     if not isinstance(made, Regulariser):
         raise TypeError(
             f"regulariser {name} is a {type(made).__name__}; derive it from recon.fields.regularisers.Regulariser"

@@ -1,55 +1,16 @@
-"""Components of Kniesel et al. (CVPR 2022): coordinate networks, noise model, and ray sampling."""
+"""Noise model and ray sampling of Kniesel et al. (CVPR 2022)."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from noiseflow.distributions.base import LatentDistribution
-from noiseflow.distributions.transforms import Radial
+from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.numerics.monotone_maps import Radial
 from noiseflow.models.base import NoiseModelBase
 
 _PARAMETER_RANGE = 10.0
-
-
-class CoordinateDensity(nn.Module):
-    """Density in (0, 1) at points of the cube [-1, 1]³: fully connected layers on a positional encoding, with a final sigmoid.
-
-    Args:
-        frequencies: number of octaves of the encoding, with sine and cosine each.
-        layers: number of hidden layers, with ReLU activations.
-        width: width of the hidden layers.
-        skip: number of hidden layers after which the encoding is concatenated again; 0 for none.
-    """
-
-    def __init__(self, frequencies: int = 10, layers: int = 9, width: int = 256, skip: int = 5) -> None:
-        super().__init__()
-        self.frequencies, self.skip = frequencies, skip
-        encoded = 6 * frequencies
-        sizes = [encoded, *[width] * (layers - 1)]
-        if skip:
-            sizes[skip] += encoded
-        self.hidden = nn.ModuleList(nn.Linear(size, width) for size in sizes)
-        self.last = nn.Linear(width, 1)
-
-    def forward(self, points: Tensor) -> Tensor:
-        """Density (...) at points (..., 3)."""
-        encoded = self.encode(points)
-        values = encoded
-        for index, layer in enumerate(self.hidden):
-            if self.skip and index == self.skip:
-                values = torch.cat([encoded, values], -1)
-            values = functional.relu(layer(values))
-        return torch.sigmoid(self.last(values)).squeeze(-1)
-
-    def encode(self, points: Tensor) -> Tensor:
-        """Sines and cosines of π·2ᵏ times each coordinate, (..., 6·frequencies)."""
-        octaves = math.pi * 2.0 ** torch.arange(self.frequencies, dtype=points.dtype, device=points.device)
-        phases = (points[..., None, :] * octaves[:, None]).flatten(-2)
-        return torch.cat([torch.sin(phases), torch.cos(phases)], -1)
 
 
 class PaperFlow(NoiseModelBase):

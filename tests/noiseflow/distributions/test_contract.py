@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.models.around import as_noise_model
+from noiseflow.models.wrapper import as_noise_model
 from tests.contracts import (
     check_bad_values,
     check_distribution,
@@ -94,7 +94,7 @@ def test_functional_transforms_agree_with_differences(name: str) -> None:
 @pytest.mark.parametrize("name", ["radial", "spline", "mixture", "8-bit spline", "8-bit detector", "physics and flow"])
 def test_many_pixels_have_the_likelihood_and_gradient_of_few(name: str) -> None:
     """Large inputs are evaluated in pieces, whose graphs are made again in the backward pass."""
-    from noiseflow.distributions.answers import MOST
+    from noiseflow.distributions.conventions import MOST
 
     model, generator = MODELS[name](), torch.Generator().manual_seed(0)
     few = torch.rand(4000, generator=generator)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import noiseflow
-from noiseflow.distributions.digitised import DigitisedDistribution
+from noiseflow.distributions.wrappers.digitised import DigitisedDistribution
 
 WIDTH = 0.31
 SIGNALS = torch.tensor([-0.2, 0.13, 0.5, 1.4], dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import noiseflow
-from noiseflow.distributions.law import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 
 SCALE, SHIFT = 2.5, -0.75
 

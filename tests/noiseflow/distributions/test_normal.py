@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from noiseflow.distributions.normal import (
+from noiseflow.distributions.numerics.normal import (
     hazard_of,
     log_normal_cdf,
     log_normal_interval,

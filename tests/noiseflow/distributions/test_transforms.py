@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from noiseflow.distributions.transforms import Affine, Radial, Spline, StudentTail, _expm1_ratio, _log1p_ratio
+from noiseflow.distributions.numerics.monotone_maps import (
+    Affine,
+    Radial,
+    Spline,
+    StudentTail,
+    _expm1_ratio,
+    _log1p_ratio,
+)
 from noiseflow.models.flow import Layer, affine_layer, radial_layer, spline_layer, tail_layer
 from tests.contracts import check_transform
 

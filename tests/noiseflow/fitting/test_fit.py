@@ -286,7 +286,7 @@ def test_a_joint_fit_begins_with_small_steps_where_it_is_told_to(warm_up, first)
     signal_model = noiseflow.StaticScene(observation)
     before, moved = signal_model.scene.detach().clone(), []
 
-    def progress(step, note):
+    def progress(task, step, total, note):
         moved.append(float((signal_model.scene - before).abs().max()))
 
     groups = [{"params": [signal_model.scene], "lr": 0.05}]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noiseflow
-from noiseflow.fitting.pixels import FitPixels, thinned
+from noiseflow.fitting.pixel_split import FitPixels, thinned
 
 
 def drawn(seed: int, shape: tuple[int, ...], share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Generator]:

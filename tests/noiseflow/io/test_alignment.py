@@ -68,7 +68,7 @@ def test_angles_beside_the_stack(tmp_path: Path, stack: str, beside: list[str], 
     for number, name in enumerate(beside, 1):
         text = f"[ZValue = 0]\nTiltAngle = {number}\n" if name.endswith("mdoc") else f"{number}\n"
         (tmp_path / name).write_text(text)
-    found = io.tilt_angles_of(tmp_path / stack, io.ImageFile(IMAGES))
+    found = io.tilt_angles_of(tmp_path / stack, io.ImageFile(IMAGES[:1]))
     assert list(found) == [1 + beside.index(expected)]
 
 
@@ -112,7 +112,7 @@ def test_angles_of_two_full_turns_are_the_largest(tmp_path: Path, text: str) -> 
 def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
     folder = tmp_path / "tilts"
     folder.mkdir()
-    image = io.ImageFile(IMAGES)
+    image = io.ImageFile(IMAGES[:1])
     (folder / "any.rawtlt").write_text("1\n")
     assert io.tilt_angles_of(folder, image).tolist() == [1.0]
     (folder / "other.mdoc").write_text("[ZValue = 0]\nTiltAngle = 2\n")
@@ -129,3 +129,20 @@ def test_an_mdoc_tells_nothing_before_its_first_section(tmp_path: Path) -> None:
         "TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n"
     )
     assert io.read_angles(tmp_path / "a.mdoc").tolist() == [1.5, -2.0]
+
+
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [
+        (["DateTime = 12-May-20 14:00:05", "DateTime = 12-May-20  14:00:45"], [0, 40]),
+        (["DateTime = 2020-05-12 14:00:05", "DateTime = 2020-05-12 13:59:55"], [10, 0]),
+        (["PriorRecordDose = 3.5", "PriorRecordDose = 0"], [3.5, 0]),
+        (["DateTime = yesterday", "DateTime = today"], None),
+        (["ExposureTime = 1", "ExposureTime = 1"], None),
+    ],
+)
+def test_an_mdoc_tells_when_images_were_taken(tmp_path: Path, entries: list[str], expected: list[float] | None) -> None:
+    sections = (f"[ZValue = {n}]\nTiltAngle = {n}\n{entry}\n" for n, entry in enumerate(entries))
+    (tmp_path / "a.mdoc").write_text("".join(sections))
+    found = io.read_tilts(tmp_path / "a.mdoc").acquired
+    assert (None if found is None else list(found - found.min())) == expected

@@ -61,7 +61,6 @@ def test_wrong_machine_stamp_is_found_out(tmp_path: Path, order: str) -> None:
     ("fields", "expected"),
     [
         ({"extra2": imod()}, "u1"),
-        ({"extra2": imod(signed=True)}, "i1"),
         ({"dmax": 255.0}, "u1"),
         ({"dmin": -128.0, "dmax": 127.0}, "i1"),
     ],
@@ -70,6 +69,49 @@ def test_bytes_are_signed_as_the_file_says(tmp_path: Path, fields: dict, expecte
     data = np.arange(250, 256, dtype="u1").reshape(1, 2, 3)
     image = io.read(write(tmp_path / "a.mrc", data, 0, **fields))
     np.testing.assert_array_equal(image.data, data.view(expected)[0])
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("flags", [1, 3])
+def test_signed_bytes_of_imod_are_grey_levels_less_128(tmp_path: Path, flags: int, order: str, mapped: bool) -> None:
+    grey = np.arange(0, 240, 4, dtype="u1").reshape(3, 4, 5)
+    stored = (grey.astype("i2") - 128).astype("i1")
+    path = write(tmp_path / "a.mrc", stored, 0, order=order, extra2=imod(order, signed=flags), dmin=-128.0, dmax=108.0)
+    image = io.read(path, mapped=mapped)
+    assert image.data.dtype == np.uint8
+    np.testing.assert_array_equal(image.data, grey)
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_unsigned_pixels_without_statistics_are_told_from_signed_ones(tmp_path: Path, kind: str) -> None:
+    top = np.iinfo(kind).max
+    y, x = np.mgrid[:32, :32] / 31
+    noise = np.random.default_rng(0).normal(0, 0.05, (3, 32, 32))
+    grey = (top * np.clip(0.5 * (x + y) + noise, 0, 1)).astype(kind)
+    signed = (top * np.clip(0.25 * (x + y - 1) + noise, -0.5, 0.5)).astype(kind.replace("u", "i"))
+    mode = {"u1": 0, "u2": 1}[kind]
+    for data in (grey, signed):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            image = io.read(write(tmp_path / "a.mrc", data, mode))
+        np.testing.assert_array_equal(image.data, data)
+        assert image.data.dtype == data.dtype
+        assert len(caught) == (data.dtype == np.uint16)
+
+
+def test_sections_beyond_the_header_are_not_dropped_in_silence(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mrc", STACK.astype("i2"), 1, nz=2, mz=2)
+    with pytest.warns(UserWarning, match="room for 1 more"):
+        assert len(io.read(path).data) == 2
+
+
+def test_one_volume_of_a_stack_of_volumes_is_chosen(tmp_path: Path) -> None:
+    volumes = np.arange(120).reshape(6, 4, 5)
+    path = write(tmp_path / "a.mrc", volumes.astype("i2"), 1, ispg=401, mz=3)
+    with pytest.raises(io.SeveralImages):
+        io.read(path)
+    np.testing.assert_array_equal(io.read(path, channel=1).data, volumes[3:])
 
 
 @pytest.mark.parametrize("mode", [3, 4, 16, 101])
@@ -206,8 +248,6 @@ def test_one_section_of_a_stack_is_an_image(tmp_path: Path, space_group: int, sh
         ({"dmax": 127.5}, "u1"),
         ({"dmax": float("nan")}, "i1"),
         ({"extra2": imod(signed=2)}, "u1"),  # another flag of IMOD's
-        ({"extra2": imod(signed=3)}, "i1"),
-        ({"extra2": imod(signed=True), "dmax": 255.0}, "i1"),
     ],
 )
 @pytest.mark.parametrize("order", ["<", ">"])

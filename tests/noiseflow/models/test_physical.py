@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 import noiseflow
-from noiseflow.distributions import electrons
-from noiseflow.distributions.base import log_normal_cdf
-from noiseflow.distributions.electrons import log_both_tails, log_density, log_interval
+from noiseflow.distributions.electrons import exact as electrons
+from noiseflow.distributions.electrons.exact import log_both_tails, log_density, log_interval
+from noiseflow.distributions.numerics.normal import log_normal_cdf
 from noiseflow.models.physics_distribution import ndtri_exp
 from recon.simulate.noises import CountingNoise
 from tests.contracts import check_noise_model, integrate_density

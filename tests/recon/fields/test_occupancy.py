@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from noiseflow import Gaussian
-from recon.fields.coordinate_network import CoordinateNetwork
-from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
@@ -24,7 +25,7 @@ from recon.simulate.simulation import add_noise, clean_tilt_series
 def field():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return CoordinateNetwork((8, 10, 12), scale=0.1, width=16, layers=3, frequencies=4, skip=1)
+        return CoordinateNetwork((8, 10, 12), scale=0.1, width=16)
 
 
 def signal_model(field, occupancy, weight=0.3):
@@ -67,7 +68,7 @@ def everything():
 
 def test_network_agrees_with_itself_at_single_places(field):
     places = torch.tensor([0, 7, 119, 959])
-    torch.testing.assert_close(field.at(places), field.units().reshape(-1)[places])
+    torch.testing.assert_close(field.of_voxels(places), field.units().reshape(-1)[places])
     field.start_from(torch.full((8, 10, 12), 0.02))
     assert float(field.volume().mean()) == pytest.approx(0.02, rel=0.5)
 
@@ -185,7 +186,7 @@ def test_what_the_data_wants_becomes_occupied_and_nothing_else():
     truth[6:10, 5:11, 7:12] = 0.1
     projector = SliceProjector(tilt_angles=[-60.0, -30.0, 0.0, 30.0, 60.0], depth=16, width=16)
     observed = torch.exp(-projector(truth)).transpose(1, 2).reshape(-1)
-    field = CoordinateNetwork((16, 16, 16), scale=0.1, width=8, layers=2, frequencies=2, skip=0)
+    field = CoordinateNetwork((16, 16, 16), scale=0.1, width=8, layers=2)
     occupancy = Occupancy(torch.zeros(2, 2, 2), (16, 16, 16))
     occupancy.mask[0, 0, 0] = True
     model = TomographySignal(field, projector, Transmission(), weight=0.2, occupancy=occupancy)
@@ -216,7 +217,7 @@ def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
     density = shells(16, generator=np.random.default_rng(1), count=2)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 20.0))
     noisy = add_noise(clean, Gaussian(0.5 * float(clean.images.std())), seed=0)
-    make = partial(CoordinateNetwork, width=8, layers=2, frequencies=2, skip=0)
+    make = partial(CoordinateNetwork, width=8, layers=2)
     grid = VolumeGrid.of(noisy)
     first, second, plain = (
         JointReconstructor(make_field=make, skip_vacuum=skip).signal_model(noisy, grid) for skip in (True, True, False)

@@ -10,7 +10,8 @@ from torch.nn import functional
 
 from benchmarks.scenes import make_scene
 from noiseflow import Gaussian
-from recon.fields.fields import MultiresolutionField, VoxelField
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation
 from recon.joint import half_resolution
@@ -170,7 +171,7 @@ def test_a_fit_stopped_at_half_the_resolution_goes_on(tmp_path):
     fit = JointReconstructor(weight=0.4, noise_model=Gaussian, num_steps=16, slab=4)
     stopped = []
 
-    def stop(done, total, note):
+    def stop(task, done, total, note):
         if note.startswith("begin"):
             stopped.append(done)
             raise KeyboardInterrupt

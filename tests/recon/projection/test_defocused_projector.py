@@ -11,7 +11,13 @@ from benchmarks.scenes import make_scene
 from recon.joint.joint import JointReconstructor
 from recon.methods import _registry as methods
 from recon.metrics.metrics import compare
-from recon.projection.defocused_projector import DefocusedProjector, jittered_projection, with_defocus
+from recon.projection.defocused_projector import (
+    KERNELS,
+    DefocusedProjector,
+    ImageDefocusedProjector,
+    jittered_projection,
+    with_defocus,
+)
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.series.tilt_series import VolumeGrid
@@ -45,6 +51,34 @@ def test_point_is_blurred_by_its_distance_from_the_focal_plane():
         along_y = image.sum(1) / image.sum()
         spread = math.sqrt(float((along_y * position**2).sum()))
         assert spread == pytest.approx(0.15 * abs(distance), abs=0.13)  # half a layer
+
+
+def test_blur_in_the_image_is_that_of_the_paper():
+    """A pixel at distance d from the axis has a Gaussian of tan(tilt)·d, whatever the depth of what it shows."""
+    operator = ImageDefocusedProjector(projector(41, 61), 0.15)
+    position = torch.arange(61, dtype=torch.float64) - 30
+    columns = torch.zeros(41 * 61, 61, dtype=torch.float64)
+    columns[:, 30] = 1.0  # one slice of constant attenuation: along y, the image of each pixel is its kernel
+    images = operator.project(columns).view(len(ANGLES), 61, 61)
+    sharp = projector(41, 61).project(columns).view(len(ANGLES), 61, 61).sum(2)
+    for angle, image, line in zip(np.deg2rad(ANGLES), images, sharp, strict=True):
+        for u in (2, 10, 25, 40, 58):
+            if line[u] > 0:
+                share = image[u] / image[u].sum()
+                deviation = math.sqrt(float((share * position**2).sum()))
+                expected = 0.15 * min(abs(math.tan(angle) * (u - 30)), math.hypot(40, 60) / 2)
+                # half a step; a sampled Gaussian of a quarter of a pixel is a single pixel
+                assert deviation == pytest.approx(expected, abs=0.13 if expected > 0.4 else 0.4)
+
+
+def test_both_kernels_agree_on_a_thin_specimen():
+    volume = torch.zeros(1, 31, 31, dtype=torch.float64)
+    volume[0, 15, 4:28:6] = 1.0
+    sharp = SliceProjector(tilt_angles=[-30.0, 45.0], depth=1, width=31, dtype=torch.float64)
+    depth, image = (with_defocus(sharp, 0.2, kernel)(volume) for kernel in KERNELS)
+    # both round widths, to the quarter of a pixel or its middle: 0.125 of 1 to 2 pixels
+    assert float((depth - image).square().mean()) < 0.05 * float(depth.square().mean())
+    assert float((sharp(volume) - image).square().mean()) > 0.2 * float(depth.square().mean())
 
 
 def test_exact_and_jittered_blur_agree():

@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from recon.fields.fields import Field, MultiresolutionField, VoxelField
+from recon.fields.fields import Field
+from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers import total_variation
 from recon.fields.upsampling import upsample
 from recon.projection.projector import SliceProjector

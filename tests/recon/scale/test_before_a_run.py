@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.commands.running import chosen_slices
-from recon.fields.fields import MultiresolutionField
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
 from recon.scale.blocks import HALO, SETTLED_ON, blocks, fitted_slices

@@ -16,7 +16,7 @@ from benchmarks.needle import load as load_needle
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.commands.measure import measure
-from recon.fields.fields import VoxelField
+from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers import Regulariser
 from recon.joint.signal_model import TomographySignal
 from recon.methods import reconstruct

@@ -27,7 +27,9 @@ def seen(change: Array, *, first_row: float = 0.0, noise: float = 0.002) -> Resi
         size=images.shape
     )
     height = first_row + np.arange(ROWS)
-    return Residuals(images + residual, images, residual, np.linspace(-60, 60, TILTS), height)
+    return Residuals(
+        images + residual, images, residual, np.ones(images.shape, bool), np.linspace(-60, 60, TILTS), height
+    )
 
 
 @pytest.mark.parametrize("first_row", [-ROWS / 2, 230.0])
@@ -55,6 +57,13 @@ def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int,
     images = gaussian_filter(generator.normal(size=(TILTS, ROWS, width)), (4, 3, 3))
     images /= images.std()
     residual = 0.3 * np.gradient(images, axis=2) + 0.1 * generator.normal(size=images.shape)
-    residuals = Residuals(images + residual, images, residual, np.linspace(-60, 60, TILTS), np.arange(ROWS))
+    residuals = Residuals(
+        images + residual,
+        images,
+        residual,
+        np.ones(images.shape, bool),
+        np.linspace(-60, 60, TILTS),
+        np.arange(ROWS),
+    )
     _, findings = image_findings(residuals, distortions(residuals))
     assert ("alignment" in {finding.subject for finding in findings}) == told

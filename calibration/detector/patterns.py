@@ -1,0 +1,130 @@
+"""Noise that differs between parts of the field: shading corrections, gains of amplifiers, rows, columns or colour filters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibration.detector.residual import Residual
+from calibration.exposures.frames import Image
+from noiseflow.described import described
+
+CHANCE = 6.0
+"""Standard errors of the χ² of noise above which a pattern is significant. The χ² of 13 patterns exceed it once in 10⁴ sets."""
+
+LEAST_PIXELS = 100
+"""Fewest pixels of a class; their mean square is then known to 14 %."""
+
+Groups = Callable[[Any, Any, tuple[int, ...]], Any]
+
+
+def _modulo(axis: int, period: int) -> Groups:
+    return lambda y, x, shape: (y, x)[axis] % period
+
+
+AMPLIFIERS: dict[str, Groups] = {
+    "left and right halves": lambda y, x, shape: (2 * x >= shape[1]).astype(int),
+    "upper and lower halves": lambda y, x, shape: (2 * y >= shape[0]).astype(int),
+    "quadrants": lambda y, x, shape: 2 * (2 * y >= shape[0]) + (2 * x >= shape[1]),
+}
+"""Parts of the field that may have amplifiers of their own: functions of row, column and frame shape."""
+
+MOSAICS: dict[str, Groups] = {
+    "every second column": _modulo(1, 2),
+    "every second row": _modulo(0, 2),
+    "2 × 2 mosaic": lambda y, x, shape: 2 * (y % 2) + x % 2,
+    "every third column": _modulo(1, 3),
+    "every third row": _modulo(0, 3),
+    "every fourth column": _modulo(1, 4),
+    "every fourth row": _modulo(0, 4),
+}
+"""Classes of pixels that repeat, and may have amplifiers or filters of their own."""
+
+
+@described(relative="of the noise variance", error="of the noise variance")
+@dataclass(frozen=True)
+class Pattern:
+    """Dependence of the noise variance on the place, at equal signal.
+
+    Attributes:
+        name: ``"field"`` for a smooth dependence, else one of `AMPLIFIERS` or `MOSAICS`; empty if there is none.
+        relative: relative deviation (rms) of the variance; 0 if not significant.
+        error: its standard error.
+        factors: (C,) variance of each class over the mean.
+    """
+
+    name: str = ""
+    relative: float = 0.0
+    error: float = 0.0
+    factors: tuple[float, ...] = ()
+
+
+def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Pattern:
+    """Find the pattern that explains most of the differences of the noise variance over the field.
+
+    Args:
+        residuals: standardised residuals of frames of equal size.
+        inflation: factor of the standard error of a variance due to correlation between pixels.
+    """
+    shape = residuals[0].mask.shape
+    total, number, known, fourth = np.zeros((4, *shape))
+    for one in residuals:
+        squares = (one.z**2 * one.mask).reshape(-1, *shape)
+        mean = max(float(squares.sum()) / max(float(one.mask.sum()) * len(squares), 1.0), np.finfo(float).tiny)
+        relative = np.where(one.mask, squares / mean - 1, 0.0)
+        total, number = total + relative.sum(0), number + len(squares) * one.mask
+        fourth = fourth + inflation**2 * (relative**2).sum(0)
+        if one.expected is not None:
+            known = known + np.where(one.mask, one.expected / one.expected[one.mask].mean() - 1, 0.0) * len(squares)
+    found = [(name, *_of_classes(total, number, group, fourth)) for name, group in AMPLIFIERS.items()]
+    # only classes that are everywhere see the same scene, so that the line of variance may replace the levels
+    found += [(name, *_of_classes(total - known, number, group, fourth)) for name, group in MOSAICS.items()]
+    found.append(("field", *_of_field(total, number, fourth)))
+    name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
+    return Pattern(name, deviation, error, factors) if excess > CHANCE else Pattern()
+
+
+Found = tuple[float, float, float, tuple[float, ...]]
+"""Excess of χ² in its standard errors, relative deviation (rms) and its standard error, factors of the classes."""
+
+NOTHING: Found = (0.0, 0.0, 0.0, ())
+
+
+def _of_classes(total: Image, number: Image, group: Groups, fourth: Image) -> Found:
+    """Compare the mean squares of classes; `fourth` is the sum of squared relative squares, the variance of `total`."""
+    y, x = np.indices(total.shape)
+    label = group(y, x, total.shape).ravel()
+    count = np.bincount(label, number.ravel())
+    if len(count) < 2 or count.min() < LEAST_PIXELS:
+        return NOTHING
+    mean = np.bincount(label, total.ravel()) / count
+    mean -= np.average(mean, weights=count)
+    variance = np.bincount(label, fourth.ravel()) / count**2
+    freedom = len(mean) - 1
+    chi_squared = float(np.sum(mean**2 / np.maximum(variance, np.finfo(float).tiny))) * freedom / len(mean)
+    usual = float(np.average(variance, weights=count)) * freedom
+    deviation = np.sqrt(max(float(np.average(mean**2, weights=count)) - usual, 0.0))
+    factors = tuple(float(1 + one) for one in mean)
+    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), factors
+
+
+def _of_field(total: Image, number: Image, fourth: Image) -> Found:
+    """Fit a second-order polynomial of the position, with errors that allow for another scatter in each pixel (White)."""
+    if number.sum() < 10 * LEAST_PIXELS or min(total.shape) < 8:
+        return NOTHING
+    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(total.shape), total.shape, strict=True))
+    weight = number.ravel()
+    terms = np.stack([term.ravel() for term in (x, y, x * x, x * y, y * y)])
+    terms -= (terms @ weight / weight.sum())[:, None]
+    gram = np.linalg.inv(terms * weight @ terms.T)
+    coefficients = gram @ (terms @ (total.ravel() - weight * total.sum() / weight.sum()))
+    covariance = gram @ (terms * fourth.ravel() @ terms.T) @ gram
+    freedom = len(terms)
+    chi_squared = float(coefficients @ np.linalg.solve(covariance, coefficients))
+    shape = coefficients @ terms
+    usual = float(np.sum(weight * np.einsum("ip,ij,jp->p", terms, covariance, terms)) / weight.sum())
+    deviation = np.sqrt(max(float(np.average(shape**2, weights=weight)) - usual, 0.0))
+    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), ()

@@ -1,0 +1,289 @@
+"""Noises whose law is known exactly and that no model of the library contains: half to develop on, half to judge on.
+
+Each is a family of laws p(observation | signal), with draws, and nodes and exact log-densities (or log-probabilities of levels)
+for the divergence of a fitted model by quadrature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import nn
+
+Array = NDArray[np.float64]
+_PANELS, _ORDER, _TAIL = 400, 6, 1e-10
+
+
+@dataclass(frozen=True)
+class Law:
+    """A conditional law.
+
+    Args:
+        title: what it is.
+        draw: function from signals and a NumPy generator to observations.
+        log_prob: function from a signal and (Q,) observations to log-densities or log-probabilities.
+        ends: function from a signal to the range of observations; or for discrete laws, to all their levels.
+        levels: whether the law is discrete.
+        signals: range of the signals.
+        masses: observations with a probability of their own beside a density, such as clipping limits.
+    """
+
+    title: str
+    draw: Callable[[Array, np.random.Generator], Array]
+    log_prob: Callable[[float, Array], Array]
+    ends: Callable[[float], Any]
+    levels: bool = False
+    signals: tuple[float, float] = (0.2, 1.0)
+    masses: tuple[float, ...] = ()
+
+    def data(self, count: int, seed: int) -> tuple[Array, Array]:
+        """Signals, uniform over their range, and observations."""
+        random = np.random.default_rng(seed)
+        signal = random.uniform(*self.signals, count)
+        return signal, self.draw(signal, random)
+
+    def nodes(self, signal: float) -> tuple[Array, Array, Array]:
+        """Observations, their exact log-probabilities or log-densities, and the weights of the integral over the law."""
+        if self.levels:
+            value = np.asarray(self.ends(signal), float)
+            log_prob = self.log_prob(signal, value)
+            return value, log_prob, np.exp(log_prob)
+        low, high = self.ends(signal)
+        edges = np.linspace(low, high, _PANELS + 1)
+        node, weight = np.polynomial.legendre.leggauss(_ORDER)
+        half = (edges[1] - edges[0]) / 2
+        value = ((edges[:-1] + half)[:, None] + half * node).ravel()
+        log_prob = self.log_prob(signal, value)
+        share = np.exp(log_prob) * np.tile(half * weight, _PANELS)
+        if self.masses:
+            limits = np.array(self.masses)
+            mass = self.log_prob(signal, limits)
+            return np.append(value, limits), np.append(log_prob, mass), np.append(share, np.exp(mass))
+        return value, log_prob, share
+
+
+@torch.no_grad()
+def divergence(law: Law, model: nn.Module, *, num_signals: int = 48) -> float:
+    """Kullback–Leibler divergence of a model from the law, nats per pixel, by quadrature: the mean over evenly spaced signals."""
+    low, high = law.signals
+    total = []
+    for signal in low + (high - low) * (np.arange(num_signals) + 0.5) / num_signals:
+        value, log_prob, share = law.nodes(float(signal))
+        at = torch.full((value.size,), float(signal), dtype=torch.float64)
+        found = model(at.float()).log_prob(torch.from_numpy(value).float()).double().numpy()
+        inside = share > 0
+        total.append(float(np.sum(share[inside] * (log_prob - found)[inside]) / share.sum()))
+    return float(np.mean(total))
+
+
+def _scipy(
+    title: str, at: Callable[[Any], Any], *, levels: bool = False, signals: tuple[float, float] = (0.2, 1.0)
+) -> Law:
+    """A law of `scipy.stats`, frozen at each signal."""
+
+    def ends(signal: float) -> Any:
+        first, last = at(signal).ppf([_TAIL, 1 - _TAIL])
+        return np.arange(first, last + 1) if levels else (first, last)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        frozen = at(signal)
+        return np.asarray(frozen.logpmf(value) if levels else frozen.logpdf(value))
+
+    return Law(title, lambda s, random: at(s).rvs(random_state=random), log_prob, ends, levels, signals)
+
+
+def _mixed(title: str, parts: Callable[[Any], list[tuple[float, Any]]]) -> Law:
+    """A continuous mixture of laws of `scipy.stats`; `parts` gives shares and frozen laws at each signal."""
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        found = parts(signal)
+        chosen = random.choice(len(found), signal.size, p=[share for share, _ in found])
+        return np.choose(chosen, [law.rvs(size=signal.size, random_state=random) for _, law in found])
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.asarray(np.logaddexp.reduce([np.log(share) + law.logpdf(value) for share, law in parts(signal)]))
+
+    def ends(signal: float) -> tuple[float, float]:
+        ends = [law.ppf([_TAIL, 1 - _TAIL]) for _, law in parts(signal)]
+        return min(first for first, _ in ends), max(last for _, last in ends)
+
+    return Law(title, draw, log_prob, ends)
+
+
+def _coded(title: str, code: Callable[[Any], Any], decode: Callable[[Any], Any], signals: tuple[float, float]) -> Law:
+    """Poisson counts that are coded, rounded, and decoded: levels that are not equidistant."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        count = np.arange(int(signal + 12 * np.sqrt(signal) + 30))
+        level = np.round(code(count))
+        masses = stats.poisson.pmf(count, signal)
+        return np.log(np.array([masses[level == each].sum() for each in np.round(code(value))]) + 1e-300)
+
+    def ends(signal: float) -> Array:
+        count = np.arange(*stats.poisson.ppf([_TAIL, 1 - _TAIL], signal) + np.array([0, 1]))
+        return np.asarray(decode(np.unique(np.round(code(count)))))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.asarray(decode(np.round(code(random.poisson(signal)))))
+
+    return Law(title, draw, log_prob, ends, levels=True, signals=signals)
+
+
+def _rounded(title: str, log_cdf_below: Callable[[float, Array], Array], draw: Any, reach: Any, signals: Any) -> Law:
+    """Rounded to whole numbers; `log_cdf_below` is the distribution function before."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.log(np.maximum(log_cdf_below(signal, value + 0.5) - log_cdf_below(signal, value - 0.5), 1e-300))
+
+    return Law(title, lambda s, random: np.round(draw(s, random)), log_prob, reach, levels=True, signals=signals)
+
+
+def _growing(signal: Any) -> Any:
+    """A standard deviation that grows like shot noise over read noise."""
+    return np.sqrt(0.03**2 + 0.07**2 * signal)
+
+
+def _clipped(low: float, high: float) -> Law:
+    def log_prob(signal: float, value: Array) -> Array:
+        inside = stats.norm(signal, 2 * _growing(signal))
+        density = inside.logpdf(value)
+        density = np.where(value <= low, inside.logcdf(low), density)
+        return np.asarray(np.where(value >= high, inside.logsf(high), density))
+
+    return Law(
+        "clipped at both ends",
+        lambda s, random: (s + 2 * _growing(s) * random.standard_normal(s.size)).clip(low, high),
+        log_prob,
+        lambda s: (low, high),
+        signals=(0.0, 1.0),
+        masses=(low, high),
+    )
+
+
+def _zero_inflated(share: float) -> Law:
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.log((1 - share) * stats.poisson.pmf(value, signal) + share * (value == 0))
+
+    return Law(
+        "zero-inflated Poisson",
+        lambda s, random: random.poisson(s) * (random.random(s.size) > share),
+        log_prob,
+        lambda s: np.arange(0, stats.poisson.ppf(1 - _TAIL, s) + 1),
+        levels=True,
+        signals=(1.0, 15.0),
+    )
+
+
+def _electron_cdf(gain: float, read_noise: float) -> Callable[[float, Array], Array]:
+    def cdf(signal: float, value: Array) -> Array:
+        rate = signal / gain
+        count = np.arange(int(rate + 12 * np.sqrt(rate) + 30))
+        return np.asarray(
+            stats.norm.cdf((value[:, None] - gain * count) / (gain * read_noise)) @ stats.poisson.pmf(count, rate)
+        )
+
+    return cdf
+
+
+def _low_counts(gain: float = 8.0, read_noise: float = 0.25) -> Law:
+    return _rounded(
+        "low counts, rounded",
+        _electron_cdf(gain, read_noise),
+        lambda s, random: gain * (random.poisson(s / gain) + read_noise * random.standard_normal(s.size)),
+        lambda s: np.arange(-20, s + 12 * np.sqrt(gain * s) + 200),
+        (2.0, 40.0),
+    )
+
+
+def _uneven_codes() -> Law:
+    """A converter whose odd codes are a third wider than its even ones."""
+
+    def edge(code: Any) -> Any:
+        return code - 0.5 - np.where(np.mod(code, 2) == 1, 1 / 6, -1 / 6) / 2 * 1.0
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law = stats.norm(signal, 2 + 0.02 * signal)
+        return np.log(np.maximum(law.cdf(edge(value + 1)) - law.cdf(edge(value)), 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        value = signal + (2 + 0.02 * signal) * random.standard_normal(signal.size)
+        code = np.round(value)
+        return code - (value < edge(code)) + (value >= edge(code + 1))
+
+    return Law(
+        "uneven codes",
+        draw,
+        log_prob,
+        lambda s: np.arange(np.floor(s - 8 * (2 + 0.02 * s)), s + 8 * (2 + 0.02 * s)),
+        levels=True,
+        signals=(20.0, 200.0),
+    )
+
+
+def laws() -> dict[str, Law]:
+    """Every law by name; those of `JUDGED` were not used to develop the models."""
+    normal = stats.norm
+    return {
+        "log-normal": _scipy("log-normal", lambda s: stats.lognorm(0.2, scale=s * np.exp(-0.02))),
+        "rice": _scipy("Rice", lambda s: stats.rice(s / 0.15, scale=0.15), signals=(0.0, 1.0)),
+        "generalised": _scipy("generalised Gaussian", lambda s: stats.gennorm(1.3, s, 0.05 + 0.1 * s)),
+        "skewed-t": _scipy("skewed t", lambda s: stats.jf_skew_t(3, 6, s, 0.03 + 0.06 * s)),
+        "clipped": _clipped(0.1, 0.9),
+        "root-coded": _coded("√-coded Poisson", lambda k: 2 * np.sqrt(k), lambda c: c**2 / 4, (20.0, 400.0)),
+        "zero-inflated": _zero_inflated(0.1),
+        "negative-binomial": _scipy(
+            "negative binomial", lambda s: stats.nbinom(8, 8 / (8 + s)), levels=True, signals=(3.0, 40.0)
+        ),
+        "spikes": _mixed("cosmic spikes", lambda s: [(0.99, normal(s, _growing(s))), (0.01, stats.expon(s, 0.5))]),
+        "low-counts": _low_counts(),
+        "telegraph": _mixed(
+            "telegraph (two peaks)",
+            lambda s: [(0.7, normal(s, 0.03 + 0 * s)), (0.3, normal(s + 0.08 + 0.05 * s, 0.03 + 0 * s))],
+        ),
+        "laplace": _scipy("Laplace", lambda s: stats.laplace(s, 0.02 + 0.05 * s)),
+        "speckle": _scipy("speckle (4 looks)", lambda s: stats.gamma(4, scale=s / 4)),
+        "gumbel": _scipy("Gumbel", lambda s: stats.gumbel_r(s, 0.03 + 0.05 * s)),
+        "t-by-signal": _scipy(
+            "Student t, 3 to 20 degrees", lambda s: stats.t(3 + 17 * s, s, 0.05 + 0 * s), signals=(0.0, 1.0)
+        ),
+        "binomial": _scipy(
+            "saturating counter (binomial)", lambda s: stats.binom(100, s / 100), levels=True, signals=(5.0, 90.0)
+        ),
+        "log-coded": _coded(
+            "log-coded Poisson", lambda k: 8 * np.log1p(k / 10), lambda c: 10 * np.expm1(c / 8), (20.0, 400.0)
+        ),
+        "uneven-codes": _uneven_codes(),
+        "inverse-gaussian": _scipy("inverse Gaussian", lambda s: stats.invgauss(0.05 / s, scale=s**2 / 0.05)),
+        "three-peaks": _mixed(
+            "three peaks",
+            lambda s: [
+                (0.5, normal(s, 0.02 + 0.01 * s)),
+                (0.3, normal(s + 0.1, 0.02 + 0.01 * s)),
+                (0.2, normal(s - 0.08, 0.02 + 0.01 * s)),
+            ],
+        ),
+        "logistic-outliers": _mixed(
+            "logistic with dead pixels",
+            lambda s: [(0.98, stats.logistic(s, 0.04 + 0 * s)), (0.02, normal(0.0 * s, 0.02))],
+        ),
+    }
+
+
+JUDGED = (
+    "laplace",
+    "speckle",
+    "gumbel",
+    "t-by-signal",
+    "binomial",
+    "log-coded",
+    "uneven-codes",
+    "inverse-gaussian",
+    "three-peaks",
+    "logistic-outliers",
+)

@@ -1,0 +1,145 @@
+"""Checks of arguments: one table of rules for numbers, and the checks of pixels and masks that all functions share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from noiseflow.arrays import as_tensor
+
+Rule = tuple[Callable[[float], bool], str]
+
+_POSITIVE: Rule = (lambda value: 0 < value < math.inf, "a positive number")
+_FINITE: Rule = (math.isfinite, "a finite number")
+_INSIDE: Rule = (lambda value: 0 < value < 1, "a number above 0 and below 1")
+_COUNT: Rule = (lambda value: value >= 1 and value == round(value), "a whole number, at least 1")
+_NONE_OR_MORE: Rule = (lambda value: value >= 0 and value == round(value), "a whole number, at least 0")
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys(("gain", "read_noise", "scale", "variance", "learning_rate"), _POSITIVE),
+    **dict.fromkeys(("offset", "level"), _FINITE),
+    **dict.fromkeys(("held_out", "dead_time"), _INSIDE),
+    **dict.fromkeys(("batch_size", "noise_interval", "num_components", "num_bins", "width"), _COUNT),
+    **dict.fromkeys(("num_signal_bins", "num_groups"), _COUNT),
+    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _NONE_OR_MORE),
+    "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
+    "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
+    "warm_up": (lambda value: 0 <= value < 1, "a share of the steps, at least 0 and below 1"),
+    "excess_factor": (lambda value: 1 < value < math.inf, "a number above 1"),
+    "step": (lambda value: 0 <= value < math.inf, "a positive rounding step, or 0 for clipping without rounding"),
+}
+"""What each argument must be, by its name; the same name means the same everywhere."""
+
+# Rounding by the number format adds spacing²/12 to the variance of signal and observation each; from half a standard deviation
+# on, it changes likelihoods by more than 1e-3 nats per pixel.
+_COARSEST = 0.5
+# A mean residual this many standard errors from 0 shows that the observation is biased; in sixteen groups of unbiased
+# residuals, the largest exceeds 3.5 of them once in a hundred times.
+_BIASED, _UNBIASED = 10.0, 3.5
+_GROUPS, _SAMPLE = 16, 2**16
+
+
+def check(**arguments: Any) -> None:
+    """Check numbers by the rule of their names; None and tensors, such as a mask for ``held_out``, are not checked.
+
+    Raises:
+        ValueError: an argument breaks its rule.
+    """
+    for name, value in arguments.items():
+        if value is None or (hasattr(value, "ndim") and value.ndim > 0):
+            continue
+        holds, wanted = RULES[name]
+        try:
+            good = not isinstance(value, bool | str) and holds(float(value))
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            raise ValueError(f"{name} is {value!r}; give {wanted}")
+
+
+def real(data: Any, name: str) -> Tensor:
+    """An array of any library, or a tensor, of real numbers as a tensor.
+
+    Raises:
+        ValueError: the numbers are complex.
+    """
+    tensor = as_tensor(data)
+    if tensor.is_complex():
+        raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
+    return tensor
+
+
+def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
+    """A mask as a boolean tensor (N,) on the device of the observation; all true if there is none.
+
+    Raises:
+        ValueError: the sizes differ, or the mask holds other values than 0 and 1, such as weights.
+    """
+    if mask is None:
+        return torch.ones(observation.numel(), dtype=torch.bool, device=observation.device)
+    flat = as_tensor(mask).reshape(-1).to(observation.device)
+    if flat.numel() != observation.numel():
+        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    if flat.dtype != torch.bool and not bool(((flat == 0) | (flat == 1)).all()):
+        raise ValueError(f"{name} holds other values than 0 and 1; give True for the pixels that it selects")
+    return flat.bool()
+
+
+def check_precision(signal: Tensor, observation: Tensor) -> None:
+    """Check that the number format resolves the noise of finite (N,) pixels.
+
+    Raises:
+        ValueError: the spacing of the numbers exceeds half a standard deviation of the residuals.
+    """
+    kinds = [each.dtype for each in (signal, observation) if each.is_floating_point()]
+    if not kinds or not signal.numel():
+        return
+    spacing = max(torch.finfo(kind).eps for kind in kinds) * float(observation.abs().max())
+    spread = float((observation.double() - signal.double()).std(correction=0))
+    if 0 < spread * _COARSEST < spacing and not bool((observation == observation.round()).all()):
+        raise ValueError(
+            f"numbers near {float(observation.abs().max()):g} are {spacing:.2g} apart in this precision, and the noise is "
+            f"{spread:.2g}; give float64, or subtract a constant from signal and observation"
+        )
+
+
+def in_single(signal: Tensor, observation: Tensor, use: Tensor) -> tuple[Tensor, Tensor]:
+    """Signal and observation in single precision, or as given if that would not resolve the noise of the pixels `use` (N,)."""
+    single = signal.float(), observation.float()
+    try:
+        check_precision(*(each.reshape(-1)[use] for each in single))
+    except ValueError:
+        return signal, observation
+    return single
+
+
+def check_order(signal: Tensor, observation: Tensor) -> None:
+    """Check that signal and observation, (N,) finite pixels, are not exchanged.
+
+    Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
+    because extreme observations have less extreme signals.
+
+    Raises:
+        ValueError: the first argument is centred on the second at all of sixteen levels, and the second is not on the first.
+    """
+    every = max(1, signal.numel() // _SAMPLE)
+    first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
+    if first.numel() < _GROUPS**2:
+        return
+    if _bias(first, second) > _BIASED and _bias(second, first) < _UNBIASED:
+        raise ValueError(
+            "signal and observation seem to be exchanged: the first argument scatters around the second; give the clean signal "
+            "first and the noisy observation second"
+        )
+
+
+def _bias(given: Tensor, values: Tensor) -> float:
+    """Largest mean of values − given in sixteen groups by the given values, in standard errors."""
+    residual = (values - given)[torch.argsort(given)]
+    groups = torch.tensor_split(residual, _GROUPS)
+    errors = [abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-300) for each in groups]
+    return float(max(errors))

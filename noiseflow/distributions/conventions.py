@@ -1,0 +1,204 @@
+"""Handling of arguments and results shared by all noise distributions.
+
+This module handles data types, NaN and infinity, probabilities outside [0, 1] and shapes that do not broadcast. Large inputs
+are evaluated in pieces; if a gradient is needed, each piece is evaluated again in the backward pass.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from noiseflow.distributions.numerics import automatic_tables
+from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
+
+MOST = 2**18
+"""Pixels evaluated at once. The graph of a flow has about a hundred float64 arrays of this size, 200 MB."""
+
+Method = Callable[..., Tensor]
+
+
+def answering(cls: type) -> None:
+    """Wrap the methods that a class defines so that they handle arguments and results as described above."""
+    for name, wrap in _WRAPPERS.items():
+        method = cls.__dict__.get(name)
+        if callable(method) and not getattr(method, "__isabstractmethod__", False):
+            setattr(cls, name, wrap(method, name))
+    for name in ("mean", "variance"):
+        found = cls.__dict__.get(name)
+        if isinstance(found, property) and found.fget is not None:
+            setattr(cls, name, property(_cast(found.fget), doc=found.__doc__))
+
+
+def _cast(getter: Callable[[Any], Tensor]) -> Callable[[Any], Tensor]:
+    @functools.wraps(getter)
+    def get(self: Any) -> Tensor:
+        return self.cast(getter(self))  # type: ignore[no-any-return]
+
+    return get
+
+
+def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], torch.dtype]:
+    """Values as floating-point tensors of the working type or wider, and the type of the result."""
+    tensors = [
+        v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=self.working_dtype, device=self.device) for v in values
+    ]
+    answer: torch.dtype | None = self.dtype
+    for given, tensor in zip(values, tensors, strict=True):
+        if isinstance(given, Tensor) and tensor.is_floating_point():
+            answer = tensor.dtype if answer is None else torch.promote_types(answer, tensor.dtype)
+    answer = answer or torch.get_default_dtype()
+    working = torch.promote_types(answer, torch.float32)
+    try:
+        shapes = [tensor.shape for tensor in tensors]
+        shape = broadcast_shapes(self.batch_shape, *shapes)
+    except (RuntimeError, ValueError) as error:
+        given_shapes = " and ".join(str(tuple(shape)) for shape in shapes)
+        raise ValueError(
+            f"{name}: a value of shape {given_shapes} does not broadcast with the signal's {tuple(self.batch_shape)}; "
+            "give one observation per pixel, or leading axes for several"
+        ) from error
+    kinds = [torch.promote_types(t.dtype if t.is_floating_point() else working, working) for t in tensors]
+    return [self.widened(t, kind).expand(shape) for t, kind in zip(tensors, kinds, strict=True)], answer
+
+
+def _density(method: Method, name: str) -> Method:
+    @functools.wraps(method)
+    def log_prob(self: Any, value: Any) -> Tensor:
+        (tensor,), answer = _taken(self, name, [value])
+        finite = torch.isfinite(tensor)
+        if self.takes_missing or (not is_traced(tensor) and bool(finite.all())):
+            return _looked_up(method, self, tensor).to(answer)
+        found = _looked_up(method, self, torch.where(finite, tensor, torch.zeros_like(tensor)))
+        instead = torch.where(torch.isnan(tensor), math.nan, -math.inf).to(found)
+        return torch.where(finite, found, instead).to(answer)
+
+    return log_prob
+
+
+def _interval(method: Method, name: str) -> Method:
+    @functools.wraps(method)
+    def log_interval_prob(self: Any, low: Any, high: Any) -> Tensor:
+        bounds, answer = _taken(self, name, [low, high])
+        below, above = bounds
+        proper = below < above
+        if not is_traced(below) and bool(proper.all()):
+            return _in_pieces(method, self, below, above).to(answer)
+        zero = torch.zeros_like(below)
+        found = _in_pieces(method, self, torch.where(proper, below, zero), torch.where(proper, above, zero + 1))
+        instead = torch.where(torch.isnan(below) | torch.isnan(above), math.nan, -math.inf).to(found)
+        return torch.where(proper, found, instead).to(answer)
+
+    return log_interval_prob
+
+
+def _cumulative(method: Method, name: str) -> Method:
+    @functools.wraps(method)
+    def cdf(self: Any, value: Any) -> Tensor:
+        (tensor,), answer = _taken(self, name, [value])
+        finite = torch.isfinite(tensor)
+        if not is_traced(tensor) and bool(finite.all()):
+            return method(self, tensor).to(answer)
+        found = method(self, torch.where(finite, tensor, torch.zeros_like(tensor)))
+        instead = torch.where(torch.isnan(tensor), math.nan, (tensor > 0).to(found.dtype))
+        return torch.where(finite, found, instead).to(answer)
+
+    return cdf
+
+
+def _quantile(method: Method, name: str) -> Method:
+    @functools.wraps(method)
+    def icdf(self: Any, value: Any) -> Tensor:
+        (tensor,), answer = _taken(self, name, [value])
+        inside = (tensor > 0) & (tensor < 1)
+        if not is_traced(tensor):
+            if bool(inside.all()):
+                return method(self, tensor).to(answer)
+            outside = (tensor < 0) | (tensor > 1)
+            if bool(outside.any()):
+                worst = float(tensor[outside].flatten()[0])
+                raise ValueError(f"icdf: {worst:g} is not a probability; give values from 0 to 1")
+        found = method(self, torch.where(inside, tensor, torch.full_like(tensor, 0.5)))
+        low, high = (end.to(found) for end in self.limits)
+        nothing = torch.full_like(found, math.nan)
+        ends = torch.where(tensor == 0, low, torch.where(tensor == 1, high, nothing))
+        return torch.where(inside, found, ends).to(answer)
+
+    return icdf
+
+
+def _draw(method: Method, name: str) -> Method:
+    @functools.wraps(method)
+    def sample(self: Any, sample_shape: Any = (), generator: torch.Generator | None = None) -> Tensor:
+        shape = torch.Size([sample_shape] if isinstance(sample_shape, int) else sample_shape)
+        with torch.no_grad():
+            whole = torch.Size([*shape, *self.batch_shape])
+            found = _drawn_from_table(self, whole, generator)
+            if found is not None:
+                return found
+            if not (self.independent and whole.numel() > MOST) or torch.compiler.is_compiling() or not self.splits:
+                return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
+            parts = self.expand(whole).flat().parts(MOST)
+            return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
+                whole
+            )
+
+    return sample
+
+
+def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator | None) -> Tensor | None:
+    if shape.numel() < automatic_tables.LARGE or torch.compiler.is_compiling() or self.source is None:
+        return None
+    model, signal = self.source
+    if not (hasattr(self, "from_latent") and automatic_tables.may_tabulate(model)):
+        return None
+    found = automatic_tables.sample(model, signal.expand(shape), generator)
+    return None if found is None else self.cast(found)
+
+
+def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
+    """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
+    if value.numel() >= automatic_tables.LARGE and self.source is not None and not self.light:
+        found = automatic_tables.automatic_log_prob(self.source[0], self.source[1], value)
+        if found is not None:
+            return found
+    return _in_pieces(method, self, value)
+
+
+def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
+    """The method's result for values (..., *batch), in pieces of bounded memory if there are many."""
+    shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
+    if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]) or not self.splits:
+        return method(self, *values)
+    whole = self if self.batch_shape == shape else self.expand(shape)
+    split = [torch.split(value.expand(shape).reshape(-1), MOST) for value in values]
+    found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(MOST), *split, strict=True)]
+    return torch.cat(found).reshape(shape)
+
+
+def _again(method: Method, part: Any, *values: Tensor) -> Tensor:
+    """The result for one piece; its graph is not stored but rebuilt in the backward pass."""
+
+    def fresh(*some: Tensor) -> Tensor:  # values cached by a distribution belong to one pass
+        return method(part.mapped(lambda tensor, rest: tensor, part.batch_shape), *some)
+
+    if not torch.is_grad_enabled():
+        return fresh(*values)
+    found: Tensor = checkpoint(fresh, *values, use_reentrant=False, preserve_rng_state=False)
+    return found
+
+
+_WRAPPERS = {
+    "log_prob": _density,
+    "log_interval_prob": _interval,
+    "cdf": _cumulative,
+    "cdf_below": _cumulative,
+    "icdf": _quantile,
+    "sample": _draw,
+}

@@ -1,0 +1,304 @@
+"""The exact distribution of shot plus read noise, in electrons: k + read_noise·n with k Poisson and n standard normal.
+
+Two representations are used. Both are accurate to about 1e-8 nats, at a cost that does not grow with the rate.
+
+*Sum*, if the read noise is below 1.5 electrons: the sum over k. Given an observation, the posterior of k is narrower than the
+read noise, so a dozen integers around its mode suffice. Neighbouring terms differ by a factor that needs no logarithm.
+
+*Contour*, above: the inversion integral of the moment generating function (`electron_contour`), 12 to 24 nodes.
+
+All computations are in float64, because fractions of an electron matter at a million electrons. Free choices of the numerical
+method (window, line) are detached: the result does not depend on them, and neither does its gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from noiseflow.distributions.electrons.contour import (
+    contour_and_slopes,
+    contour_log_interval,
+    contour_log_mass,
+    is_smooth_cell,
+    log_contour_integral,
+    positive_rate,
+    saddle_point,
+    tilted_rate,
+)
+from noiseflow.distributions.electrons.narrow_cells import (
+    LEAST_READ_NOISE,
+    MOST_READ_NOISE,
+    cell_and_slopes,
+    is_narrow,
+    posterior_mode,
+)
+from noiseflow.distributions.electrons.peaks import is_near_peak, peaks_and_slopes
+from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.numerics.normal import log_normal_cdf, log_normal_interval
+
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+RESOLVED = 1.5  # electrons: read noise below which the sum is used
+_FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
+_STRONG = 30.0
+
+
+def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    """Log-density, nats per electron.
+
+    Args:
+        residual: observation − rate, electrons, float64.
+        rate: expected electrons, ≥ 0, float64.
+        read_noise: scalar, electrons, float64.
+    """
+    if _most(read_noise) < RESOLVED:
+        return _lattice_log_density(residual, rate, read_noise)
+    line = saddle_point(residual, rate, read_noise)
+    one = torch.ones_like(line)
+    return log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
+
+
+def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """Log-probability of the tail beyond the observation: above it for residuals > 0, otherwise below it.
+
+    Args:
+        residual: observation − rate, electrons, float64.
+        rate: expected electrons, ≥ 0, float64.
+        read_noise: electrons, float64.
+        twice: always use the contour, because the incomplete gamma functions of the sum have no second derivative.
+    """
+    upper = residual.detach() > 0
+    if not twice and _most(read_noise) < RESOLVED:
+        return _lattice_log_tail(residual, rate, read_noise, upper)
+    side = torch.where(upper, 1.0, -1.0).to(residual)
+    saddle = saddle_point(residual, rate, read_noise)
+    least = 2 / torch.sqrt(tilted_rate(rate, saddle) + read_noise**2).detach()
+    line = side * torch.maximum(side * saddle, least)
+
+    def factor(t: Tensor) -> tuple[Tensor, Tensor]:
+        square = side * (line**2 + t**2)
+        return line / square, -t / square
+
+    return log_contour_integral(residual, rate, read_noise, line, side / line, factor)
+
+
+def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
+    """``(log P(≤ observation), log P(> observation))``; residuals may be infinite."""
+    finite = torch.isfinite(residual)
+    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
+    near = torch.where(finite, near, torch.full_like(near, -math.inf))
+    far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
+    upper = residual > 0
+    return torch.where(upper, far, near), torch.where(upper, near, far)
+
+
+def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """log P(low < residual ≤ high). The bounds (observation − rate, electrons) may be infinite; `twice` as in `log_tail`."""
+    width = high - low
+    if _most(read_noise) < RESOLVED:
+        narrow = width.detach() <= 3
+        direct = _lattice_log_interval
+    else:
+        narrow = is_smooth_cell(low, high, rate, read_noise)
+        direct = contour_log_interval
+    if bool(narrow.all()):
+        return direct(low, high, rate, read_noise)
+    if not bool(narrow.any()):
+        return _log_difference_of_tails(low, high, rate, read_noise, twice=twice)
+    wide, noise = ~narrow, (read_noise, read_noise)
+    if read_noise.ndim:
+        noise = read_noise[narrow], read_noise[wide]
+    near = direct(low[narrow], high[narrow], rate[narrow], noise[0])
+    far = _log_difference_of_tails(low[wide], high[wide], rate[wide], noise[1], twice=twice)
+    return torch.zeros_like(low).masked_scatter(narrow, near).masked_scatter(wide, far)
+
+
+@torch.no_grad()
+def interval_and_slopes(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """`log_interval`, several times faster for narrow cells, with its derivatives with respect to all four arguments.
+
+    Args:
+        low, high, rate: (n,) or () electrons, float64.
+        read_noise: scalar, electrons, float64.
+        slopes: whether to return the derivatives, each shaped like the cells.
+    """
+    if low.ndim == 0:
+        value, parts = interval_and_slopes(low[None], high[None], rate[None], read_noise, slopes=slopes)
+        return value[0], tuple(part[0] for part in parts)
+    sigma = float(read_noise)
+    mode = posterior_mode(low, high, rate, read_noise) if sigma <= MOST_READ_NOISE else rate
+    found = [torch.empty_like(low) for _ in range(5 if slopes else 1)]
+    left, cells = torch.arange(low.numel(), device=low.device), (low, high, rate, mode)
+    for suits, way in _ways(sigma):
+        here = suits(*cells, read_noise)
+        if bool(here.all()):
+            value, parts = way(*cells, read_noise, slopes=slopes)
+            for out, part in zip(found, (value, *parts), strict=True):
+                out[left] = part
+            break
+        if bool(here.any()):
+            value, parts = way(*(each[here] for each in cells), read_noise, slopes=slopes)
+            for out, part in zip(found, (value, *parts), strict=True):
+                out[left[here]] = part
+            left, cells = left[~here], tuple(each[~here] for each in cells)  # type: ignore[assignment]
+    empty = ~torch.isfinite(found[0])
+    if bool(empty.any()):  # far from any electron the fast methods underflow; the general one does not
+        value, parts = _slowly(low[empty], high[empty], rate[empty], read_noise, slopes=slopes)
+        for out, part in zip(found, (value, *parts), strict=True):
+            out[empty] = part
+    return found[0], tuple(found[1:])
+
+
+def _ways(read_noise: float) -> list[tuple[Callable[..., Tensor], Callable[..., Any]]]:
+    """Pairs of a predicate for cells and a method for them: the fastest first, and last the one valid for all cells."""
+    everything = (_always, _without_mode(_slowly))
+    smooth = (_without_mode(is_smooth_cell), _without_mode(contour_and_slopes))
+    if read_noise > MOST_READ_NOISE:
+        return [smooth, everything]
+    narrow = (is_narrow, cell_and_slopes)
+    if read_noise >= RESOLVED:
+        return [narrow, smooth, everything]
+    peaks = (is_near_peak, peaks_and_slopes)
+    return [narrow, peaks, everything] if read_noise >= LEAST_READ_NOISE else [peaks, everything]
+
+
+def _always(low: Tensor, *rest: Tensor) -> Tensor:
+    return torch.ones_like(low, dtype=torch.bool)
+
+
+def _without_mode(function: Callable[..., Any]) -> Callable[..., Any]:
+    def called(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, **options: Any) -> Any:
+        return function(low, high, rate, read_noise, **options)
+
+    return called
+
+
+def _slowly(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    if not slopes or not low.numel():
+        empty = (torch.zeros_like(low),) * 4 if slopes else ()
+        return log_interval(low, high, rate, read_noise), empty
+    with torch.enable_grad():
+        noise = read_noise.expand_as(low).clone()
+        at = [each.detach().clone().requires_grad_() for each in (low, high, rate, noise)]
+        # one copy of the read noise per pixel, so that each has its own derivative
+        value = log_interval(*at)
+        found = torch.autograd.grad(value.sum(), at)
+    return value.detach(), found
+
+
+def _most(read_noise: Tensor) -> float:
+    """The read noise, or the largest of several."""
+    return float(read_noise.detach().max())
+
+
+def _log_difference_of_tails(
+    low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    (below_low, above_low), (below_high, above_high) = (
+        log_both_tails(x, rate, read_noise, twice=twice) for x in (low, high)
+    )
+    right = low > 0
+    across = (low <= 0) & (high > 0)
+    large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)
+    minus_one = torch.full_like(large, -1.0)
+    ratio = torch.where(across | torch.isneginf(small), minus_one, small - large)
+    difference = large + torch.where(torch.isneginf(small), torch.zeros_like(large), _log1mexp(ratio))
+    outside = torch.where(across, below_low.exp() + above_high.exp(), torch.zeros_like(large))
+    return torch.where(across, torch.log1p(-outside), difference)
+
+
+def _log1mexp(value: Tensor) -> Tensor:
+    """log(1 − exp(value)) for value < 0."""
+    return torch.log1p(-torch.exp(value))
+
+
+def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    variance = read_noise**2
+    mode = lattice_mode(residual, rate, variance)
+    gap = residual - (mode - rate)
+    positive, safe = positive_rate(rate)
+    up = tilted_rate(rate, (2 * gap - 1) / (2 * variance) - torch.log(mode + 1))
+    inside = positive & (mode > 0)
+    safe_mode = torch.where(inside, mode, torch.ones_like(mode))
+    exponent = torch.log(safe_mode) - torch.log(safe) - (2 * gap + 1) / (2 * variance)
+    down = torch.where(
+        inside, torch.exp(torch.where(inside, exponent, torch.zeros_like(exponent))), torch.zeros_like(gap)
+    )
+    total = above = below = torch.ones_like(gap)
+    for step in range(math.ceil(REACH * _most(read_noise))):
+        decay = torch.exp(-step / variance)
+        above = above * up * decay * ((mode + 1) / (mode + 1 + step))
+        below = below * down * decay * ((safe_mode - step) / safe_mode)
+        total = total + above + below
+    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - _LOG_SQRT_2PI
+    return at_mode + torch.log(total)
+
+
+def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper: Tensor) -> Tensor:
+    sigma = _most(read_noise)
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
+    mode = lattice_mode(residual, rate, read_noise**2)
+    start = torch.where(upper, mode - near, mode - far).clamp(min=0)
+    side = torch.where(upper, 1.0, -1.0).to(residual)
+
+    def log_part(count: Tensor) -> Tensor:
+        return log_normal_cdf(side * (count - rate - residual) / read_noise)
+
+    inside = _lattice_sum(start, near + far + 1, rate, log_part)
+    return torch.logaddexp(inside, _log_full_mass(start, near + far + 1, rate, upper))
+
+
+def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    reach = math.ceil(REACH * _most(read_noise)) + 1
+    start = (lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
+
+    def log_part(count: Tensor) -> Tensor:
+        gap = count - rate
+        return log_normal_interval((low - gap) / read_noise, (high - gap) / read_noise)
+
+    return _lattice_sum(start, 2 * reach + 5, rate, log_part)
+
+
+def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Tensor], Tensor]) -> Tensor:
+    """log Σ P(k)·exp(log_part(k)) over `count` integers from `start` on."""
+    positive, safe = positive_rate(rate)
+    log_rate = torch.where(positive, torch.log(safe), torch.full_like(safe, -1e30))
+    log_mass = log_poisson(start, rate)
+    total = log_mass + log_part(start)
+    for step in range(1, count):
+        log_mass = log_mass + log_rate - torch.log(start + step)
+        total = torch.logaddexp(total, log_mass + log_part(start + step))
+    return total
+
+
+def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Tensor:
+    """log P(k ≥ start + count) where `upper`, else log P(k < start)."""
+    positive, safe = positive_rate(rate)
+    edge = torch.where(upper, start + count, start.clamp(min=1))
+    possible = positive & (upper | (start > 0))
+    strong = torch.minimum(safe, edge).detach() > _STRONG
+    log_mass = torch.full_like(rate, -1e300)
+    if not bool(strong.all()):
+        log_mass = _log_gamma_mass(edge, safe, upper)
+    if bool(strong.any()):
+        large = contour_log_mass(edge.clamp(min=_STRONG), safe.clamp(min=_STRONG), upper)
+        log_mass = torch.where(strong, large, log_mass)
+    return torch.where(possible, log_mass, torch.full_like(log_mass, -1e300))
+
+
+def _log_gamma_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
+    mass = torch.where(upper, torch.special.gammainc(edge, rate), torch.special.gammaincc(edge, rate))
+    shown = mass > 1e-290
+    # this far out the probabilities decrease geometrically from the edge
+    last = torch.where(upper, edge, edge - 1)
+    ratio = torch.where(upper, rate / (edge + 1), last / rate).clamp(max=0.5)
+    beyond = log_poisson(last, rate) - torch.log1p(-ratio)
+    return torch.where(shown, torch.log(torch.where(shown, mass, torch.ones_like(mass))), beyond)

@@ -1,0 +1,1 @@
+"""The distributions of detectors, each in closed form or exact to a stated error."""

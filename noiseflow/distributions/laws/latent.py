@@ -1,0 +1,88 @@
+"""Distributions whose observation is an increasing function of a standard normal latent."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf, normal_quadrature
+
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+_ROUNDINGS = 8
+_TOGETHER = 2**16  # pixel values
+
+
+class LatentDistribution(NoiseDistribution):
+    """A distribution whose observation is an increasing function of a standard normal latent, so F(o) = Φ(latent(o))."""
+
+    @abstractmethod
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
+
+    @abstractmethod
+    def from_latent(self, latent: Tensor) -> Tensor:
+        """The observation of a latent."""
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        latent, ladj = self.to_latent(value)
+        return ladj - 0.5 * latent * latent - _LOG_SQRT_2PI
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return normal_cdf(self.to_latent(value)[0])
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)
+        mass = log_normal_interval(bottom, top)
+        # in a narrow cell the difference of latents loses digits; the slopes at its ends then give the width, unless they
+        # differ by more than is lost, as near the cusp of a radial layer
+        middle, finite = (bottom + top) / 2, torch.isfinite(bottom) & torch.isfinite(top)
+        width, eps = top - bottom, torch.finfo(bottom.dtype).eps
+        alike = (slope_above - slope_below).abs() * width <= _ROUNDINGS * eps * (1 + middle.abs())
+        narrow = finite & (high > low) & (width < eps ** (1 / 3)) & alike
+        zero = torch.zeros_like(middle)
+        width = torch.where(narrow, high - low, zero + 1)
+        middle, slope = torch.where(narrow, middle, zero), torch.where(narrow, (slope_below + slope_above) / 2, zero)
+        return torch.where(narrow, torch.log(width) + slope - 0.5 * middle * middle - _LOG_SQRT_2PI, mass)
+
+    def _latent_bound(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        finite = torch.isfinite(value)
+        latent, slope = self.to_latent(torch.where(finite, value, torch.zeros_like(value)))
+        return torch.where(finite, latent, value), torch.where(finite, slope, torch.zeros_like(slope))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.from_latent(torch.special.ndtri(value))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        like = self._like()
+        shape = (*sample_shape, *self.batch_shape)
+        return self.from_latent(torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device))
+
+    def _place(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        latent, ladj = self.to_latent(value)
+        return latent, torch.exp(ladj)
+
+    def _like(self) -> Tensor:
+        return self.anything()
+
+    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+        """E[function(observation)] by quadrature over the latent, shape of the batch."""
+        like = self._like()
+        total = torch.zeros(self.batch_shape, dtype=like.dtype, device=like.device)
+        nodes, weights = (tensor.to(like) for tensor in normal_quadrature(torch.float64))
+        together = max(1, _TOGETHER // max(1, total.numel()))
+        for node, weight in zip(torch.split(nodes, together), torch.split(weights, together), strict=True):
+            latent = node.view(-1, *[1] * total.ndim).expand(-1, *total.shape).contiguous()
+            total = total + torch.tensordot(weight, function(self.from_latent(latent)), dims=1)
+        return total
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        like = self._like()
+        shape = (-1, *[1] * len(self.batch_shape))
+        nodes, weights = (tensor.to(like).view(shape) for tensor in normal_quadrature(torch.float64))
+        latent = nodes.expand(-1, *self.batch_shape).contiguous()
+        return self.from_latent(latent), weights.expand_as(latent)

@@ -1,0 +1,205 @@
+"""The distribution of shot plus read noise, in detector units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from noiseflow.distributions.electrons.exact import (
+    RESOLVED,
+    interval_and_slopes,
+    log_both_tails,
+    log_density,
+    log_interval,
+)
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
+
+
+def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Residual and rate, electrons, of equal shape; one of value and signal may be a scalar."""
+    residual = (value - signal) / gain
+    return residual, ((signal - offset).clamp(min=0) / gain).expand_as(residual)
+
+
+@compilable
+def _log_density(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_density(*in_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
+
+
+@compilable
+def _log_interval(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_interval(*_bounds(low, high, signal, gain, offset, read_noise), read_noise, twice=twice)
+
+
+def _bounds(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of the bounds and rates, electrons; infinite bounds are replaced by finite ones beyond all probability."""
+    (bottom, rate), (top, _) = (in_electrons(value, signal, gain, offset) for value in (low, high))
+    finite = torch.isfinite(low), torch.isfinite(high)
+    if bool((finite[0] & finite[1]).all()):
+        return bottom, top, rate
+    (bottom, _), (top, _) = (
+        in_electrons(torch.where(known, value, torch.zeros_like(value)), signal, gain, offset)
+        for known, value in zip(finite, (low, high), strict=True)
+    )
+    end = (40 * torch.sqrt(rate + read_noise**2) + 100).detach()
+    least = torch.where(finite[1], torch.minimum(top.detach() - end, -end), -end)
+    most = torch.where(finite[0], torch.maximum(bottom.detach() + end, end), end)
+    bottom = torch.where(finite[0], bottom, torch.where(low > 0, most, least))
+    top = torch.where(finite[1], top, torch.where(high > 0, most, least))
+    return bottom, top, rate
+
+
+def _interval_and_slopes(
+    low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Log-probability of an interval and its derivatives, by the chain rule from electrons to detector units."""
+    bottom, top, rate = _bounds(low, high, signal, gain, offset, read_noise)
+    value, found = interval_and_slopes(bottom, top, rate, read_noise, slopes=slopes)
+    if not slopes:
+        return value, ()
+    of_low, of_high, of_rate, of_noise = found
+    of_low, of_high = (
+        torch.where(torch.isfinite(bound), slope / gain, torch.zeros_like(slope))
+        for bound, slope in ((low, of_low), (high, of_high))
+    )
+    of_rate = torch.where(signal > offset, of_rate / gain, torch.zeros_like(of_rate))
+    of_gain = -(bottom * of_low + top * of_high + rate * of_rate)
+    return value, (of_low, of_high, of_rate - of_low - of_high, of_gain, -of_rate, of_noise)
+
+
+@compilable
+def _log_below(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[0]
+
+
+@compilable
+def _log_above(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[1]
+
+
+class PoissonGaussianDistribution(NoiseDistribution):
+    """Distribution of gain·(k + read_noise·n) + offset, k Poisson of rate (signal − offset)/gain, n standard normal.
+
+    Args:
+        signal: clean pixel values, detector units, any shape.
+        gain, offset, read_noise: scalars, float64: counts per electron, counts, electrons rms.
+    """
+
+    per_pixel: ClassVar[tuple[str, ...]] = ("signal",)
+
+    def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
+        super().__init__(signal.shape, like=signal)
+        self.signal, self.gain, self.offset, self.read_noise = self.clean(signal), gain, offset, read_noise
+
+    @property
+    def light(self) -> bool:
+        """True: derivatives are stored instead of a graph."""
+        return True
+
+    @property
+    def law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Arguments of elementwise functions after the observation: signal, gain, offset, read noise."""
+        return self.signal, self.gain, self.offset, self.read_noise
+
+    @property
+    def rate(self) -> Tensor:
+        """Expected electrons, float64."""
+        return (self.signal.double() - self.offset).clamp(min=0) / self.gain
+
+    def electrons(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals and rates of observations, electrons, float64."""
+        residual = (value.double() - self.signal.double()) / self.gain
+        return residual, self.rate.expand_as(residual)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return pixelwise(_log_density, value, *self.law)
+
+    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
+        return pixelwise(_log_below, value, *self.law), pixelwise(_log_above, value, *self.law)
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return pixelwise(_log_below, value, *self.law).exp()
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
+        return bisect_quantile(self, value, middle - reach, middle + reach)
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        signal = self.signal
+        rate = torch.nan_to_num(self.rate).to(signal.dtype).expand((*sample_shape, *self.batch_shape))
+        normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
+        noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
+        return noise.add_(signal)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.signal
+
+    @property
+    def variance(self) -> Tensor:
+        return self.gain**2 * (self.rate + self.read_noise**2)
+
+
+class UnevenPoissonGaussian(PoissonGaussianDistribution):
+    """As `PoissonGaussianDistribution`, with a separate read noise for each pixel.
+
+    Args:
+        signal: clean pixel values, detector units, any shape.
+        gain, offset: scalars, float64.
+        read_noise: electrons rms, float64, shape of the signal.
+    """
+
+    per_pixel: ClassVar[tuple[str, ...]] = ("signal", "read_noise")
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return pixelwise(_UNEVEN[_log_density], value, *self.law)
+
+    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        below, above = (pixelwise(_UNEVEN[part], value, *self.law) for part in (_log_below, _log_above))
+        return below, above
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return pixelwise(_UNEVEN[_log_below], value, *self.law).exp()
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
+
+
+def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Split a call of an elementwise function by read noise: pixels that resolve single electrons use the sum, the others the
+    contour integral. The read noise is the last argument."""
+
+    def parted(*inputs: Tensor, twice: bool = False) -> Tensor:
+        resolved = inputs[-1].detach() < RESOLVED
+        if bool(resolved.all()) or not bool(resolved.any()):
+            return function(*inputs, twice=twice)
+        parts = [
+            function(*(each[chosen] if each.ndim else each for each in inputs), twice=twice)
+            for chosen in (resolved, ~resolved)
+        ]
+        found = torch.zeros_like(inputs[-1], dtype=parts[0].dtype)
+        return found.masked_scatter(resolved, parts[0]).masked_scatter(~resolved, parts[1])
+
+    parted.__name__ = f"{function.__name__}_by_read_noise"
+    return parted
+
+
+_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _log_below, _log_above)}

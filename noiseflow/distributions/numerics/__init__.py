@@ -1,0 +1,1 @@
+"""Functions that the distributions are computed with: tails, quadrature, maps, tables."""

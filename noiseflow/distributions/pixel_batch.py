@@ -1,0 +1,184 @@
+"""Base class for batches of pixels: data type, device, expanding and splitting."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+Kept = TypeVar("Kept")
+Taking = Callable[[Tensor, tuple[int, ...]], Tensor]
+
+
+class PixelBatch:
+    """A batch of independent pixels.
+
+    Attributes:
+        independent: whether pixels can be evaluated independently of each other.
+        takes_missing: whether `log_prob` handles NaN observations itself.
+        light: whether a gradient stores only a few numbers per pixel, so that evaluation in pieces has no benefit.
+        per_pixel: names of the attributes that hold one value or row of values per pixel; None for all tensors whose first
+            axes are the batch axes.
+    """
+
+    independent: ClassVar[bool] = True
+    takes_missing: ClassVar[bool] = False
+    per_pixel: ClassVar[tuple[str, ...] | None] = None
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The noise model and the signal if likelihoods of large inputs may be looked up in tables, otherwise None."""
+        return None
+
+    @property
+    def light(self) -> bool:
+        return False
+
+    def _set_kind(self, like: Tensor | None) -> None:
+        floating = like is not None and like.is_floating_point()
+        self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
+        self._given_device = None if like is None else like.device
+        self._computed: dict[bool, Any] = {}
+
+    def once(self, compute: Callable[[], Kept]) -> Kept:
+        """The cached result of `compute`, computed once with gradients and once without."""
+        key = torch.is_grad_enabled()
+        if key not in self._computed:
+            self._computed[key] = compute()
+        kept: Kept = self._computed[key]
+        return kept
+
+    def _pixels(self) -> Tensor | None:
+        """A tensor of the batch shape, for subclasses that do not set the data type of their results."""
+        held = (value for value in vars(self).values() if isinstance(value, Tensor) and value.is_floating_point())
+        return next((value for value in held if value.shape == self.batch_shape), None)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Data type of samples, means and variances."""
+        if self._given_dtype is not None:
+            return self._given_dtype
+        pixels = self._pixels()
+        return torch.get_default_dtype() if pixels is None else pixels.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of samples, means and variances."""
+        if self._given_device is not None:
+            return self._given_device
+        pixels = self._pixels()
+        return torch.get_default_device() if pixels is None else pixels.device
+
+    @property
+    def working_dtype(self) -> torch.dtype:
+        """Data type of the computation, at least single precision."""
+        return torch.promote_types(self.dtype, torch.float32)
+
+    def working(self, tensor: Tensor) -> Tensor:
+        """Convert a tensor to the working data type unless its own is wider."""
+        return tensor.to(torch.promote_types(tensor.dtype, self.working_dtype))
+
+    def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
+        """Convert an observation to a data type that is at least as wide as its own."""
+        return value.to(dtype)
+
+    def clean(self, signal: Tensor) -> Tensor:
+        """Convert a signal to the working data type; non-finite signals become NaN, and so do all results for them."""
+        signal = self.working(signal)
+        if is_traced(signal) or not bool(torch.isfinite(signal).all()):
+            return torch.where(torch.isfinite(signal), signal, torch.full_like(signal, math.nan))
+        return signal
+
+    def cast(self, tensor: Tensor) -> Tensor:
+        """Convert a result to the data type of the signal."""
+        return tensor if self._given_dtype is None else tensor.to(self._given_dtype)
+
+    def anything(self) -> Tensor:
+        """A scalar of the working data type on the device."""
+        return torch.zeros((), dtype=self.working_dtype, device=self.device)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape of the signal."""
+        shape: torch.Size = self._batch_shape  # type: ignore[attr-defined]
+        return shape
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Self:
+        """The same distribution for a larger batch; pixels along a new or expanded axis are independent of each other."""
+        shape = torch.Size(batch_shape)
+        broadcast_shapes(self.batch_shape, shape)
+        return self.mapped(lambda tensor, rest: tensor.expand(*shape, *rest), shape)
+
+    def flat(self) -> Self:
+        """The same pixels with one batch axis."""
+        return self.mapped(lambda tensor, rest: tensor.reshape(-1, *rest), torch.Size([math.prod(self.batch_shape)]))
+
+    def parts(self, size: int) -> list[Self]:
+        """Split a batch with one axis into distributions of `size` consecutive pixels each."""
+        split: dict[int, tuple[Tensor, tuple[Tensor, ...]]] = {}  # keeps the tensor alive, so that its id is not reused
+
+        def part(index: int) -> Taking:
+            return lambda tensor, rest: split.setdefault(id(tensor), (tensor, torch.split(tensor, size)))[1][index]
+
+        count = self.batch_shape[0]
+        starts = range(0, count, size)
+        return [self.mapped(part(i), torch.Size([min(size, count - at)])) for i, at in enumerate(starts)]
+
+    def mapped(self, take: Taking, shape: torch.Size) -> Self:
+        """A copy with every per-pixel tensor replaced by ``take(tensor, shape of the axes after the batch axes)``."""
+        other = copy.copy(self)
+        other._batch_shape, other._computed = shape, {}  # type: ignore[attr-defined]
+        size = len(self.batch_shape)
+        for name, value in vars(self).items():
+            if isinstance(getattr(type(self), name, None), cached_property):
+                del other.__dict__[name]
+            elif isinstance(value, PixelBatch):
+                setattr(other, name, value.mapped(take, shape))
+            elif isinstance(value, Tensor) and self._is_per_pixel(name, value):
+                setattr(other, name, take(value, tuple(value.shape[size:])))
+        return other
+
+    @property
+    def splits(self) -> bool:
+        """Whether the distribution can be split into pixels. It cannot if a tensor may hold pixels along axes other than the
+        leading ones."""
+        for name, value in vars(self).items():
+            if isinstance(value, PixelBatch) and not value.splits:
+                return False
+            if isinstance(value, Tensor) and value.numel() > 1 and not self._is_per_pixel(name, value):
+                return self.per_pixel is not None
+        return True
+
+    def _is_per_pixel(self, name: str, tensor: Tensor) -> bool:
+        if self.per_pixel is not None:
+            return name in self.per_pixel
+        return tensor.shape[: len(self.batch_shape)] == self.batch_shape
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.batch_shape)) or "1"
+        kind = str(self.dtype).removeprefix("torch.")
+        inside = getattr(self, "base", None)
+        of = f", of {type(inside).__name__}" if isinstance(inside, PixelBatch) else ""
+        return f"{type(self).__name__}({shape} pixels, {kind}, {self.device}{of})"
+
+
+def is_traced(tensor: Tensor) -> bool:
+    """Whether values are not accessible: inside ``torch.compile`` or a transform of ``torch.func``."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """The shape that all shapes broadcast to. Uses NumPy, because the first call of torch's function loads SymPy (1 s).
+
+    Raises:
+        ValueError: the shapes do not broadcast (RuntimeError inside ``torch.compile``).
+    """
+    if torch.compiler.is_compiling():
+        return torch.broadcast_shapes(*shapes)  # type: ignore[no-any-return, no-untyped-call]
+    return torch.Size(np.broadcast_shapes(*map(tuple, shapes)))

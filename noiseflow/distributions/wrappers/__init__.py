@@ -1,0 +1,1 @@
+"""Distributions made from others: rounded and clipped, or completed by quadrature."""

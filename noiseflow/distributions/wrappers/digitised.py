@@ -1,0 +1,234 @@
+"""The distribution of rounded and clipped observations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import constraints
+
+from noiseflow.distributions.laws.discrete import DiscreteLevels
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+
+_SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
+_ROUNDINGS = 8  # rounding errors of the limit within which an observation counts as clipped
+_MOST_LEVELS = 2**16
+
+
+class Converter(Protocol):
+    """An analogue-to-digital converter: rounds to steps from an origin and clips at two limits, detector units."""
+
+    step: float
+    low: float
+    high: float
+    origin: float
+
+
+class DigitisedDistribution(NoiseDistribution):
+    """A rounded and clipped distribution.
+
+    ``log_prob`` is a log-probability at the clipping limits and, if the step is positive, at every level. With ``step = 0``,
+    observations between the limits have a log-density. A value between two levels gets the probability of a cell centred on it.
+    A value beyond a limit by more than half a step is impossible (−inf).
+
+    Args:
+        detector: the step and the clipping limits; a module if large inputs may be tabulated.
+        base: distribution before the converter: any torch distribution of one number per pixel.
+        signal: the signal, for tables of large inputs; None to use no tables.
+    """
+
+    per_pixel = ("_signal",)
+
+    def __init__(self, detector: Converter, base: Any, signal: Tensor | None = None) -> None:
+        base = as_noise_distribution(base)
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base: NoiseDistribution = base
+        self.step, self.low, self.high = detector.step, detector.low, detector.high
+        self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
+        self._detector, self._signal = detector, signal
+
+    @property
+    def independent(self) -> bool:  # type: ignore[override]
+        """Whether pixels can be evaluated independently."""
+        return self.base.independent
+
+    @property
+    def light(self) -> bool:
+        return self.base.light
+
+    def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
+        """Convert an observation to a wider data type; a value equal to a limit in its own type stays equal to it."""
+        wider = value.to(dtype)
+        if wider.dtype == value.dtype:
+            return wider
+        for limit in (self.low, self.high):
+            wider = torch.where(value == limit, limit, wider)
+        return wider
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The detector and the signal."""
+        return (
+            None
+            if self._signal is None or not isinstance(self._detector, nn.Module)
+            else (self._detector, self._signal)
+        )
+
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """Whether every observation has a probability rather than a density."""
+        return self.step > 0 or self.base.discrete
+
+    @property
+    def has_rsample(self) -> bool:  # type: ignore[override]
+        """Whether draws are differentiable: only if they are clipped and not rounded."""
+        return self.step == 0 and self.base.has_rsample
+
+    def rescaled(self, scale: Tensor, shift: Tensor) -> DigitisedDistribution:
+        return DigitisedDistribution(self._detector, self.base.rescaled(scale, shift))
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> DigitisedDistribution:
+        """The same for a larger batch."""
+        shape = torch.Size(batch_shape)
+        signal = None if self._signal is None else self._signal.expand(shape)
+        return DigitisedDistribution(self._detector, self.base.expand(shape), signal)
+
+    @property
+    def edges(self) -> tuple[float, float]:
+        """The values before digitisation below which all are clipped to the low limit, and above which to the high one."""
+        if self.step == 0:
+            return self.low, self.high
+        steps = (self.high - self._origin) / self.step
+        # if the high limit lies between two levels, only values that round to the level above it are clipped
+        last = math.ceil(steps - 1e-3) - 1 if math.isfinite(steps) else steps
+        return self.low + self.step / 2, self._origin + (last + 0.5) * self.step
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        value = self._fine(value)
+        on_low, on_high, possible = self._places(value)
+        inside = value.clamp(self.low, self.high)  # values beyond a limit are not used and must not affect the gradient
+        found = self._masses(inside, on_low, on_high) if self.step > 0 else self._clipped(inside, on_low, on_high)
+        return torch.where(possible, found, torch.full_like(found, -math.inf))
+
+    def _masses(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> Tensor:
+        half = self.step / 2
+        below, above = (edge if math.isfinite(edge) else 0.0 for edge in self.edges)
+        low = torch.where(on_low, -math.inf, torch.where(on_high, above, inside - half))
+        high = torch.where(on_high, math.inf, torch.where(on_low, below, inside + half))
+        return self.base.log_interval_prob(low, high)
+
+    def _clipped(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> Tensor:
+        result = self.base.log_prob(inside)
+        if inside.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
+            low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
+            high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)
+            return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
+        # the probability of a limit depends on the signal alone: it has the batch shape, not that of the values
+        infinity = torch.full(self.batch_shape, math.inf, dtype=inside.dtype, device=inside.device)
+        if math.isfinite(self.low):
+            mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low))
+            result = torch.where(on_low, mass, result)
+        if math.isfinite(self.high):
+            mass = self.base.log_interval_prob(torch.full_like(infinity, self.high), infinity)
+            result = torch.where(on_high, mass, result)
+        return result
+
+    def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether values are at the low limit, at the high limit, and possible at all."""
+        rounding = _ROUNDINGS * torch.finfo(value.dtype).eps
+        slack = [max(self.step / 2, rounding * abs(limit)) for limit in (self.low, self.high)]
+        possible = (value >= self.low - slack[0]) & (value <= self.high + slack[1])
+        return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= self._top, possible
+
+    def _fine(self, value: Tensor) -> Tensor:
+        """Values in double precision if single precision would shift the edges of their cells."""
+        if self.step == 0 or value.dtype == torch.float64:
+            return value
+        if not is_traced(value):
+            largest = float(value.detach().abs().max()) if value.numel() else 0.0
+            if torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step:
+                return value
+        return value.double()
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.base.log_interval_prob(self._edge(low), self._edge(high))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self.base.cdf(self._edge(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        edge = self._level(self._fine(value), torch.ceil) - self.step / 2 if self.step > 0 else value
+        edge = torch.where(value <= self.low, torch.full_like(edge, -math.inf), edge)
+        return self.base.cdf_below(torch.where(value > self.high, torch.full_like(edge, math.inf), edge))
+
+    def _edge(self, value: Tensor) -> Tensor:
+        """The value before digitisation below which every value is digitised to at most `value`."""
+        finite = torch.isfinite(value)
+        safe = self._fine(torch.where(finite, value, torch.zeros_like(value)))
+        edge = self._level(safe, torch.floor) + self.step / 2 if self.step > 0 else safe
+        edge = torch.where(finite, edge, value)
+        edge = torch.where(value < self.low, torch.full_like(edge, -math.inf), edge)
+        return torch.where(value >= self._top, torch.full_like(edge, math.inf), edge)
+
+    @property
+    def _top(self) -> float:
+        """The smallest value that counts as the high limit, allowing for rounding in another data type."""
+        return self.high - 1e-3 * self.step if math.isfinite(self.high) else self.high
+
+    def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
+        steps = (value - self._origin) / self.step
+        nearest = torch.round(steps)
+        on_level = (steps - nearest).abs() < 1e-3  # rounding errors must not move a level to its neighbour
+        level: Tensor = torch.where(on_level, nearest, rounding(steps))
+        return level * self.step + self._origin
+
+    def digitise(self, value: Tensor) -> Tensor:
+        """Round and clip values."""
+        rounded = self._level(value, torch.round) if self.step > 0 else value
+        return rounded.clamp(self.low, self.high)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.digitise(self.base.icdf(value))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        return self.digitise(self.base.sample(sample_shape, generator=generator))
+
+    def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        """Differentiable draws of a distribution that is clipped and not rounded; see `NoiseDistribution.rsample`."""
+        if not self.has_rsample:
+            return super().rsample(sample_shape, generator)
+        return self.digitise(self.base.rsample(sample_shape, generator))
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The clipping limits, or the limits of the base distribution if they are narrower."""
+        low, high = self.base.limits
+        return self.digitise(low), self.digitise(high)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The levels; without rounding, all values between the limits."""
+        if self.step > 0:
+            return DiscreteLevels(self.step, self._origin, self.low, self.high)
+        return constraints.interval(self.low, self.high)  # type: ignore[no-untyped-call]
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        if self.step == 0:
+            nodes, weights = self.base.quadrature()
+            return self.digitise(nodes), weights
+        tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
+        first, last = (self.icdf(tail) for tail in tails)
+        count = int(((last - first) / self.step).max().ceil()) + 1 if first.numel() else 1
+        if count > _MOST_LEVELS:
+            raise ValueError(
+                f"some pixels have {count} likely levels, more than the maximum of {_MOST_LEVELS}; use a coarser step"
+            )
+        steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
+        nodes = torch.minimum(first + steps * self.step, last)
+        once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
+        return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))

@@ -1,0 +1,148 @@
+"""IMOD's files: transforms (``.xf``), and the angle offset and excluded views of ``tilt.com``.
+
+Source: https://bio3d.colorado.edu/imod/doc/man/tilt.html
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io import angle_text
+from noiseflow.io.checks import number, text_lines
+from noiseflow.io.tilt_table import TiltTable
+
+_FLAT = 0.05
+"""Degrees: a rotation about x that moves the edge of a 4096-pixel image by less than two pixels."""
+
+
+def read(path: Path) -> TiltTable:
+    """The angles of the ``TILTFILE`` next to the command file, with its offset and its excluded views.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: the command file names no ``TILTFILE``, or a value is not a number.
+    """
+    entries = _entries(path)
+    if "TILTFILE" not in entries:
+        raise ValueError(f"{path} names no TILTFILE with the tilt angles; give that file with --angles")
+    return _applied(angle_text.read(path.with_name(Path(entries["TILTFILE"]).name)), entries, path)
+
+
+def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
+    """A table with what the ``tilt.com`` of a stack adds, if it lies next to it, and a warning that says so.
+
+    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) are not modelled and are named in a warning.
+    """
+    path = stack.with_name("tilt.com")
+    if path.is_file() and stack.is_file():
+        entries = _entries(path)
+        # older files name the stack in a line of its own, without a keyword
+        older = next((name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), "")
+        projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or older
+        if Path(projections).stem.lower().removesuffix("_ali") == stem.lower():
+            return _applied(table, entries, path)
+    turned = stack.with_name(f"{stem}.xtilt")
+    if turned.is_file() and not stack.is_dir():
+        _warn_of_x(angle_text.read(turned).angles, turned)
+    return table
+
+
+def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable:
+    count, offset = len(table.angles), _value(entries, "OFFSET", path)
+    lists = ",".join(filter(None, (entries.get("EXCLUDELIST"), entries.get("EXCLUDELIST2"))))
+    excluded = parse_views(lists, count, path)
+    if excluded or offset:
+        views = ", ".join(str(view + 1) for view in excluded[:12]) + (", …" if len(excluded) > 12 else "")
+        parts = [f"adds {offset:g}° to the tilt angles"] * bool(offset) + [f"excludes the views {views}"] * bool(
+            excluded
+        )
+        warnings.warn(f"{path} {' and '.join(parts)}", stacklevel=5)
+    turned = [_value(entries, "XAXISTILT", path)]
+    if "XTILTFILE" in entries and (file := path.with_name(Path(entries["XTILTFILE"]).name)).is_file():
+        turned = list(angle_text.read(file).angles)
+    _warn_of_x(np.array(turned), path)
+    return replace(table, angles=table.angles + offset, excluded=tuple(sorted({*table.excluded, *excluded})))
+
+
+def _warn_of_x(angles: NDArray[np.float64], path: Path) -> None:
+    if np.abs(angles).max(initial=0.0) > _FLAT:
+        varies = "" if np.ptp(angles) <= _FLAT else ", different for each view: the images do not share one axis"
+        warnings.warn(
+            f"{path} turns the specimen by up to {np.abs(angles).max():g}° about x{varies}; this is not applied, and the volume "
+            "is turned by as much: level it afterwards, for example with rotatevol",
+            stacklevel=5,
+        )
+
+
+def _value(entries: dict[str, str], name: str, path: Path) -> float:
+    try:
+        return number(entries.get(name, "0").replace(",", " ").split()[0])
+    except (ValueError, IndexError):
+        raise ValueError(f"{path}: {name} '{entries[name][:40]}' is not a number") from None
+
+
+def _entries(path: Path) -> dict[str, str]:
+    """Values by keyword in capitals; the last of a repeated keyword counts, as in IMOD, but lists of views are joined."""
+    found: dict[str, str] = {}
+    for line in text_lines(path, "command file", holds="keywords with values"):
+        words = line.split("#")[0].split(None, 1)
+        if words and not words[0].startswith("$"):
+            name, value = words[0].upper(), words[1].strip() if len(words) > 1 else ""
+            joined = name.startswith("EXCLUDE") and name in found
+            found[name] = f"{found[name]},{value}" if joined else value
+    return found
+
+
+def parse_views(text: str, count: int, source: object = "views") -> list[int]:
+    """Indices of views given as in IMOD: numbers from 1, and ranges, such as ``1,5-8,30``.
+
+    Raises:
+        ValueError: the text is no such list, or a view does not exist.
+    """
+    found: set[int] = set()
+    for part in filter(None, text.replace(",", " ").split()):
+        first, _, last = part.partition("-")
+        last = last or first
+        numbers = first.isascii() and first.isdigit() and last.isascii() and last.isdigit()
+        if not numbers or not 1 <= int(first) <= int(last) <= count:
+            raise ValueError(
+                f"{source}: '{part}' is not a view from 1 to {count}, or a range of them; write for example 1,5-8"
+            )
+        found.update(range(int(first) - 1, int(last)))
+    return sorted(found)
+
+
+def read_transforms(path: str | Path) -> NDArray[np.float64]:
+    """Read an IMOD ``.xf`` file.
+
+    Args:
+        path: text file, one line ``A11 A12 A21 A22 DX DY`` per section.
+
+    Returns:
+        (section, 2, 3): the matrix A and the shift in pixels, in the order (x, y) of IMOD.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: a line does not hold six numbers, a matrix is not invertible, or the file is empty.
+    """
+    path = Path(path)
+    rows = []
+    for count, line in enumerate(text_lines(path, "alignment file", holds="six numbers per line"), 1):
+        if not line.strip():
+            continue
+        try:
+            a11, a12, a21, a22, dx, dy = map(number, line.split())
+        except ValueError:
+            raise ValueError(f"{path} line {count}: six numbers A11 A12 A21 A22 DX DY are needed") from None
+        row = np.array([[a11, a12, dx], [a21, a22, dy]])
+        if not np.isfinite(row).all() or abs(np.linalg.det(row[:, :2])) < 1e-6:
+            raise ValueError(f"{path} line {count}: this transform is not invertible; check the alignment file")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path} holds no transforms; one line of six numbers per section is required")
+    return np.stack(rows)

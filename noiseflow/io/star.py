@@ -1,0 +1,111 @@
+"""Tables of tilts in STAR files: RELION's tilt series and Warp's ``.tomostar``.
+
+Sources: https://relion.readthedocs.io (tilt-series metadata), https://warpem.github.io/warp
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noiseflow.io.checks import number, text_lines
+from noiseflow.io.tilt_table import TiltTable, rotations
+
+_ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
+_NAMES = ("rlnMicrographMovieName", "rlnMicrographName", "wrpMovieName")
+_AXES = ("rlnTomoNominalTiltAxisAngle", "wrpAxisAngle")
+_SIZES = ("rlnTomoTiltSeriesPixelSize", "rlnMicrographPixelSize", "rlnMicrographOriginalPixelSize")
+_ALIGNED = ("rlnTomoZRot", "rlnTomoXShiftAngst", "rlnTomoYShiftAngst")
+
+_SECTION = re.compile(r"([0-9]{1,9})@")
+Columns = dict[str, list[str]]
+
+
+def read(path: Path) -> TiltTable:
+    """The first table with tilt angles; an alignment of RELION becomes transforms if the file states the pixel size.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: no table has tilt angles, or a value is not a number.
+    """
+    tables = _tables(text_lines(path, "angle file", holds="a table of tilts"))
+    table = next((table for table in tables if any(name in table for name in _ANGLES)), None)
+    if table is None:
+        raise ValueError(f"{path} holds no angles: no table has a column {', '.join(_ANGLES)}")
+    angles = _numbers(table, _ANGLES, path)
+    assert angles is not None
+    sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
+    axes = _numbers(table, _AXES, path)
+    size = None if sizes is None else float(sizes[0])
+    names = next((table[name] for name in _NAMES if name in table), [])
+    sections = [int(stated[1]) for name in names if (stated := _SECTION.match(name))]
+    return TiltTable(
+        angles,
+        () if sections else tuple(names),
+        np.array(sections, dtype=np.int64) - 1 if sections and len(sections) == len(names) else None,
+        transforms=None if size is None else _transforms(table, size, path),
+        pixel_size=size,
+        tilt_axis=None if axes is None else float(axes.mean()),
+    )
+
+
+def has_tilts(path: Path) -> bool:
+    """Whether a file has a column of tilt angles."""
+    try:
+        return any(name in path.read_text(encoding="utf-8", errors="replace") for name in _ANGLES)
+    except OSError:
+        return False
+
+
+def _transforms(table: Columns, size: float, path: Path) -> NDArray[np.float64] | None:
+    columns = [_numbers(table, (name,), path) for name in _ALIGNED]
+    if any(column is None for column in columns):
+        return None
+    axes, x, y = (np.asarray(column) for column in columns)
+    return rotations(axes, np.stack([x, y], 1) / size)
+
+
+def _numbers(table: Columns, names: Sequence[str], path: Path) -> NDArray[np.float64] | None:
+    name = next((name for name in names if name in table), None)
+    if name is None:
+        return None
+    try:
+        return np.array([number(text) for text in table[name]], dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{path}, column {name}: {error}") from None
+
+
+def _tables(lines: list[str]) -> list[Columns]:
+    """Columns by name of every table: loops, and lists of single values."""
+    tables: list[Columns] = []
+    names: list[str] = []
+    looped = False
+    for line in map(str.strip, lines):
+        if not line or line.startswith("#"):
+            continue
+        if line.startswith("data_") or line == "loop_":
+            looped, names = line == "loop_", []
+            tables.append({})
+        elif line.startswith("_") and tables:
+            name, *value = _split(line.partition(" #")[0])
+            names.append(name[1:])
+            tables[-1][name[1:]] = [] if looped else value
+        elif looped:
+            values = _split(line)
+            if len(values) == len(names):
+                for name, text in zip(names, values, strict=True):
+                    tables[-1][name].append(text)
+    return tables
+
+
+def _split(line: str) -> list[str]:
+    """Words, of which those with spaces are in quotes; a line with an open quotation is split at spaces."""
+    try:
+        return shlex.split(line)
+    except ValueError:
+        return line.split()

@@ -1,0 +1,93 @@
+"""Noise models that wrap other noise models, and modules of other libraries as noise models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.distributions.image_pixels import Signal, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.models.base import NoiseModelBase
+
+_HALF = (torch.float16, torch.bfloat16)
+
+
+class ModelAround(NoiseModelBase):
+    """Base class of noise models that wrap another one. Properties are taken from the inner model unless overridden.
+
+    Args:
+        model: the inner noise model.
+
+    Raises:
+        TypeError: `model` is not a module.
+    """
+
+    model: NoiseModelBase
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = as_noise_model(model)
+
+
+def _of_inner(name: str) -> property:
+    """A trait that a wrapper takes from its inner model, and sets there."""
+    own = getattr(NoiseModelBase, name)
+    return property(
+        lambda self: getattr(self.model, name), lambda self, value: setattr(self.model, name, value), None, own.__doc__
+    )
+
+
+for _name in (
+    *("needs_image", "neighbourhood", "shared_axis", "describes_single_readings", "tabulate", "one_pixel"),
+    *("starts_most_likely", "learning_rate", "num_steps", "joint_learning_rate", "most_joint_steps", "starts_anew"),
+    "fitted_range",
+):
+    setattr(ModelAround, _name, _of_inner(_name))
+
+
+class ForeignModel(NoiseModelBase):
+    """Any module that returns a distribution for signals, as a noise model with default properties.
+
+    Half-precision signals are passed in single precision, unless the parameters of the module are in half precision. Infinite
+    signals are passed as NaN.
+
+    Args:
+        module: called with signals; returns a distribution of one observation per signal.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        values = values_of(signal)
+        if not values.is_floating_point():
+            return as_noise_distribution(self.module(values))
+        own = next((p.dtype for p in self.module.parameters() if p.is_floating_point()), torch.float32)
+        working = values.to(torch.promote_types(values.dtype, own if own in _HALF else torch.float32))
+        working = torch.where(torch.isfinite(working), working, torch.full_like(working, math.nan))
+        return as_noise_distribution(self.module(working), like=values)
+
+    def standardise(self, signal: Signal, observation: Tensor) -> None:
+        """Call ``standardise`` of the module if it has one."""
+        own: Callable[..., Any] | None = getattr(self.module, "standardise", None)
+        if own is not None:
+            own(values_of(signal), observation)
+
+
+def as_noise_model(module: nn.Module) -> NoiseModelBase:
+    """Return the module if it is a noise model, otherwise wrap it in `ForeignModel`.
+
+    Raises:
+        TypeError: the argument is not a module.
+    """
+    if not isinstance(module, nn.Module):
+        raise TypeError(
+            f"a noise model must be a torch module, not {type(module).__name__}; derive it from noiseflow.NoiseModelBase"
+        )
+    return module if isinstance(module, NoiseModelBase) else ForeignModel(module)

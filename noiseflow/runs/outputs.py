@@ -1,0 +1,209 @@
+"""Output files: checked before the computation, written to a temporary file, and renamed when complete."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib.util
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from noiseflow.installation import install_command
+from noiseflow.runs.ownership import require_own
+from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
+
+_CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
+
+
+def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, overwrite: bool = True) -> Path:
+    """Check that a result can be written before a long computation starts, and return the path.
+
+    Args:
+        path: the file to write; for a link, its target is written.
+        suffixes: allowed suffixes; by default those of the image formats that `write` supports.
+        overwrite: replace any existing file; otherwise only files that this program wrote.
+
+    Raises:
+        ValueError: the suffix is not allowed, or the path is a folder.
+        FileNotFoundError: the folder does not exist.
+        FileExistsError: without `overwrite`, the file exists and this program did not write it.
+        PermissionError: the folder is not writable.
+        ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
+    """
+    from noiseflow.io.image_file import WRITE_SUFFIXES
+
+    suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(
+            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
+        )
+    is_zarr = path.suffix.lower() == ".zarr"
+    if is_zarr and importlib.util.find_spec("zarr") is None:
+        raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: {install_command('formats')}")
+    if path.is_dir() and not is_zarr:
+        raise ValueError(f"{path} is a folder; name an output file")
+    target = link_target(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{target.parent} does not exist; create the folder first")
+    require_own(path, overwrite=overwrite)
+    _require_writable(target.parent)
+    clear_leftovers(target)
+    return path
+
+
+def require_other(output: str | Path, *inputs: str | Path | None) -> None:
+    """Check that an output does not replace an input, or an image of a folder that is an input.
+
+    Raises:
+        ValueError: the output is one of the inputs.
+    """
+    target = Path(output)
+    if not target.exists():
+        return
+    for source in inputs:
+        if source is not None and any(path.exists() and target.samefile(path) for path in _parts(source)):
+            raise ValueError(f"{output} is also an input and would be overwritten; name another output")
+
+
+def _parts(source: str | Path) -> list[Path]:
+    from noiseflow.io.folder import files_of
+
+    path = Path(str(source).partition("::")[0])
+    return [path, *files_of(path)] if path.is_dir() else [path]
+
+
+def check_folder(
+    path: str | Path,
+    *,
+    num_bytes: int = 0,
+    holds: Sequence[str] = (),
+    beside: Sequence[Path | None] = (),
+    overwrite: bool = True,
+) -> Path:
+    """Check that results can be written to a folder before a long computation starts. The folder need not exist yet.
+
+    Args:
+        path: the folder.
+        num_bytes: size of the results, bytes.
+        holds: names of the files that will be written there.
+        beside: other output files, whose names the folder cannot have.
+        overwrite: replace existing files of these names; otherwise only files that this program wrote.
+
+    Raises:
+        ValueError: the path, or a parent, is a file or will be one.
+        FileExistsError: without `overwrite`, one of the files exists and this program did not write it.
+        PermissionError: the folder cannot be created or written to.
+        OSError: the disk does not have enough space.
+    """
+    path = Path(path)
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir():
+        raise ValueError(f"{existing} is a file; name a folder instead of {path}")
+    for other in beside:
+        if other is not None and other.resolve() in (path.resolve(), *path.resolve().parents):
+            raise ValueError(f"{other} will be a file; name another folder instead of {path}")
+    for name in holds:
+        require_own(path / name, overwrite=overwrite)
+    _require_writable(existing)
+    free = shutil.disk_usage(existing).free
+    if num_bytes > free:
+        raise OSError(
+            f"{path} needs {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB free; "
+            "free some space, choose another disk or a smaller size"
+        )
+    return path
+
+
+def reserve(path: Path, num_bytes: int) -> None:
+    """Allocate a file on the disk before it is written through a memory map, where a full disk would crash the program.
+
+    Raises:
+        OSError: the disk does not have enough space.
+    """
+    with path.open("r+b") as stream:
+        reserve_room(stream.fileno(), num_bytes)
+
+
+def reserve_room(handle: int, num_bytes: int) -> None:
+    """As `reserve`, for an open file, which is extended to this length."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(handle, 0, num_bytes)
+    else:
+        os.ftruncate(handle, num_bytes)
+
+
+def _require_writable(folder: Path) -> None:
+    """Raise PermissionError if a folder is not writable, by its permissions or because creating a file fails."""
+    refusal = f"{folder} is not writable; choose another output folder"
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(refusal)
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise PermissionError(refusal) from error
+
+
+def require_whole(path: Path, num_bytes: int) -> None:
+    """Raise OSError if a file is too short; on a full disk some libraries lose the last buffer without an error."""
+    if path.stat().st_size < num_bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield the name of a temporary file that is renamed to `path`, or to the target of a link, if the block succeeds."""
+    with partial_folder(path) as folder:
+        partial = folder / Path(path).name
+        try:
+            yield partial
+        except OSError as error:
+            if error.errno is None and _CUT_SHORT.fullmatch(str(error)):  # NumPy's error, which hides the reason
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+            raise
+        put_in_place(partial, path)
+
+
+def put_in_place(partial: Path, path: str | Path) -> None:
+    """Rename a complete file in a temporary folder next to an output to this output, or to the target of a link."""
+    partial.chmod(0o666 & ~_umask())
+    partial.replace(link_target(path))
+
+
+@contextlib.contextmanager
+def output_folder(path: str | Path, *, parents: bool = True) -> Iterator[Path]:
+    """Create a folder, with its parents if needed. If the block fails and left no files, created folders are removed."""
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=parents, exist_ok=True)
+    try:
+        yield path
+    except BaseException:
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder that replaces `path`, or the target of a link, if the block succeeds."""
+    target = link_target(path)
+    with partial_folder(path) as folder:
+        partial = folder / "new"
+        partial.mkdir()
+        yield partial
+        partial.chmod(0o777 & ~_umask())
+        if target.exists():
+            target.rename(folder / REPLACED)
+        partial.rename(target)
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask

@@ -1,0 +1,132 @@
+"""Statistics that several packages need: robust spread, products of neighbours, weighted lines, White's errors, block means."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+# Standard deviation of a normal distribution per median absolute deviation: 1 / Φ⁻¹(3/4).
+_PER_MAD = 1.4826
+
+
+def robust_deviation(values: Array, centre: float | None = None) -> float:
+    """Standard deviation from the median absolute deviation, which outliers in less than half of the values hardly change.
+
+    Args:
+        values: any shape, any unit.
+        centre: the value to measure from; the median by default.
+
+    Example:
+        >>> import numpy as np
+        >>> from noiseflow.statistics import robust_deviation
+        >>> round(robust_deviation(np.array([1.0, 2.0, 3.0, 4.0, 1000.0])), 3)
+        1.483
+    """
+    middle = np.median(values) if centre is None else centre
+    return _PER_MAD * float(np.median(np.abs(values - middle)))
+
+
+def neighbour_products(values: Array, other: Array | None = None, *, axis: int = -1) -> Array:
+    """Products of each value with the next one along an axis, shorter by one there.
+
+    Noise that is independent between neighbours does not contribute to their mean, which therefore measures common structure
+    (the autocovariance at lag one, if the values have mean zero).
+
+    Args:
+        values: any shape.
+        other: an array of the same shape that the earlier one of two neighbours is taken from; `values` by default.
+        axis: the axis along which values are neighbours.
+
+    Example:
+        >>> import numpy as np
+        >>> from noiseflow.statistics import neighbour_products
+        >>> neighbour_products(np.array([1.0, 2.0, 3.0])).tolist()
+        [2.0, 6.0]
+    """
+    later, earlier = np.moveaxis(values, axis, 0)[1:], np.moveaxis(values if other is None else other, axis, 0)[:-1]
+    return np.moveaxis(later * earlier, 0, axis)
+
+
+class Line(NamedTuple):
+    """A fitted line, y = intercept + slope·x.
+
+    Attributes:
+        slope, intercept: coefficients.
+        slope_error: standard error of the slope, for weights that are inverse variances.
+        chi_squared: χ² per degree of freedom.
+    """
+
+    slope: float
+    intercept: float
+    slope_error: float
+    chi_squared: float
+
+
+def weighted_line(x: Array, y: Array, weight: Array) -> Line:
+    """Fit a line by weighted least squares; the slope of points at a single x is 0.
+
+    Args:
+        x, y, weight: (N,) places, values, and their inverse variances.
+
+    Example:
+        >>> import numpy as np
+        >>> from noiseflow.statistics import weighted_line
+        >>> line = weighted_line(np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0]), np.ones(3))
+        >>> line.slope, line.intercept, round(line.slope_error, 3)
+        (2.0, 1.0, 0.707)
+    """
+    middle = float(np.average(x, weights=weight))
+    information = max(float(np.sum(weight * (x - middle) ** 2)), np.finfo(float).tiny)
+    slope = float(np.sum(weight * (x - middle) * y)) / information
+    intercept = float(np.average(y, weights=weight)) - slope * middle
+    chi_squared = float(np.sum(weight * (y - intercept - slope * x) ** 2)) / max(len(x) - 2, 1)
+    return Line(slope, intercept, float(np.sqrt(1 / information)), chi_squared)
+
+
+def white_regression(columns: Array, values: Array, *, ridge: float = 0.0) -> tuple[Array, Array]:
+    """Least squares with White's standard errors, which hold for noise of any variance (doi:10.2307/1912934).
+
+    Args:
+        columns: (N, K) regressors; their scales do not matter.
+        values: (..., N) one or several series of values.
+        ridge: addition to the diagonal of the normal matrix of scaled columns, for columns that are nearly alike.
+
+    Returns:
+        (..., K) coefficients and their standard errors; an undetermined coefficient is 0, or has a very large error with a ridge.
+
+    Example:
+        >>> import numpy as np
+        >>> from noiseflow.statistics import white_regression
+        >>> found, error = white_regression(np.ones((4, 1)), np.array([1.0, 3.0, 1.0, 3.0]))
+        >>> round(float(found[0]), 3), round(float(error[0]), 3)
+        (2.0, 0.577)
+    """
+    rows, fitted = columns.shape
+    scale = np.sqrt((columns**2).sum(0)) + 1e-30
+    scaled = columns / scale
+    inverse = np.linalg.pinv(scaled.T @ scaled + ridge * np.eye(fitted))
+    spread = scaled @ inverse
+    found = values @ spread
+    left = values - found @ scaled.T
+    # the factor corrects for the fitted coefficients, as in any estimate of a variance
+    errors = np.sqrt((left**2) @ spread**2 * (rows / max(1, rows - fitted)))
+    return found / scale, np.maximum(errors, 1e-30) / scale
+
+
+def block_means(images: Array, down: int, across: int) -> Array:
+    """Means of blocks of `down` × `across` pixels of (..., y, x) images; incomplete blocks at the far edges are dropped.
+
+    Example:
+        >>> import numpy as np
+        >>> from noiseflow.statistics import block_means
+        >>> block_means(np.array([[1.0, 3.0, 9.0], [5.0, 7.0, 9.0]]), 2, 2).tolist()
+        [[4.0]]
+    """
+    *stack, rows, columns = images.shape
+    height, width = rows // down, columns // across
+    whole = images[..., : height * down, : width * across]
+    return np.asarray(whole.reshape(*stack, height, down, width, across).mean((-3, -1)))

@@ -1,0 +1,36 @@
+"""The command `noiseflow export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption
+
+
+def export(
+    field: Annotated[Path, typer.Argument(help="Field of `noiseflow reconstruct --save-field` (.safetensors).")],
+    out: Annotated[
+        Path, typer.Option("--out", "--output", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")
+    ],
+    voxel_size: Annotated[
+        float | None, typer.Option(help="Edge length of the voxels, Å; that of the fit by default.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write the volume of a field, with voxels of any size."""
+    from noiseflow import io
+    from recon.fields.files import load_field, sampled_volume
+
+    output = Output(json)
+    io.require_other(out, field)
+    io.check_output(out, overwrite=overwrite)
+    volume = sampled_volume(load_field(field), voxel_size)
+    volume.write(out)
+    sizes = " x ".join(str(size) for size in volume.attenuation.shape)
+    size = "unknown" if volume.voxel_size is None else f"{volume.voxel_size:.4g}"
+    output.line(f"volume: {out}, {sizes} voxels (z, y, x) of {size} Å")
+    output.result({"volume": out, "shape": list(volume.attenuation.shape), "voxel_size": volume.voxel_size})

@@ -1,0 +1,109 @@
+"""Field files: safetensors with the kind of field and its settings as JSON metadata. Loading runs no code from the file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from noiseflow.installation import library_version
+from noiseflow.runs.outputs import check_output
+from noiseflow.runs.states import save_tensors
+from recon.fields._registry import find_field, name_of
+from recon.fields.fields import Field
+from recon.series.tilt_series import Volume
+
+FIELD_SUFFIXES = frozenset({".safetensors"})
+_FORMAT = "noiseflow field"
+_MASK = "occupied bits"
+
+
+def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] | None = None) -> Path:
+    """Save a field with its vacuum, voxel size and orientation.
+
+    Args:
+        field: a field whose class is registered, see `recon.fields.field_names`.
+        path: target, ``.safetensors``.
+        provenance: origin of the field, any JSON-serialisable mapping.
+
+    Raises:
+        ValueError: the class of the field is not registered, or the path cannot be written.
+
+    Example:
+        >>> import pathlib, recon, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "field.safetensors"
+        >>> _ = recon.fields.save_field(recon.CoordinateNetwork((8, 8, 8)), path)
+        >>> recon.fields.load_field(path).volume().shape
+        torch.Size([8, 8, 8])
+    """
+    path = check_output(path, suffixes=FIELD_SUFFIXES)
+    shape = (field.depth, field.height, field.width)
+    description = {"kind": name_of(field), "shape": shape, "scale": float(field.scale), "settings": field.config()}
+    description |= {"voxel_size": field.voxel_size, "flipped": field.flipped}
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.state_dict().items()}
+    if field.occupied is not None:
+        tensors[_MASK] = torch.from_numpy(np.packbits(field.occupied.cpu().numpy()))
+    metadata = {"format": _FORMAT, "library_version": library_version(), "field": json.dumps(description)}
+    save_tensors(path, tensors, metadata | {"provenance": json.dumps(dict(provenance or {}), default=str)})
+    return path
+
+
+def load_field(path: str | Path) -> Field:
+    """Load a field that `save_field` wrote.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: it is another file, or damaged.
+
+    Example:
+        >>> import pathlib, recon, tempfile, torch
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "field.safetensors"
+        >>> _ = recon.fields.save_field(recon.VoxelField((4, 4, 4)), path)
+        >>> recon.fields.load_field(path).at(torch.tensor([[1.5, 0.0, 3.0]])).shape
+        torch.Size([1])
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != _FORMAT:
+                raise ValueError(f"{path} is not a field; `noiseflow reconstruct --save-field` writes one")
+            known = json.loads(metadata["field"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        field = find_field(known["kind"])(known["shape"], scale=known["scale"], **known["settings"])
+        mask = tensors.pop(_MASK, None)
+        field.load_state_dict(tensors)
+        if mask is not None:
+            size = (field.depth, field.width, field.height)
+            bits = np.unpackbits(mask.numpy(), count=math.prod(size)).astype(bool)
+            field.occupied = torch.from_numpy(bits.reshape(size))
+        field.voxel_size, field.flipped = known["voxel_size"], tuple(known["flipped"])
+    except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is damaged ({type(error).__name__}); save the field again") from error
+    return field
+
+
+def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
+    """The volume of a field with voxels of this size, Å; its own if None.
+
+    Raises:
+        ValueError: the voxel size of the field is not known, or the new one is not positive.
+    """
+    if voxel_size is None:
+        return Volume(field.volume().cpu().numpy(), field.voxel_size)
+    if field.voxel_size is None:
+        raise ValueError(
+            f"--voxel-size {voxel_size:g}: the pixel size of the series is not known; give it, or set field.voxel_size"
+        )
+    if not 0 < voxel_size < math.inf:
+        raise ValueError(f"--voxel-size {voxel_size:g} must be positive and finite, in Å")
+    return Volume(field.sampled(voxel_size / field.voxel_size).numpy(), voxel_size)

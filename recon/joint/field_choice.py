@@ -1,0 +1,90 @@
+"""Choice of the field by the likelihood of held-out pixels, on the slab."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from torch import nn
+
+from noiseflow.progress import Progress
+from recon.fields._names import AUTO
+from recon.fields._registry import field_kinds
+from recon.fields.fields import Field
+from recon.joint.joint import JointReconstructor
+from recon.joint.plan import FitStage
+from recon.series.first_guess import contrast_slab
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """A field and the evidence for it.
+
+    Attributes:
+        name: the chosen field.
+        tried: field → held-out negative log-likelihood of the slab, nats per pixel, in the order tried.
+        slices: number of slices of the slab.
+    """
+
+    name: str
+    tried: dict[str, float]
+    slices: int
+
+    def in_words(self) -> str:
+        """The choice in one line."""
+        others = ", ".join(
+            f"{name} {nll - self.tried[self.name]:+.4f}" for name, nll in self.tried.items() if name != self.name
+        )
+        return f"{self.name} ({others} nats per held-out pixel of {self.slices} slices)"
+
+
+def choose_field(
+    fit: JointReconstructor,
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    kinds: Mapping[str, type[Field]],
+    *,
+    progress: Progress | None = None,
+) -> FieldChoice:
+    """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best.
+
+    Noise model and weight are chosen with the first field and kept for the others, so that only the field differs.
+
+    Args:
+        fit: the joint fit of the series.
+        tilt_series, grid: data and grid of the whole volume.
+        kinds: the fields by name.
+        progress: called with a task, completed and expected steps, and a note.
+    """
+    rows = contrast_slab(tilt_series, fit.num_slices(grid))
+    slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
+    tried: dict[str, float] = {}
+    for name, kind in kinds.items():
+        prefix = f"{fit.prefix}field {name}: "
+        result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)
+        if not tried:
+            fixed = result.likelihood or result.noise_model
+            fit = replace(fit, weight=result.weight, noise_model=partial(_frozen, fixed))
+        tried[name] = math.inf if result.fit_result is None else result.fit_result.held_out_nll
+    return FieldChoice(min(tried, key=lambda name: tried[name]), tried, slab_grid.height)
+
+
+def _frozen(noise_model: nn.Module | None) -> nn.Module:
+    if noise_model is None:
+        raise ValueError("a field is chosen by a likelihood; this fit has no noise model")
+    return noise_model.requires_grad_(False)
+
+
+def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:
+    """The stages of the choice, for the plan; none if the field is given."""
+    if field != AUTO:
+        return []
+    steps = fit.schedule.whole if fit.num_steps is None else fit.num_steps
+    return [
+        FitStage(
+            "choose field", "fields", "slab", "chosen", steps, rate=fit.schedule.rate, fits=len(field_kinds(field))
+        )
+    ]

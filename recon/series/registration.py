@@ -1,0 +1,331 @@
+"""Registration of two tilt series of one specimen, about two axes: rotation and shift in three dimensions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from noiseflow.described import described
+from noiseflow.progress import Progress
+from recon.series.alignment import Alignment
+from recon.series.alignment_search import line_integrals_of
+from recon.series.matching import Matcher
+from recon.series.tilt_series import TiltSeries
+
+Array = NDArray[np.float64]
+# widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
+_SEARCHED, _WIDTHS = 24, (24, 48, 80)
+_ITERATIONS, _ROUNDS = 30, 6
+# degrees: steps of the search within 40° of ±90°; volumes of 24 voxels overlap when they are 5° apart
+_SPACING, _WIDEST = 10.0, 40.0
+_CANDIDATES = 4
+_RELAXATION = 1.5  # of steps towards a volume that follows them by half
+_TURN, _MOVE = 0.02, 0.5  # radians and voxels, of numerical derivatives: half a voxel at the edge of 48
+# of the variance: unrelated specimens predict each other's images to less than a third, as all are bright in the middle
+_LEAST = 0.4
+
+
+@described(axis="°", first_offset="°", second_offset="°", shift="px")
+@dataclass(frozen=True)
+class Registration:
+    """The position of a second tilt axis relative to the first, and what it explains.
+
+    The specimen is tilted about the first axis with its angles minus `first_offset`. Turned in its plane, it is tilted about the
+    second axis with the angles of the second series, negated if `inverted`, plus `second_offset`.
+
+    Attributes:
+        axis: direction of the second axis in the plane of the specimen, degrees from the first axis towards −x.
+        first_offset, second_offset: degrees.
+        shift: (z, y, x) of the centre of the second series from that of the first, pixels.
+        inverted: whether the tilt angles of the second series had the opposite sign of those of the first.
+        explained: share of the variance of the images of each series that the volume of the other one predicts.
+    """
+
+    axis: float
+    first_offset: float
+    second_offset: float
+    shift: tuple[float, float, float]
+    inverted: bool
+    explained: tuple[float, float]
+
+    def of_first(self, tilt_series: TiltSeries) -> TiltSeries:
+        """The first series, with its angles in the common frame."""
+        return replace(tilt_series, tilt_angles=tilt_series.tilt_angles - self.first_offset)
+
+    def of_second(self, alignment: Alignment) -> Alignment:
+        """The alignment of the raw images of the second series with the shifts and angles of this registration."""
+        refined = alignment.tilt_angles if alignment.refined_angles is None else alignment.refined_angles
+        angles = (-refined if self.inverted else refined) + self.second_offset
+        psi, theta = np.deg2rad(self.axis), np.deg2rad(angles)
+        z, y, x = self.shift
+        along = np.full_like(theta, y * np.cos(psi) - x * np.sin(psi))
+        across = (x * np.cos(psi) + y * np.sin(psi)) * np.cos(theta) + z * np.sin(theta)
+        moved = alignment.moved(-np.stack([along, across], 1))
+        if abs(self.axis) < 180 and self.axis > 0:
+            return replace(moved, refined_angles=angles)
+        return replace(moved, tilt_axis=moved.tilt_axis + 180, refined_angles=-angles)
+
+    @property
+    def stored_axis(self) -> float:
+        """The direction modulo 180°, near 90°; images of a direction near −90° are turned by 180°."""
+        return self.axis % 180
+
+    def in_words(self) -> str:
+        """One line."""
+        offsets = f"tilt angles {-self.first_offset:+.2f}° and {self.second_offset:+.2f}°"
+        sign = ", of the opposite sign" if self.inverted else ""
+        return (
+            f"second axis at {self.axis:.2f}° to the first; {offsets}{sign}; shift (z, y, x) "
+            f"{', '.join(f'{value:.2f}' for value in self.shift)} pixels; each series explains {self.explained[0]:.1%} and "
+            f"{self.explained[1]:.1%} of the other"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "axis_degrees": self.axis,
+            "angle_offsets_degrees": [-self.first_offset, self.second_offset],
+            "shift_zyx_pixels": list(self.shift),
+            "tilt_sign_inverted": self.inverted,
+            "explained": list(self.explained),
+        }
+
+
+def register(
+    first: TiltSeries, second: TiltSeries, *, device: torch.device | str = "cpu", progress: Progress | None = None
+) -> Registration:
+    """Find the rotation and shift between two aligned series of one specimen.
+
+    Coarse volumes of both series are compared for directions of the second axis within 40° of ±90° and both signs of its tilt
+    angles, by their cross-correlation. From the best ones, Gauss–Newton steps of rotation and shift minimise the differences
+    between the images of each series and the projections of the volume of the other one, at widths up to 80 pixels. Volumes
+    differ in their missing wedges, but images do not.
+
+    Args:
+        first, second: aligned, each with its axis along y.
+        device: torch device.
+        progress: called at every size.
+
+    Raises:
+        ValueError: pixel sizes or modes differ, or the volumes have little in common.
+    """
+    _require_alike(first, second)
+    with torch.no_grad():
+        lines = [line_integrals_of(series).to(device) for series in (first, second)]
+        size = max(max(series.images.shape[1:]) for series in (first, second))
+        widths = sorted({min(width, size) for width in _WIDTHS})
+        found: list[_Pose] = []
+        for done, width in enumerate(widths):
+            pair = _Pair(lines, (first, second), max(1, round(size / width)), size)
+            if not found:
+                found = sorted((pair.refined(pose) for pose in pair.candidates()), key=lambda pose: pose.error)
+            found = [pair.refined(found[0])]
+            if progress is not None:
+                progress("registering", done + 1, len(widths), f"explained {1 - found[0].error / 2:.1%}")
+        if (share := 1 - found[0].error / 2) < _LEAST:
+            raise ValueError(
+                f"the two series do not show one specimen about axes near 90° apart: the volume of each explains {share:.0%} of "
+                "the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
+            )
+        return _registration(pair.settled(found[0]), pair)
+
+
+def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
+    sizes = first.pixel_size, second.pixel_size
+    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > 0.02:
+        raise ValueError(f"the two series have pixels of {sizes[0]:.4g} Å and {sizes[1]:.4g} Å; bin them to one size")
+    if first.mode != second.mode:
+        raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """Coordinates (x, y, z) of the second frame are `rotation` @ (those of the first − `shift`), raw pixels."""
+
+    rotation: Tensor
+    shift: Tensor
+    inverted: bool
+    error: float = math.inf
+    explained: tuple[float, float] = (0.0, 0.0)
+
+
+class _Pair:
+    """Both series at one size, with a volume of each."""
+
+    def __init__(self, lines: list[Tensor], series: tuple[TiltSeries, TiltSeries], binning: int, size: int) -> None:
+        self.binning = binning
+        self.matchers, self.images, self.seen, self.volumes = [], list[Tensor](), list[Tensor](), list[Tensor]()
+        for each, of in zip(lines, series, strict=True):
+            used = None if of.mask is None else torch.from_numpy(of.mask).float().to(each.device)
+            matcher = Matcher(each, of.tilt_angles, binning, used, size=size // binning)
+            images, seen = matcher.aligned(0.0, matcher.in_own_pixels(torch.zeros(len(each), 2, device=each.device)))
+            self.matchers.append(matcher)
+            self.images.append(images)
+            self.seen.append(seen)
+            self.volumes.append(matcher.sirt(images, seen, None, _ITERATIONS))
+
+    def candidates(self) -> list[_Pose]:
+        """The directions of the second axis at which whole volumes correlate best, with their shifts."""
+        found = []
+        steps = np.arange(-_WIDEST, _WIDEST + 1, _SPACING)
+        for inverted in (False, True):
+            second = self.volumes[1].flip(0) if inverted else self.volumes[1]
+            for degrees in (*(90 + steps), *(-90 + steps)):
+                rotation = _in_plane(math.radians(degrees)).to(second)
+                turned = _sampled(self.volumes[0], rotation, torch.zeros_like(rotation[0]))
+                peak, move = _correlated(turned, second)
+                pose = _Pose(rotation, -(rotation.T @ move) * self.binning, inverted)
+                found.append((peak, pose))
+        found.sort(key=lambda pair: -pair[0])
+        kept: list[_Pose] = []
+        for _, pose in found:
+            near = (
+                other.inverted == pose.inverted and float((other.rotation - pose.rotation).norm()) < math.radians(30)
+                for other in kept
+            )
+            if not any(near):
+                kept.append(pose)
+        return kept[:_CANDIDATES]
+
+    def refined(self, pose: _Pose) -> _Pose:
+        """Gauss–Newton steps; the best pose that was seen."""
+        best = self._judged(pose)
+        for _ in range(_ROUNDS):
+            tried = self._judged(self._stepped(best, self._residuals))
+            if tried.error >= best.error:
+                break
+            best = tried
+        return best
+
+    def settled(self, pose: _Pose) -> _Pose:
+        """Gauss–Newton steps towards a volume of both series, which lacks less of its frequencies than that of one series."""
+        volume = (self.volumes[0] + self._from_second(self.volumes[1], pose)) / 2
+        for _ in range(_ROUNDS):
+            volume = self._of_both(volume, pose)
+            pose = self._stepped(pose, partial(self._from_volume, volume), _RELAXATION)
+        return self._judged(pose)
+
+    def _from_volume(self, volume: Tensor, pose: _Pose) -> tuple[Tensor, ...]:
+        """Images of the second series minus the projections of a volume in the frame of the first."""
+        return (self._residual(1, self._to_second(volume, pose)),)
+
+    def _of_both(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """SIRT iterations with the images of both series; a turn back stands for the adjoint of a turn."""
+        first, second = self.matchers
+        weights = [matcher.projector.T(seen) for matcher, seen in zip(self.matchers, self.seen, strict=True)]
+        inverse = 1 / (weights[0] + self._from_second(weights[1], pose)).clamp_min(1)
+        lengths = [matcher.projector(torch.ones_like(volume)).clamp_min(1) for matcher in self.matchers]
+        for _ in range(_ITERATIONS // 3):
+            here = (self.images[0] - first.projector(volume)) * self.seen[0] / lengths[0]
+            there = (self.images[1] - second.projector(self._to_second(volume, pose))) * self.seen[1] / lengths[1]
+            update = first.projector.T(here) + self._from_second(second.projector.T(there), pose)
+            volume = (volume + inverse * update).clamp_min(0)
+        return volume
+
+    def _to_second(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """A volume in the frame of the second series."""
+        found = _sampled(volume, pose.rotation, pose.shift / self.binning)
+        return found.flip(0) if pose.inverted else found
+
+    def _from_second(self, volume: Tensor, pose: _Pose) -> Tensor:
+        """The reverse."""
+        back = -(pose.rotation @ pose.shift) / self.binning
+        return _sampled(volume.flip(0) if pose.inverted else volume, pose.rotation.T, back)
+
+    def _residuals(self, pose: _Pose) -> tuple[Tensor, ...]:
+        """Images of the first and second series minus the projections of the other's volume, and 0 where nothing is seen."""
+        here, there = self._from_second(self.volumes[1], pose), self._to_second(self.volumes[0], pose)
+        return self._residual(0, here), self._residual(1, there)
+
+    def _residual(self, number: int, volume: Tensor) -> Tensor:
+        predicted, images, seen = self.matchers[number].projector(volume), self.images[number], self.seen[number]
+        scale = (predicted * images * seen).sum() / (predicted.square() * seen).sum().clamp_min(1e-30)
+        return (images - scale * predicted) * seen
+
+    def _judged(self, pose: _Pose) -> _Pose:
+        shares = [
+            float(left.square().sum() / whole) for left, whole in zip(self._residuals(pose), self._power, strict=True)
+        ]
+        return replace(pose, error=sum(shares), explained=(1 - shares[0], 1 - shares[1]))
+
+    @property
+    def _power(self) -> list[Tensor]:
+        """The variance of the images of each series, times the number of pixels."""
+        means = [(images * seen).sum() / seen.sum() for images, seen in zip(self.images, self.seen, strict=True)]
+        return [
+            ((images - mean).square() * seen).sum()
+            for images, seen, mean in zip(self.images, self.seen, means, strict=True)
+        ]
+
+    def _stepped(self, pose: _Pose, residuals: Callable[[_Pose], tuple[Tensor, ...]], relaxation: float = 1.0) -> _Pose:
+        """A Gauss–Newton step of rotation and shift."""
+        columns, start = list[Tensor](), _joined(residuals(pose))
+        for number in range(6):
+            step = torch.zeros(6, dtype=torch.float64)
+            step[number] = _TURN if number < 3 else _MOVE * self.binning
+            down, up = (_joined(residuals(_moved(pose, sign * step))) for sign in (-1, 1))
+            columns.append((up - down) / (2 * step[number]))
+        slopes = torch.stack(columns)
+        step = torch.linalg.lstsq(slopes @ slopes.T, (slopes @ start)[:, None]).solution[:, 0].cpu()
+        return _moved(pose, -relaxation * step)
+
+
+def _joined(residuals: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat([residual.flatten() for residual in residuals]).double()
+
+
+def _moved(pose: _Pose, step: Tensor) -> _Pose:
+    """A pose turned by a small rotation vector in the second frame, and shifted."""
+    x, y, z = step[:3].tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    turn = torch.linalg.matrix_exp(cross).to(pose.rotation)
+    return replace(pose, rotation=turn @ pose.rotation, shift=pose.shift + step[3:].to(pose.shift))
+
+
+def _in_plane(angle: float) -> Tensor:
+    """Coordinates (x, y, z) in a frame turned about z."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _sampled(volume: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
+    """A cube in a frame whose coordinates are `rotation` @ (those of the volume − `shift`), voxels."""
+    matrix = torch.cat([rotation.T, 2 * shift[:, None] / volume.shape[0]], 1)
+    grid = functional.affine_grid(matrix[None], [1, 1, *volume.shape], align_corners=False)
+    # cubes are (z, y, x), and grids hold (x, y, z)
+    return functional.grid_sample(volume[None, None], grid, mode="bilinear", align_corners=False)[0, 0]
+
+
+def _correlated(one: Tensor, other: Tensor) -> tuple[float, Tensor]:
+    """The largest normalised cross-correlation, and the shift (x, y, z) of `other` from `one`."""
+    size = one.shape[0]
+    spectra = [torch.fft.rfftn(each - each.mean(), s=[2 * size] * 3) for each in (one, other)]
+    found = torch.fft.irfftn(spectra[1] * spectra[0].conj(), s=[2 * size] * 3)
+    place = torch.tensor(np.unravel_index(int(found.argmax()), found.shape))
+    place = torch.where(place >= size, place - 2 * size, place)
+    norm = ((one - one.mean()).norm() * (other - other.mean()).norm()).clamp_min(1e-30)
+    return float(found.max() / norm), place.flip(0).to(one)
+
+
+def _registration(pose: _Pose, pair: _Pair) -> Registration:
+    """The rotation as one about the first axis, one in the plane of the specimen, and one about the second axis."""
+    rotation, shift = pose.rotation.double().cpu().numpy(), pose.shift.double().cpu().numpy()
+    sign = 1.0 if rotation[0, 1] > 0 else -1.0
+    first = math.atan2(-sign * rotation[1, 2], -sign * rotation[1, 0])
+    second = math.atan2(-sign * rotation[2, 1], sign * rotation[0, 1])
+    axis = sign * math.acos(max(-1.0, min(1.0, float(rotation[1, 1]))))
+    cosine, sine = math.cos(first), math.sin(first)
+    x, y, z = shift
+    common = (-x * sine + z * cosine, y, x * cosine + z * sine)
+    return Registration(
+        math.degrees(axis), math.degrees(first), math.degrees(second), common, pose.inverted, pose.explained
+    )

@@ -1,0 +1,151 @@
+"""Faults that leave every histogram Poisson-Gaussian: they are measured, excluded or reported."""
+
+import numpy as np
+import pytest
+
+from calibration.camera import calibrate_camera
+from calibration.detector.emva import measure_camera
+from calibration.exposures.frames import Burst, ExposurePair
+from calibration.exposures.outliers import without_outliers
+from calibration.pipeline import measure_exposures
+
+from . import simulators as sim
+
+
+def reasons(found):
+    return {one.name for one in found.verdict.reasons}
+
+
+def calibration_burst(frames):
+    return Burst(np.stack(frames), calibration=True)
+
+
+def bent(generator, electrons, power, *, around):
+    """Pixel values of a response ∝ light^power with a local gain of 2·power counts per electron at `around` electrons."""
+    counts = 2 * around * (generator.poisson(electrons) / around) ** power
+    return np.round(100 + counts + 6 * generator.standard_normal(electrons.shape))
+
+
+@pytest.mark.parametrize("power", [0.9, 1.1])
+def test_dark_frames_tell_the_exponent_of_the_response(power):
+    generator = np.random.default_rng(1)
+    scene = sim.random_scene(generator, 192)
+    around = scene.mean()
+    exposures = [ExposurePair(*(bent(generator, times * scene, power, around=around) for times in (1, 16)))]
+    found = measure_exposures(exposures)
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.q05 < 2 * power < found.figures.gain.q95
+    dark = calibration_burst([bent(generator, 0 * scene, power, around=around) for _ in range(4)])
+    found = measure_exposures(exposures, dark=dark)
+    assert reasons(found) == {"nonlinear response"}
+    assert found.detector.response.exponent == pytest.approx(power, abs=4 * found.detector.response.error)
+    assert found.figures.gain.median == pytest.approx(2 * power, rel=0.06)
+
+
+def test_a_linear_response_with_dark_frames_leaves_the_interval_narrow():
+    generator = np.random.default_rng(2)
+    scene = sim.random_scene(generator)
+    dark = calibration_burst([sim.exposed(generator, 0 * scene) for _ in range(4)])
+    found = measure_exposures([ExposurePair(*sim.clean(generator, scene))], dark=dark)
+    gain = found.figures.gain
+    assert (found.verdict.grade, found.detector.response.known) == ("good", True)
+    assert gain.q95 - gain.q05 < 0.1 * gain.median
+
+
+def test_flats_divided_by_their_shading_are_reported_and_shaded_ones_are_not():
+    generator = np.random.default_rng(3)
+    y, x = np.indices((128, 128)) / 127 - 0.5
+    shading = 1 - 1.2 * (x**2 + y**2)
+
+    def frames(electrons, by):
+        values = [sim.exposed(generator, electrons * shading, rounded=False) for _ in range(3)]
+        return calibration_burst([np.round(100 + (one - 100) / by) for one in values])
+
+    levels = (100.0, 500.0, 2000.0)
+    divided = calibrate_camera([frames(level, shading) for level in levels], [frames(0.0, shading)])
+    assert "uneven field" in reasons(divided)
+    shaded = calibrate_camera([frames(level, 1.0) for level in levels], [frames(0.0, 1.0)])
+    assert shaded.verdict.grade == "good"
+    assert shaded.figures.gain.median == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("of", [lambda y, x: x >= 64, lambda y, x: x % 2, lambda y, x: (y % 2 == 0) & (x % 2 == 0)])
+def test_gains_of_halves_columns_and_mosaics_are_reported_by_class(of):
+    generator = np.random.default_rng(4)
+    scene = sim.random_scene(generator, 128)
+    gain = np.where(of(*np.indices(scene.shape)), 2.5, 2.0)
+    pair = measure_exposures([ExposurePair(*(sim.exposed(generator, t * scene, gain=gain) for t in (1, 16)))])
+    flats = [
+        calibration_burst([sim.exposed(generator, 0 * scene + e, gain=gain) for _ in range(3)])
+        for e in (0, 100, 400, 900)
+    ]
+    camera = calibrate_camera(flats[1:], flats[:1])
+    for found in (pair, camera):
+        assert reasons(found) == {"uneven gains"}
+    ratio = max(camera.figures.pattern.factors) / min(camera.figures.pattern.factors)
+    assert ratio == pytest.approx(1.25, abs=0.06)
+
+
+def test_cosmic_rays_are_excluded_and_counted():
+    generator = np.random.default_rng(5)
+    scene = sim.random_scene(generator)
+
+    def struck(image):
+        hit = generator.random(image.shape) < 1e-3
+        return image + np.round(np.where(hit, 100 + generator.exponential(500, image.shape), 0))
+
+    short, long = sim.clean(generator, scene)
+    found = measure_exposures([ExposurePair(struck(short), long)])
+    assert found.verdict.grade == "good"
+    assert found.figures.linear.median == pytest.approx(2.0, rel=0.03)
+    assert found.pairs[0].counts.outliers > 40
+    level = np.full((96, 96), 1000.0)
+    flats = [calibration_burst([struck(sim.exposed(generator, s * level)) for _ in range(2)]) for s in (0.1, 1.0)]
+    dark = calibration_burst([sim.exposed(generator, 0 * level) for _ in range(4)])
+    camera = measure_camera(flats, [dark])
+    assert camera.gain.median == pytest.approx(2.0, rel=0.03)
+    assert 20 < camera.outliers < 60
+
+
+@pytest.mark.parametrize("shape", [(2, 64, 64), (6, 64, 64), (400, 3, 3)])
+@pytest.mark.parametrize("electrons", [0.2, 5.0, 100.0])
+def test_tails_of_noise_are_no_outliers(shape, electrons):
+    generator = np.random.default_rng(6)
+    frames = sim.exposed(generator, np.full(shape, electrons))
+    again, number = without_outliers(frames)
+    assert number <= 1
+    assert again.var(axis=0).mean() == pytest.approx(frames.var(axis=0).mean(), rel=0.01)
+
+
+def test_nine_pixels_of_an_emccd_have_its_excess_factor_and_no_correlation():
+    generator = np.random.default_rng(7)
+
+    def frames(electrons):
+        level = np.full((3, 3), electrons)
+        return calibration_burst(
+            [sim.multiplied(generator, level, gain=100.0, offset=500.0, read=30.0) for _ in range(3000)]
+        )
+
+    found = calibrate_camera([frames(level) for level in (2.0, 5.0, 12.0, 25.0, 50.0, 100.0)], [frames(0.0)])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.median == pytest.approx(200.0, rel=0.03)
+    assert found.figures.excess_factor.q05 < 2.0 < found.figures.excess_factor.q95
+    assert found.figures.excess_factor.median == pytest.approx(2.0, abs=0.35)
+
+
+def test_a_given_exposure_ratio_tells_the_exponent():
+    generator = np.random.default_rng(8)
+    scene = sim.random_scene(generator, 192)
+    around = scene.mean()
+    bent_pair, straight = (
+        ExposurePair(
+            bent(generator, scene, power, around=around), bent(generator, 16 * scene, power, around=around), 16.0
+        )
+        for power in (0.95, 1.0)
+    )
+    found = measure_exposures([bent_pair])
+    assert reasons(found) == {"nonlinear response"}
+    assert found.figures.gain.median == pytest.approx(1.9, rel=0.05)
+    found = measure_exposures([straight])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median

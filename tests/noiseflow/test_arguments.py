@@ -1,0 +1,153 @@
+"""Arguments out of range, pixels that cannot be used, and metrics of bad inputs: each is one clear error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import noiseflow
+from noiseflow import metrics
+
+SIGNAL = torch.linspace(0, 1, 5000)
+OBSERVATION = SIGNAL + 0.1 * torch.randn(5000, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        {"held_out": 0},
+        {"held_out": 1.5},
+        {"held_out": torch.full((5000,), 0.3)},
+        {"num_steps": -3},
+        {"num_steps": 2.5},
+        {"batch_size": 0},
+        {"learning_rate": -1.0},
+        {"learning_rate": float("nan")},
+        {"learning_rate": "fast"},
+        {"warm_up": 2},
+        {"noise_interval": 0},
+        {"noise_steps": -1},
+        {"mask": torch.linspace(0, 1, 5000)},
+        {"mask": torch.ones(4999, dtype=torch.bool)},
+    ],
+    ids=str,
+)
+def test_fit_names_the_argument_that_is_wrong(argument: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(argument))):
+        noiseflow.fit(noiseflow.Gaussian(), SIGNAL, OBSERVATION, **({"num_steps": 3} | argument))
+
+
+def test_select_checks_its_arguments_too() -> None:
+    for argument in ({"held_out": 1.5}, {"num_steps": -1}, {"mask": torch.full((5000,), 0.5)}):
+        with pytest.raises(ValueError, match=next(iter(argument))):
+            noiseflow.select(SIGNAL, OBSERVATION, candidates={"Gaussian": noiseflow.Gaussian()}, **argument)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        ("Gaussian", {"scale": 0.0}),
+        ("Gaussian", {"scale": float("nan")}),
+        ("Poisson", {"gain": -1.0}),
+        ("PoissonGaussian", {"read_noise": 0.0}),
+        ("PoissonGaussian", {"offset": float("inf")}),
+        ("ExcessNoise", {"excess_factor": 1.0}),
+        ("DeadTimeCounter", {"dead_time": 1.0}),
+        ("Mixture", {"num_components": 0}),
+        ("Mixture", {"num_components": 2.5}),
+        ("RadialFlow", {"num_layers": -1}),
+        ("RadialFlow", {"neighbourhood": 2}),
+        ("SplineFlow", {"num_bins": 0}),
+        ("SplineFlow", {"width": 0}),
+        ("PhysicsFlow", {"num_bins": 0}),
+    ],
+)
+def test_constructors_name_the_argument_that_is_wrong(kind: str, arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        getattr(noiseflow, kind)(**arguments)
+
+
+def test_exchanged_images_are_recognised() -> None:
+    with pytest.raises(ValueError, match="exchanged"):
+        noiseflow.fit(noiseflow.Gaussian(), OBSERVATION, SIGNAL, num_steps=3)
+
+
+@pytest.mark.parametrize("low", [-1.0, 0.3])
+def test_clipped_and_biased_observations_are_not_taken_for_exchanged_ones(low: float) -> None:
+    noiseflow.fit(noiseflow.Gaussian(), SIGNAL, 1.05 * OBSERVATION.clamp(low, 0.9), num_steps=3, digitise=False)
+
+
+def test_complex_pixels_are_refused() -> None:
+    for pair in ((SIGNAL, OBSERVATION + 0j), (SIGNAL + 0j, OBSERVATION)):
+        with pytest.raises(ValueError, match="complex"):
+            noiseflow.fit(noiseflow.Gaussian(), *pair, num_steps=3)
+        with pytest.raises(ValueError, match="complex"):
+            metrics.evaluate(noiseflow.Gaussian(), *pair)
+
+
+def test_pixels_whose_precision_hides_the_noise_are_refused() -> None:
+    signal = 3e4 + SIGNAL.double()
+    observation = signal + 1e-3 * torch.randn(5000, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    noise_model = noiseflow.Gaussian(1e-3)
+    assert metrics.evaluate(noise_model, signal, observation).nll == pytest.approx(-5.49, abs=0.03)
+    with pytest.raises(ValueError, match="precision"):
+        metrics.evaluate(noise_model, signal.float(), observation.float())
+
+
+def test_constructors_leave_the_global_random_state_alone() -> None:
+    before = torch.get_rng_state()
+    for kind in ("SplineFlow", "RadialFlow", "Mixture", "PhysicsFlow", "SignalDependentGaussian"):
+        getattr(noiseflow, kind)()
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [
+        ([5, 5], [0.5, 0.5]),
+        ([float("nan"), 1.0], [0.5, 0.5]),
+        ([-0.5, 1.5], [0.5, 0.5]),
+        ([0.5, 0.5], [0.25, 0.25, 0.5]),
+        (0.5, 0.5),
+    ],
+)
+def test_distances_refuse_what_is_no_probability(p: Any, q: Any) -> None:
+    for distance in (metrics.jensen_shannon, metrics.bhattacharyya):
+        with pytest.raises(ValueError, match=r"give|divide"):
+            distance(p, q)
+
+
+def test_distances_take_lists() -> None:
+    assert float(metrics.jensen_shannon([0.5, 0.5], [0.5, 0.5])) == 0
+    assert float(metrics.bhattacharyya([1, 0], [0, 1])) == 0
+    assert metrics.kolmogorov_smirnov([0.5]) == 0.5
+    for values in ([], [0.5, 2.0], [0.5, float("nan")]):
+        with pytest.raises(ValueError, match="integral transform"):
+            metrics.kolmogorov_smirnov(values)
+
+
+def test_divergence_takes_images_and_masks() -> None:
+    signal, observation = (each.reshape(50, 100).numpy() for each in (SIGNAL, OBSERVATION))
+    whole = metrics.divergence(noiseflow.Gaussian(0.1), signal, observation)
+    spoilt = observation.copy()
+    spoilt[0] = 100.0
+    masked = np.ma.masked_array(spoilt, mask=spoilt == 100.0)
+    assert whole.jsd < 2 * whole.jsd_floor
+    found = metrics.divergence(noiseflow.Gaussian(0.1), signal, masked)
+    assert found.jsd < 2 * found.jsd_floor
+
+
+def test_tails_show_what_the_divergence_does_not() -> None:
+    """Five pixels in a thousand are ten times wider."""
+    random = torch.Generator().manual_seed(2)
+    noise = torch.randn(40_000, generator=random)
+    noise[:200] *= 10
+    found = metrics.evaluate(noiseflow.Gaussian(float(noise.std())), torch.zeros(40_000), noise, num_signal_bins=1)
+    tail = found.tails[0]
+    assert tail.observed[1] > 10 * tail.expected[1]
+    assert tail.p_value[1] < 1e-6
+    fair = metrics.evaluate(noiseflow.Gaussian(1.0), torch.zeros(40_000), torch.randn(40_000, generator=random))
+    assert min(p for tail in fair.tails for p in tail.p_value) > 1e-4
