@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 2
 
-.PHONY: demo test test-shard test-slow fuzz soak mutation check lint docs gallery clean
+.PHONY: demo core test test-shard test-slow fuzz soak mutation check lint docs gallery clean
 
 demo: .venv/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
@@ -11,6 +11,15 @@ demo: .venv/demo-ready
 test: export OMP_NUM_THREADS := 1
 test: .venv/test-ready
 	$(BIN)/python -m pytest -n 2
+
+# Laws, contracts, projector and its adjoint, formats, plan: less than a minute of one core, for every change.
+CORE := tests/test_architecture.py tests/noiseflow/test_statistics.py tests/noiseflow/runs tests/noiseflow/io/test_mrc.py \
+	tests/noiseflow/io/test_images.py tests/noiseflow/fitting/test_pixels.py tests/noiseflow/metrics/test_metrics.py \
+	tests/noiseflow/models/test_digitised_model.py tests/noiseflow/distributions/test_law.py \
+	tests/noiseflow/distributions/test_normal.py tests/recon/projection tests/recon/metrics tests/recon/joint/test_plan.py
+core: export OMP_NUM_THREADS := 1
+core: .venv/test-ready
+	$(BIN)/python -m pytest $(CORE)
 
 # What CI runs: all fast tests and one share of the slow ones, SHARD=K/N.
 test-shard: export OMP_NUM_THREADS := 1

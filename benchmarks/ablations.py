@@ -13,8 +13,8 @@ from torch import nn
 from benchmarks.defocus import STRENGTH, defocused_scene
 from benchmarks.external import missing
 from benchmarks.network import WIDTHS, fit_network
-from benchmarks.scenes import Cell, Results, Scene, make_scene
-from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised
+from benchmarks.scenes import EMPTY, Cell, Results, Scene, make_scene
+from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.kinds.voxels import VoxelField
@@ -85,6 +85,7 @@ def _once(scene: Scene, **options: Any) -> Best:
 
 def _likelihoods(scene: Scene) -> list[Variant]:
     variants: dict[str, Callable[[], Best]] = {
+        EMPTY: lambda: empty_volume(scene),
         "L1": lambda: _searched(scene, noise_model=Laplace),
         "L2": lambda: _searched(scene, noise_model=Gaussian),
         "true noise (oracle)": lambda: _searched(scene, noise_model=lambda: scene.noise_model),

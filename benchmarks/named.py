@@ -16,7 +16,7 @@ from benchmarks.rivals import Effort
 from benchmarks.scenes import Results, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.ownership import require_own, signature
+from noiseflow.runs.ownership import require_own, signature
 from recon.methods._classical import part_of
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import fourier_shell_correlation, resolution

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from benchmarks.external import missing
-from benchmarks.scenes import Cell, Results, Scene
-from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
+from benchmarks.scenes import EMPTY, Cell, Results, Scene
+from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume, sirts
 from noiseflow import Digitised, Gaussian, SplineFlow, detect_digitisation, fit
 from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import compare
@@ -27,7 +27,7 @@ PUBLISHED: dict[str, tuple[float, float, float, float, float]] = {
 """2D PSNR (dB), 100·MSE and 10·DSSIM, 3D PSNR and 100·MSE, as printed, except that MSE and DSSIM of the last five rows are
 exchanged: in print their columns are swapped (10·log10 of the printed DSSIM/100 is the printed PSNR)."""
 
-METHODS = (*PUBLISHED, "oracle")
+METHODS = (*PUBLISHED, "oracle", EMPTY)
 _CLEAN = 0.02  # initial weight of the search for data without noise
 CLEAN_STEPS = 4 * STEPS  # without noise a fit improves for much longer
 
@@ -58,6 +58,7 @@ def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
         return Best(f"chose weight {result.weight:.3g}", result.volume.attenuation, {})
 
     return {
+        EMPTY: lambda: empty_volume(scene),
         "WBP": lambda: best(back_projections(noisy, grid), score),
         "SIRT": lambda: best(sirts(noisy, grid), score),
         "L2, noisy images": lambda: best_fit(noisy, grid, least_squares, score),

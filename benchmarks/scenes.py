@@ -26,6 +26,8 @@ from recon.simulate.simulation import ACQUISITIONS, add_noise, angles_between, c
 
 Array = NDArray[Any]
 Cell = dict[str, Any]
+EMPTY = "empty volume"
+"""Name of the row without attenuation, whose score every method has to exceed."""
 
 
 @dataclass(frozen=True)

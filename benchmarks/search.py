@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes import Scene
 from recon.denoise.denoisers import find_denoiser
 from recon.joint.joint import JointReconstructor
 from recon.joint.weight import choose_weight
@@ -49,6 +50,11 @@ class Best:
     def at_an_end(self) -> bool:
         """Whether the best setting is the first or last one tried, so that a wider search might find a better one."""
         return len(self.tried) > 1 and self.setting in (next(iter(self.tried)), list(self.tried)[-1])
+
+
+def empty_volume(scene: Scene) -> Best:
+    """No attenuation anywhere: a score that every method has to exceed."""
+    return Best("no attenuation", np.zeros_like(scene.truth), {})
 
 
 def best(candidates: Iterable[Candidate], score: Callable[[Array], float]) -> Best:

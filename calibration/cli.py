@@ -78,52 +78,47 @@ def calibrate(
     device: DeviceOption = "auto",
 ) -> None:
     """Measure a detector's gain, offset and read noise and fit a noise model, from exposure pairs, bursts, or flats and darks."""
+    inputs = [*(short or []), *(long or []), *(dark or []), *(flat or [])]
+    with progress_shown(json_mode=json) as progress:
+        progress("Reading exposures", 0, 1, "")  # before the imports, which take most of a second
+        from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
+        from calibration.camera import MAPS, map_path
+        from calibration.detector.models import SIMPLE, require_kind
+        from noiseflow.io import check_folder, check_output, require_other
+        from noiseflow.io.model_files import MODEL_SUFFIXES
+
+        check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
+        require_other(output, *inputs)
+        if report is not None:
+            check_folder(report, holds=["report.html"], beside=[output], overwrite=overwrite)
+        require_kind(kind)
+        for path in () if short else (map_path(output, name) for name in MAPS):
+            check_output(path, overwrite=overwrite)
+            require_other(path, *inputs)
+        if short:
+            _require_fitting(long, flat_time, dark_time, exposure_ratio)
+            exposures = (
+                read_pairs(short, long, exposure_ratio=exposure_ratio, channel=channel)
+                if long
+                else read_burst(short, channel=channel)
+            )
+            findings = calibrate_exposures(
+                exposures,
+                dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
+                flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
+                kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
+                seed=seed,
+                device=_device(device),
+                progress=progress,
+            )
+    if not short:
+        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, channel, output, report, seed, Output(json))
+        return
     import noiseflow
-    from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
-    from calibration.camera import MAPS, map_path
-    from calibration.detector.models import SIMPLE, require_kind
     from calibration.pipeline import saved_model
     from calibration.report.figures import LABELS
     from calibration.report.page import write_report
-    from noiseflow.io import check_folder, check_output, require_other
-    from noiseflow.io.model_files import MODEL_SUFFIXES
 
-    inputs = [*(short or []), *(long or []), *(dark or []), *(flat or [])]
-    check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
-    require_other(output, *inputs)
-    if report is not None:
-        check_folder(report, holds=["report.html"], beside=[output], overwrite=overwrite)
-    require_kind(kind)
-    chosen_device = _device(device)
-    if not short:
-        for path in (map_path(output, name) for name in MAPS):
-            check_output(path, overwrite=overwrite)
-            require_other(path, *inputs)
-        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, channel, output, report, seed, Output(json))
-        return
-    if flat_time or dark_time:
-        raise ValueError(
-            "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
-        )
-    if not long and exposure_ratio is not None:
-        raise ValueError(
-            "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
-        )
-    exposures = (
-        read_pairs(short, long, exposure_ratio=exposure_ratio, channel=channel)
-        if long
-        else read_burst(short, channel=channel)
-    )
-    with progress_shown(json_mode=json) as progress:
-        findings = calibrate_exposures(
-            exposures,
-            dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
-            flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
-            kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
-            seed=seed,
-            device=chosen_device,
-            progress=progress,
-        )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
     model = saved_model(best.model, findings)
@@ -134,6 +129,20 @@ def calibrate(
     _report(out, findings)
     out.line(f"Noise model ({LABELS[best.name]}): {output}" + (f"\nReport: {page}" if page else ""))
     out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
+
+
+def _require_fitting(
+    long: list[Path] | None, flat_time: list[float] | None, dark_time: list[float] | None, exposure_ratio: float | None
+) -> None:
+    """Reject options that do not apply to exposures of a scene."""
+    if flat_time or dark_time:
+        raise ValueError(
+            "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
+        )
+    if not long and exposure_ratio is not None:
+        raise ValueError(
+            "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
+        )
 
 
 def _calibrate_camera(
@@ -183,12 +192,14 @@ def _calibrate_camera(
 
 def summary(findings: Findings) -> dict[str, Any]:
     """Return the findings as plain values: ``verdict``, ``reasons``, ``detector``, ``registration``, ``models``, ``burst``."""
+    from calibration.detector.models import foremost
+
     found: dict[str, Any] = {
         "verdict": findings.verdict.grade,
         "reasons": [vars(reason) for reason in findings.verdict.reasons],
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
-        "models": {score.name: _figures(score) for score in findings.scores},
+        "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
     }
     if findings.burst is not None:
         found["burst"] = vars(findings.burst)
@@ -270,8 +281,15 @@ def _registration(pair: AlignedPair) -> dict[str, Any]:
     return values | scaling | {"structured_share": structured_share(pair), "masked": vars(pair.counts)}
 
 
-def _figures(score: ModelScore) -> dict[str, Any]:
-    judged, overall = score.evaluation, score.evaluation.overall
+def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
     likelihood = {name: getattr(score, name) for name in ("nll", "nll_error", "excess", "excess_error")}
+    if not compared:
+        return likelihood
+    judged, overall = score.evaluation, score.evaluation.overall
     by_signal = {"jsd_by_signal": judged.mean_jsd, "jsd_by_signal_floor": judged.mean_jsd_floor}
-    return likelihood | vars(overall) | by_signal | {"ks": judged.ks, "ks_floor": judged.ks_floor}
+    return (
+        likelihood
+        | vars(overall)
+        | by_signal
+        | {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
+    )

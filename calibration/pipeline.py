@@ -145,7 +145,11 @@ def measure_exposures(
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
     else:
-        pairs = [align_pair(pair) for pair in exposures]
+        pairs = []
+        for number, pair in enumerate(exposures):
+            if progress is not None:
+                progress("Aligning exposures", number, len(exposures), "")
+            pairs.append(align_pair(pair))
     pairs, repairs = repaired(pairs)
     repairs = replace(repairs, join=join, joined=joined)
     correlation = correlation_of(pairs)

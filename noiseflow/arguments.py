@@ -20,13 +20,14 @@ _COUNT: Rule = (lambda value: value >= 1 and value == round(value), "a whole num
 _NONE_OR_MORE: Rule = (lambda value: value >= 0 and value == round(value), "a whole number, at least 0")
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys(("gain", "read_noise", "scale", "variance", "learning_rate", "checkpoint_interval"), _POSITIVE),
+    **dict.fromkeys(("gain", "read_noise", "scale", "variance", "learning_rate"), _POSITIVE),
     **dict.fromkeys(("offset", "level"), _FINITE),
     **dict.fromkeys(("held_out", "dead_time"), _INSIDE),
     **dict.fromkeys(("batch_size", "noise_interval", "num_components", "num_bins", "width"), _COUNT),
     **dict.fromkeys(("num_signal_bins", "num_groups"), _COUNT),
     **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _NONE_OR_MORE),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
+    "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
     "warm_up": (lambda value: 0 <= value < 1, "a share of the steps, at least 0 and below 1"),
     "excess_factor": (lambda value: 1 < value < math.inf, "a number above 1"),
     "step": (lambda value: 0 <= value < math.inf, "a positive rounding step, or 0 for clipping without rounding"),

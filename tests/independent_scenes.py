@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -202,15 +203,21 @@ def independent_series(
 ) -> IndependentSeries:
     """A scene with noise at tilts, each by name or given, in a cube of `size` voxels."""
     angles = RANGES[tilts] if isinstance(tilts, str) else np.asarray(tilts, float)
-    density = _sampled(SCENES[name], size, seed)
-    clean = np.stack([_project(density, size, np.deg2rad(angle)) for angle in angles])
+    clean, truth = _clean(name, tuple(angles), size, seed)
     peak = float(clean.max())
     images, unit = (NOISES[noise] if isinstance(noise, str) else noise)(clean / peak, np.random.default_rng(seed + 1))
-    margin, parts = (len(density) - size * _VOXEL_PARTS) // 2, _VOXEL_PARTS
-    seen = density[margin : margin + size * parts, :, margin : margin + size * parts]
-    truth = seen.reshape(size, parts, size, parts, size, parts).mean((1, 3, 5))
     series = recon.TiltSeries(images, angles, mode="linear")
     return IndependentSeries(series, truth * unit / peak, clean * unit / peak)
+
+
+@cache
+def _clean(name: str, angles: tuple[float, ...], size: int, seed: int) -> tuple[Array, Array]:
+    """Clean images (tilt, y, u) and density (z, y, x) of a scene."""
+    density, parts = _sampled(SCENES[name], size, seed), _VOXEL_PARTS
+    clean = np.stack([_project(density, size, np.deg2rad(angle)) for angle in angles])
+    margin = (len(density) - size * parts) // 2
+    seen = density[margin : margin + size * parts, :, margin : margin + size * parts]
+    return clean, seen.reshape(size, parts, size, parts, size, parts).mean((1, 3, 5))
 
 
 def _sampled(density: Density, size: int, seed: int) -> Array:

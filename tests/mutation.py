@@ -59,7 +59,11 @@ TARGETS = {
     ],
     "noiseflow/metrics/evaluation.py": ["noiseflow/metrics/test_metrics.py"],
     "noiseflow/io/mrc.py": ["noiseflow/io/test_mrc.py", "noiseflow/io/test_tilt_axis.py"],
-    "noiseflow/io/angles.py": ["noiseflow/io/test_alignment.py", "recon/series/test_tilt_series.py"],
+    "noiseflow/io/angles.py": [
+        "noiseflow/io/test_alignment.py",
+        "recon/series/test_tilt_series.py",
+        "test_series_files.py",
+    ],
     "recon/projection/projector.py": ["recon/projection/test_projector.py"],
     "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
     "recon/projection/wbp.py": ["recon/projection/test_wbp.py"],
@@ -67,7 +71,7 @@ TARGETS = {
     "recon/fields/regularisers/total_variation.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
     "recon/fields/occupancy.py": ["recon/fields/test_occupancy.py", "recon/fields/test_vacuum.py"],
     "calibration/detector/log_posterior.py": ["calibration/detector/test_log_posterior.py"],
-    "recon/joint/state_files.py": ["recon/joint/test_state_files.py", "recon/test_resume.py"],
+    "noiseflow/runs/states.py": ["noiseflow/runs/test_states.py", "recon/test_resume.py"],
 }
 """File → the tests nearest to it, nearest first."""
 PAIRS: dict[type, type] = {

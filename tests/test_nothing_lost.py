@@ -24,9 +24,9 @@ import recon.commands.results
 import recon.scale.blocks  # noqa: F401
 from noiseflow import io
 from noiseflow.commands.cli import main
-from noiseflow.io.ownership import require_own
-from noiseflow.io.partials import _prefix
-from recon.joint.state_files import discard_states, write_state
+from noiseflow.runs.ownership import require_own
+from noiseflow.runs.partials import _prefix
+from noiseflow.runs.states import discard_states, write_state
 from tests.processes import finish, start, wait_for
 
 CALIBRATE = (

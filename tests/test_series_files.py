@@ -100,6 +100,7 @@ TEXTS = {
     "one line": ("-60 -58 -56\n", [-60, -58, -56]),
     "one line, commas": ("-60, -58,-56\n", [-60, -58, -56]),
     "one line, semicolons": ("-60,5;-58,5;-56,5", [-60.5, -58.5, -56.5]),
+    "units": ("tilt (degrees)\n-60 deg\n-58 deg\n-56 deg\n", [-60, -58, -56]),
     "typographic minus": ("−60\n−58\n−56°\n", [-60, -58, -56]),
 }
 
@@ -126,6 +127,9 @@ MDOCS = {
     "sections": "[ZValue = 1]\nTiltAngle = 3\n[ZValue = 0]\nTiltAngle = -3\n[ZValue = 2]\nTiltAngle = 9\n",
     "frame sets": "".join(f"[FrameSet = 0]\nTiltAngle = {a}\nSubFramePath = D:\\x\\f{a}.tif\n" for a in (-3, 3, 9)),
     "images": "".join(f"[Image = f{a}.tif]\nTiltAngle = {a}\n" for a in (-3, 3, 9)),
+    "montages": "".join(
+        f"[ZValue = {a + 3}]\nTiltAngle = {a}\n[MontSection = 0]\nTiltAngle = 77\n" for a in (-3, 3, 9)
+    ),
     "lower case": "".join(f"[zvalue={n}]\ntiltangle={a}\n" for n, a in enumerate((-3, 3, 9))),
 }
 
@@ -165,6 +169,19 @@ def test_images_and_angles_are_joined_by_name(images: list[str], rows: list[str]
     series = recon.read_tilt_series(folder)
     for angle, image in zip(series.tilt_angles, series.images, strict=True):
         np.testing.assert_array_equal(image, STACK[{3.1: 0, -3.1: 1, 9.1: 2}[angle]])
+
+
+def test_a_plain_list_in_another_order_is_joined_by_the_angles_in_names(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "tilts", ["t_3.0.tif", "t_-3.0.tif", "t_9.0.tif"], STACK)
+    (folder / "a.tlt").write_text("-3.1\n3.1\n9.1\n")
+    image = io.read(folder)
+    with pytest.warns(UserWarning, match="by the angles in the names"):
+        table = io.tilts_of(folder, image)
+    found = dict(zip(image.names, table.angles, strict=True))
+    assert found == {"t_3.0.tif": 3.1, "t_-3.0.tif": -3.1, "t_9.0.tif": 9.1}
+    (folder / "a.tlt").write_text("-30\n0\n30\n")  # other angles: by order, with a warning
+    with pytest.warns(UserWarning, match="angle file is used"):
+        assert io.tilts_of(folder, image).angles.tolist() == [-30, 0, 30]
 
 
 def test_images_that_the_file_does_not_name_are_refused(tmp_path: Path) -> None:
@@ -237,6 +254,13 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="about x"):
         given = recon.read_tilt_series(tmp_path / "a_ali.mrc", angles=tmp_path / "tilt.com")
     assert given.tilt_angles.tolist() == series.tilt_angles.tolist()
+    (tmp_path / "a.xf").write_text("1 0 0 1 0 0\n" * 4)
+    io.write(tmp_path / "a.mrc", stack)
+    (tmp_path / "a.rawtlt").write_text("-19\n-9\n11\n21\n")
+    raw = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert raw.tilt_angles.tolist() == [-17.5, 12.5, 22.5]
+    refined = recon.read_alignment(tmp_path / "a.xf", raw).joined(raw).apply(raw)
+    assert refined.tilt_angles.tolist() == series.tilt_angles.tolist()
     io.write(tmp_path / "b.mrc", stack)
     (tmp_path / "b.tlt").write_text("-20\n-10\n10\n20\n")
     assert recon.read_tilt_series(tmp_path / "b.mrc").num_tilts == 4  # the command file of another stack
@@ -342,6 +366,8 @@ def test_transforms_made_on_unbinned_images_are_scaled(tmp_path: Path) -> None:
     io.write(tmp_path / "a_bin4.mrc", raw.reshape(3, 8, 4, 12, 4).mean((2, 4)))
     np.savetxt(tmp_path / "a_bin4.rawtlt", [-30, 0, 30])
     series = recon.read_tilt_series(tmp_path / "a_bin4.mrc")
+    with pytest.warns(UserWarning, match="--alignment-binning"):
+        recon.read_alignment(tmp_path / "a.xf", series)
     given = recon.read_alignment(tmp_path / "a.xf", series, binning=4).joined(series)
     assert given.shifts[0].tolist() == [1, -2]
     io.write(tmp_path / "a.st", raw)  # the stack that was aligned
@@ -467,3 +493,51 @@ def test_dark_frames_of_aretomo_are_excluded_and_sections_put_in_order(tmp_path:
 def test_angles_that_look_like_radians_are_pointed_out(stop: float) -> None:
     with pytest.warns(UserWarning, match="radians"):
         recon.TiltSeries(np.random.default_rng(0).random((20, 8, 9)), np.linspace(0, stop, 20, endpoint=False))
+
+
+def test_channels_of_arrays_without_names_are_the_shorter_axis(tmp_path: Path) -> None:
+    maps = np.random.default_rng(0).integers(0, 9, (7, 2, 8, 9)).astype(np.uint8)
+    np.savetxt(tmp_path / "a.TLT", np.arange(7) * 10)  # a suffix of Windows
+    for data in (maps, maps.swapaxes(0, 1)):
+        np.save(tmp_path / "a.npy", data)
+        with pytest.raises(io.SeveralImages) as caught:
+            recon.read_tilt_series(tmp_path / "a.npy")
+        assert caught.value.names == ("0", "1")
+        np.testing.assert_array_equal(recon.read_tilt_series(tmp_path / "a.npy", channel=1).images, maps[:, 1])
+
+
+def test_image_keys_are_found_beside_a_link_to_the_images(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "a.nxs", "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"], detector["image_key"] = np.random.default_rng(0).random((7, 8, 9)), [2, 1, 0, 0, 0, 0, 3]
+        file["entry/data/data"] = detector["data"]
+        file["entry/sample/rotation_angle"] = [0.0, 0, -30, -10, 10, 30, 0]
+    assert recon.read_tilt_series(tmp_path / "a.nxs", mask_nan=True).tilt_angles.tolist() == [-30, -10, 10, 30]
+
+
+def test_the_options_of_files_arrive_in_the_volume(tmp_path: Path, run, refused) -> None:
+    from tests.test_formats import mrc_of_type
+
+    stack = mrc_of_type("f4")(tmp_path)
+    options = ["--method", "wbp", "--keep-tilts", "--pixel-size", "5", "--exclude-views", "1,12-13"]
+    result = run("reconstruct", stack, "-o", tmp_path / "volume.mrc", *options)
+    assert result["figures"]["tilts"] == "10, -50° to 40°"
+    assert io.read(tmp_path / "volume.mrc").voxel_size == (5, 5, 5)
+    for option in (["--exclude-views", "14"], ["--pixel-size", "-1"]):
+        assert option[0] in refused("reconstruct", stack, "-o", tmp_path / "other.mrc", *option)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "mrad", None])
+@pytest.mark.parametrize("name", ["angles", "scan/tilt_angle", "exchange/theta"])
+def test_angles_of_hdf5_files_by_name_and_unit(name: str, unit: str | None, tmp_path: Path) -> None:
+    import h5py
+
+    angles = np.arange(0, 350, 50.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["images"] = np.random.default_rng(0).random((7, 8, 9))
+        file[name] = (angles * {"rad": np.pi / 180, "mrad": np.pi / 0.18}.get(unit or "", 1.0))[:, None]
+        if unit is not None:
+            file[name].attrs["units"] = unit
+    np.testing.assert_allclose(recon.read_tilt_series(tmp_path / "a.h5").tilt_angles, angles)

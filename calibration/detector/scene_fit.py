@@ -27,6 +27,9 @@ KERNEL_REACH = 4
 MOST_FITTED = 120_000
 """Largest number of pixels in a refit; the errors of 100 coefficients then add 0.1 % to the variance."""
 
+MOST_JUDGED = 400_000
+"""Largest number of pixels for the shares of the scene; they are then known to 1e-5, far below those of interest."""
+
 PATCH_BLUR = 3.0
 """Smoothing of the residuals in the search for changed regions, pixels."""
 
@@ -75,7 +78,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     subtracted.
     """
     residual = residual_of(pair)
-    mask, scale = pair.mask, residual.spread[pair.mask]
+    mask = pair.mask
     smooth = smooth_signal(pair, blur=BLUR)
     y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(mask.shape), mask.shape, strict=True))
     centred = smooth - smooth[mask].mean()
@@ -89,21 +92,24 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     impulse[12, 12] = 1.0
     point = ndimage.gaussian_filter(impulse, BLUR)
     own = {"blur": [ndimage.gaussian_filter(point, 0.75, order=order)[12, 12] for order in ORDERS.values()]}
-    noise = residual.share * float(mask.sum())  # Σ own variance / variance
+    chosen = np.flatnonzero(mask)
+    chosen = np.random.default_rng(0).choice(chosen, MOST_JUDGED) if len(chosen) > MOST_JUDGED else chosen
+    scale, z = residual.spread.flat[chosen], residual.z.flat[chosen]
     shares = {}
+    noise = residual.share * len(chosen)  # Σ own variance / variance
     for name, columns in groups.items():
-        design = np.stack([column[mask] for column in (*base, *columns)]) / scale
-        design /= np.maximum(np.sqrt((design**2).sum(1, keepdims=True)), np.finfo(float).tiny)
-        norms = np.sqrt(np.stack([(column[mask] / scale) @ (column[mask] / scale) for column in (*base, *columns)]))
+        design = np.stack([column.flat[chosen] for column in (*base, *columns)]) / scale
+        norms = np.sqrt((design**2).sum(1))
+        design /= np.maximum(norms[:, None], np.finfo(float).tiny)
         coupled = np.array([0.0, point[12, 12], *own.get(name, [0.0] * len(columns))]) * noise
-        moment = design @ residual.z[mask] + coupled / np.maximum(norms, np.finfo(float).tiny)
+        moment = design @ z + coupled / np.maximum(norms, np.finfo(float).tiny)
         gram = design @ design.T + 1e-9 * np.eye(len(design))
         whole = moment @ np.linalg.solve(gram, moment)
         without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
-        shares[name] = (whole - without - len(columns)) / mask.sum()
+        shares[name] = (whole - without - len(columns)) / len(chosen)
     most = max(len(columns) for columns in groups.values())
     return SceneFit(
-        **{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / mask.sum())
+        **{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / len(chosen))
     )
 
 

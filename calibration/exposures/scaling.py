@@ -19,6 +19,9 @@ CUT = 4.0
 """Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
 outliers then increase the standard deviation by 7 %."""
 
+MOST_SORTED = 1_000_000
+"""Number of residuals from which only every n-th is used; the standard deviations of 24 levels are then known to 0.4 %."""
+
 BLOCK = 8
 """Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
 
@@ -195,6 +198,10 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> I
     Residuals are clipped at `CUT` standard deviations to limit the effect of outliers. Percentiles are not used for the result,
     because they change in whole rounding steps where the noise spans few of them.
     """
+    wanted = level
+    if len(level) > MOST_SORTED:
+        step = len(level) // MOST_SORTED + 1
+        level, residual = level[::step], residual[::step]
     number = max(1, min(num_levels, len(level) // 50))
     groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)
     centres, values = level[groups].mean(1), residual[groups]
@@ -203,4 +210,4 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> I
     for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
         spread = np.clip(values, middle - CUT * spread, middle + CUT * spread).std(axis=1, keepdims=True)
     spreads = spread[:, 0]
-    return np.asarray(np.maximum(np.interp(level, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))
+    return np.asarray(np.maximum(np.interp(wanted, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))

@@ -28,6 +28,7 @@ from calibration.registration.matching import (
 )
 from noiseflow.described import described
 from noiseflow.io import as_array
+from noiseflow.statistics import block_means
 
 Motion = Literal["translation", "euclidean", "affine"]
 
@@ -48,6 +49,9 @@ scene. Unrelated frames that overlap by half, without rotation or magnification,
 LATTICE = 0.7
 """Height of a secondary correlation peak, relative to the peak at the registered position, above which a scene counts as
 periodic. The integer shift next to the maximum of a period of 5 pixels has 0.8."""
+
+LARGE = 1024
+"""Side from which frames are binned for their correlation, pixels; the filter before it removes the finest detail anyway."""
 
 LARGEST_TURN = 0.05
 """Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
@@ -286,8 +290,11 @@ def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> 
     The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
     shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation.
     """
-    mask = covered(matrix, short.shape)
-    bands = (band_pass(image, blur) for image in (short, _interpolated(long, matrix)))
+    factor = max(1, min(short.shape) // LARGE)
+    mask = block_means(covered(matrix, short.shape).astype(float), factor, factor) == 1
+    bands = (
+        band_pass(block_means(image, factor, factor), blur / factor) for image in (short, _interpolated(long, matrix))
+    )
     first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
     energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
     surface = cross_correlation(first, second) / energy

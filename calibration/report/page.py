@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
-from calibration.detector.models import ModelScore, simplest_sufficient
+from calibration.detector.models import CHANCE, HEAVIER, ModelScore, foremost, simplest_sufficient
 from calibration.detector.posterior import Interval
 from calibration.detector.response import Response
 from calibration.pipeline import Findings
@@ -48,14 +48,31 @@ TABLE_HEADER = (
 )
 
 
+TAILS_HEADER = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
+
+
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
-    """Return the scores of each model as text; divergences in units of 10⁻⁴."""
-    return [_row(score) for score in scores]
+    """Return the scores of each model as text; divergences, in units of 10⁻⁴, of the foremost ones."""
+    compared = foremost(scores) if scores else []
+    return [_row(score, score in compared) for score in scores]
 
 
-def _row(score: ModelScore) -> list[str]:
-    judged, overall = score.evaluation, score.evaluation.overall
+def tail_rows(score: ModelScore) -> list[list[str]]:
+    """Return the shares beyond 3, 4 and 5 standard deviations at each signal, per cent, each beside the model's."""
+    return [
+        [
+            f"{one.signal:.5g}",
+            *(f"{100 * value:.3g}" for two in zip(one.observed, one.expected, strict=True) for value in two),
+        ]
+        for one in score.evaluation.tails
+    ]
+
+
+def _row(score: ModelScore, compared: bool) -> list[str]:
     likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
+    if not compared:
+        return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
+    judged, overall = score.evaluation, score.evaluation.overall
     pairs = (
         *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
         *(judged.mean_jsd, judged.mean_jsd_floor),
@@ -82,6 +99,12 @@ def verdict(scores: Sequence[ModelScore]) -> str:
         text += (
             f" However, its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
             "finite-sample floor: check the histograms before you use it."
+        )
+    heavy = max(chosen.evaluation.tails, key=lambda one: one.observed[1] - one.expected[1])
+    if heavy.observed[1] > HEAVIER * heavy.expected[1] and heavy.p_value[1] < CHANCE:
+        text += (
+            f" Its tails are too light: at {heavy.signal:.4g} counts {heavy.observed[1]:.2%} of the pixels lie beyond four "
+            f"standard deviations, of the model's {heavy.expected[1]:.2%} (random telegraph noise, sparks or a changing scene)."
         )
     return text
 
@@ -289,6 +312,10 @@ def _add_models(page: Report, findings: Findings) -> None:
         "samples drawn from the model itself."
     )
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
+    if findings.scores:
+        chosen = simplest_sufficient(findings.scores)
+        caption = f"Tails of the {LABELS[chosen.name]} model: share of held-out pixels beyond 3, 4 and 5 standard "
+        page.table(TAILS_HEADER, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
     histograms = histogram_figure(findings.pixels, findings.scores)
@@ -297,7 +324,7 @@ def _add_models(page: Report, findings: Findings) -> None:
         caption="Residuals of the held-out pixels at each signal level (grey), with the density of every model.",
     )
     page.figure(
-        pit_figure(findings.scores),
+        pit_figure(foremost(findings.scores)),
         caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
     )
 

@@ -32,7 +32,7 @@ def end_stopped(text: str) -> NoReturn:
     """Exit with one line and code 130 after an interrupt; further interrupts are ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from noiseflow.io.partials import clear_unfinished
+    from noiseflow.runs.partials import clear_unfinished
 
     clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)

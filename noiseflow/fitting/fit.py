@@ -30,6 +30,7 @@ from noiseflow.threads import few_threads, warn_if_spinning
 _CELLS = 2**13  # about as many cells as a fit has
 
 _log = logging.getLogger("noiseflow")
+_PART = 2**20  # pixels predicted at once
 
 
 @torch.enable_grad()
@@ -138,7 +139,7 @@ def fit(
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     if digitise and model.learns and not model.describes_single_readings:
-        model, digitisation = _behind_converter(model, observation, use)
+        model, digitisation = _behind_converter(model, signal_model, observation, use)
     if model.needs_image and observation.ndim < 2:
         raise ValueError(
             f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
@@ -152,7 +153,13 @@ def fit(
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
     direct = train_noise and checkpoint is None and resume is None and pixels.train.ndim == 1
-    if isinstance(signal_model, KnownSignal) and direct and model.learns and model.fits_directly:
+    if (
+        isinstance(signal_model, KnownSignal)
+        and direct
+        and model.learns
+        and model.fits_directly
+        and not model.needs_image
+    ):
         with few_threads(_CELLS):
             return fit_directly(
                 model, signal_model.flat, pixels, result, num_steps=num_steps, weight=counted, standardise=standardise
@@ -201,11 +208,13 @@ def _as_floating(observation: Tensor) -> Tensor:
 
 
 def _behind_converter(
-    noise_model: NoiseModelBase, observation: Tensor, use: Tensor
+    noise_model: NoiseModelBase, signal_model: nn.Module, observation: Tensor, use: Tensor
 ) -> tuple[NoiseModelBase, Digitisation]:
     """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
-    values = observation.detach().reshape(-1)[use].cpu()
-    found = detect_digitisation((values.float() if values.dtype == torch.bfloat16 else values).numpy())
+    values = observation.detach().cpu()
+    values = values.float() if values.dtype == torch.bfloat16 else values
+    used = np.ma.masked_array(values.numpy(), ~use.reshape(observation.shape).cpu().numpy())
+    found = detect_digitisation(used, _predicted(signal_model, observation))
     if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
@@ -214,6 +223,17 @@ def _behind_converter(
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
+
+
+@torch.no_grad()
+def _predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
+    """The signal of all pixels, shaped like the observation."""
+    if hasattr(signal_model, "signal"):
+        whole: Tensor = signal_model.signal()  # type: ignore[operator]
+    else:
+        pixels = torch.arange(observation.numel(), device=observation.device)
+        whole = torch.cat([signal_model(part) for part in torch.split(pixels, _PART)])
+    return whole.detach().reshape(observation.shape)
 
 
 def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:

@@ -22,6 +22,7 @@ from noiseflow.distributions.numerics.table_axes import (
 )
 
 _MAX_LEVELS = 1024
+_RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
 _CHUNK = 2**18  # pixels per lookup, so that intermediate arrays fit in the cache
 _WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
@@ -130,6 +131,7 @@ class ObservationTable:
         num_rows, num_columns = SIZES[size % len(SIZES)]
         levels = self._levels if size < len(SIZES) else None
         self._laid_out_for = copy.deepcopy(noise_model.state_dict())
+        self.low = self._lowest_possible(noise_model)
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
         self._rows = Rows(self._scale, num_rows)
         self._signals = self._rows.signals(self._observation)
@@ -145,6 +147,24 @@ class ObservationTable:
             self._values = levels[None, :].expand(num_rows, -1)
         self.rebuild(noise_model)
         return self.measure_error(noise_model)
+
+    @torch.no_grad()
+    def _lowest_possible(self, noise_model: nn.Module) -> float:
+        """The low end of the rows, raised to where observations become possible, such as counts above their offset: rows without
+        a likelihood would spoil the slope of those beside them."""
+        observation = self._observation[:: max(1, self._observation.numel() // 1024)]
+
+        def impossible(signal: float) -> int:
+            return int(torch.isinf(noise_model(torch.full_like(observation, signal)).log_prob(observation)).sum())
+
+        below, above = self.low, self.high
+        fewest = impossible(above)
+        if impossible(below) <= fewest:
+            return below
+        while above - below > _RAISED * (self.high - self.low):
+            middle = (below + above) / 2
+            below, above = (below, middle) if impossible(middle) <= fewest else (middle, above)
+        return above
 
     @torch.no_grad()
     def rebuild(self, noise_model: nn.Module) -> None:

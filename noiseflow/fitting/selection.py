@@ -187,7 +187,8 @@ def select(
     pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
     found = Digitisation()
     if digitise:
-        found = detect_digitisation(as_tensor(observation).detach().reshape(-1)[pixels.use].cpu().numpy())
+        unused = ~pixels.use.reshape(pixels.observation.shape).cpu().numpy()
+        found = detect_digitisation(np.ma.masked_array(as_tensor(observation).detach().cpu(), unused), pixels.signal)
     if found.found:
         wrapped = {
             name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model

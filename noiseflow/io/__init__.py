@@ -1,5 +1,13 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
+from noiseflow.runs.lock import locked as locked
+from noiseflow.runs.outputs import atomic_path as atomic_path
+from noiseflow.runs.outputs import check_folder as check_folder
+from noiseflow.runs.outputs import check_output as check_output
+from noiseflow.runs.outputs import output_folder as output_folder
+from noiseflow.runs.outputs import require_other as require_other
+from noiseflow.runs.partials import partial_folder as partial_folder
+
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
@@ -10,11 +18,6 @@ from .checks import SeveralImages as SeveralImages
 from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite
-from .files import atomic_path as atomic_path
-from .files import check_folder as check_folder
-from .files import check_output as check_output
-from .files import output_folder as output_folder
-from .files import require_other as require_other
 from .folder import files_of as files_of
 from .image_file import SUFFIXES as SUFFIXES
 from .image_file import ImageFile as ImageFile
@@ -23,7 +26,5 @@ from .images import read_image as read_image
 from .images import write as write
 from .imod import parse_views as parse_views
 from .imod import read_transforms as read_transforms
-from .lock import locked as locked
-from .partials import partial_folder as partial_folder
 from .tilt_axis import tilt_axis_of as tilt_axis_of
 from .tilt_table import TiltTable as TiltTable

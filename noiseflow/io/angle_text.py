@@ -14,6 +14,7 @@ from noiseflow.io.tilt_table import LARGEST_ANGLE, TiltTable
 
 _COMMENT = re.compile(r"[#!%].*|//.*")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+_UNIT = re.compile(r"°|(?<![a-z])deg(rees?)?(?![a-z])", re.IGNORECASE)
 _TITLE = re.compile(r"tilt|angle|theta|alpha|degree", re.IGNORECASE)
 
 
@@ -49,7 +50,7 @@ def read(path: Path) -> TiltTable:
 
 
 def _words(line: str) -> list[str]:
-    line = line.replace("−", "-").replace("°", " ").strip()
+    line = _UNIT.sub(" ", line.replace("−", "-")).strip()
     line = line.replace(",", " ") if re.search(r",\s", line) else line
     words: list[str] = []
     for word in filter(None, re.split(r"[\s;]+", line)):

@@ -116,6 +116,8 @@ def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list
     if image.names and image.tilt_angles is not None and len(table.angles) >= count:
         found = _by_angle(table.angles, image.tilt_angles)
         if found is not None:
+            if found != list(range(count)):
+                warnings.warn(f"{file} is joined to {stack} by the angles in the names of the images", stacklevel=3)
             return found
     if table.sections is not None and sorted(table.sections) == list(range(count)):
         return [int(row) for row in np.argsort(table.sections)]
@@ -183,8 +185,16 @@ def file_stem(name: str) -> str:
 
 
 def angle_file_of(stack: str | Path) -> Path | None:
-    """The angle file that `tilts_of` uses; None if there is none."""
-    return next((candidate for candidate in candidates(stack) if _is_table(candidate)), None)
+    """The angle file that `tilts_of` uses; None if there is none. Suffixes may be in capitals."""
+    found: dict[Path, dict[str, Path]] = {}
+    for candidate in candidates(stack):
+        folder = candidate.parent
+        if folder not in found:
+            found[folder] = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        file = candidate if candidate.is_file() else found[folder].get(candidate.name.lower())
+        if file is not None and _is_table(file):
+            return file
+    return None
 
 
 def _is_table(file: Path) -> bool:

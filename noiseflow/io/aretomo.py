@@ -11,6 +11,7 @@ import numpy as np
 from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable, rotations
 
+_MOST = 1e6  # sections, more than any series has
 _COLUMNS = 10
 """SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT"""
 _SIZE = re.compile(r"#\s*RawSize\s*=\s*(\d+)\s+(\d+)")
@@ -35,18 +36,19 @@ def read(path: Path) -> TiltTable:
         local = local or _LOCAL.match(line) is not None
         if size := _SIZE.match(line):
             shape = (int(size[2]), int(size[1]))
-        elif found := _DARK.match(line):
-            dark.append([float(found[1]), *[0.0] * (_COLUMNS - 2), number(found[2])])
-        if local or not line.strip() or line.lstrip().startswith("#"):
+        found = _DARK.match(line)
+        words = [found[1], *["0"] * (_COLUMNS - 2), found[2]] if found else line.partition("#")[0].split()
+        if local or not words:
             continue
         try:
-            rows.append([number(word) for word in line.split()])
+            values = [number(word) for word in words]
         except ValueError:
-            rows.append([])
-        if len(rows[-1]) != _COLUMNS:
+            values = []
+        if len(values) != _COLUMNS or not np.isfinite(values).all() or not 0 <= values[0] < _MOST:
             raise ValueError(
                 f"{path} line {count}: ten numbers SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT are needed"
             )
+        (dark if found else rows).append(values)
     table = np.array([*rows, *dark], dtype=np.float64).reshape(-1, _COLUMNS)
     kept = table[: len(rows)]
     if local or np.abs(kept[:, 2] - 1).max(initial=0.0) > _SAME:

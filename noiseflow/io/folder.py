@@ -62,10 +62,12 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         warnings.warn(f"{folder} holds movies of {counts} frames, which are summed without an alignment", stacklevel=4)
     assert first is not None
     own = next((table for table in tables if table is not None), None)
-    size = own.pixel_size if own is not None else None
+    size, stated = None if own is None else own.pixel_size, first.voxel_size
+    if size is not None and (stated is None or stated[2] == 1):  # 1 Å: programs write it where they know no size
+        stated = size, size, size
     return ImageFile(
         np.stack(sections),
-        first.voxel_size or (None if size is None else (size, size, size)),
+        stated,
         np.array(inside) if len(inside) == len(files) else angles_in_names(list(names)),
         first.tilt_axis,
         names=names,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import choose_member, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
 
@@ -58,7 +58,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         voxel_size = _voxel_size(name, dataset, found)
     if angles is not None and len(kinds) == len(angles):
         angles = angles[kinds == _SAMPLE]
-    return ImageFile(data, voxel_size, angles, flat=fields[0], dark=fields[1])
+    channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
+    return ImageFile(data, voxel_size, angles, channels=channels, flat=fields[0], dark=fields[1])
 
 
 def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
@@ -69,8 +70,9 @@ def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
 
 
 def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
-    lists = [(name, item) for name, item in found.items() if item.shape == (count,) and item.dtype.kind in "iuf"]
-    return recorded_angles(((name, list(np.asarray(item, float) * _unit(item))) for name, item in lists), count)
+    lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
+    numbers = ((name, np.ravel(item) * _unit(item)) for name, item in lists.items() if item.dtype.kind in "iuf")
+    return recorded_angles(((name, [float(value) for value in values]) for name, values in numbers), count)
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
@@ -78,7 +80,7 @@ def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
     keys = [
         np.asarray(item, dtype=np.int64)
         for other, item in found.items()
-        if other.rpartition("/")[0] == name.rpartition("/")[0]
+        if other.split("/")[1] == name.split("/")[1]
         and other.rpartition("/")[2] in ("image_key", "image_key_control")
         and item.shape == dataset.shape[:1]
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,3 +58,8 @@ class ImageFile:
         tilts = "" if angles is None else f", tilts {angles.min():g}° to {angles.max():g}°"
         shape = " x ".join(map(str, self.data.shape))
         return f"ImageFile({shape} {self.data.dtype}, voxel size {size}{tilts})"
+
+
+def numbered(count: int, names: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names of channels, or their numbers from zero if they do not have a name each."""
+    return tuple(names) if len(set(names)) == count else tuple(str(index) for index in range(count))

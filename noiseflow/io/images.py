@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import Unsupported, as_array, choose
-from noiseflow.io.files import atomic_folder, atomic_path, check_output, require_whole
+from noiseflow.io.checks import SeveralImages, Unsupported, as_array, choose
 from noiseflow.io.image_file import (
     CAMERA_SUFFIXES,
     HDF5_SUFFIXES,
@@ -26,7 +25,9 @@ from noiseflow.io.image_file import (
     TIFF_SUFFIXES,
     ImageFile,
     VoxelSize,
+    numbered,
 )
+from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -187,6 +188,8 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
             image = read(plain, channel=channel)
         except (EOFError, gzip.BadGzipFile) as error:
             raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
+        except SeveralImages as error:
+            raise SeveralImages(str(error).replace(str(plain), str(path)), error.names) from error
         except ValueError as error:
             raise ValueError(str(error).replace(str(plain), str(path))) from error
     return image
@@ -195,8 +198,10 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
 def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:
     """The chosen channel of (channel, section, y, x); readers of formats with named images have chosen already."""
     if image.data.ndim == 4:
-        names = image.channels or tuple(str(index) for index in range(len(image.data)))
-        return replace(image, data=image.data[choose(names, wanted, "channels")])
+        # axes without names: there are fewer channels than tilts, and another number of angles is refused
+        swapped = not image.channels and image.data.shape[0] > image.data.shape[1]
+        data = np.moveaxis(image.data, 1, 0) if swapped else image.data
+        return replace(image, data=data[choose(image.channels or numbered(len(data)), wanted, "channels")])
     if wanted not in (None, "0") and not named:
         raise Unsupported(f"holds one image; remove ::{wanted} or --channel {wanted}")
     return image

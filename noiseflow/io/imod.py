@@ -41,8 +41,10 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
     path = stack.with_name("tilt.com")
     if path.is_file() and stack.is_file():
         entries = _entries(path)
-        projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or ""
-        if Path(projections).stem.removesuffix("_ali") == stem:
+        # older files name the stack in a line of its own, without a keyword
+        older = next((name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), "")
+        projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or older
+        if Path(projections).stem.lower().removesuffix("_ali") == stem.lower():
             return _applied(table, entries, path)
     turned = stack.with_name(f"{stem}.xtilt")
     if turned.is_file() and not stack.is_dir():

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.files import reserve_room
 from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
-from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start, signature
+from noiseflow.runs.outputs import reserve_room
+from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start, signature
 
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from noiseflow.io.tilt_table import LARGEST_ANGLE
 
-_ANGLE_NAME = re.compile(r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle", re.IGNORECASE)
+_ANGLE_NAME = re.compile(
+    r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE
+)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
+    **dict.fromkeys(("mrad", "milliradian", "milliradians"), 0.18 / np.pi),
 }
 
 

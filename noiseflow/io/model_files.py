@@ -14,9 +14,9 @@ from torch import nn
 import noiseflow
 from noiseflow.installation import library_version
 from noiseflow.io import check_output
-from noiseflow.io.tensor_files import save_tensors
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.plugins import load_plugins
+from noiseflow.runs.states import save_tensors
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.ownership import signature
 from noiseflow.io.tilt_axis import axis_in_titles
+from noiseflow.runs.ownership import signature
 
 _HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -61,7 +61,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
     data = _as_meant(data.astype(data.dtype.newbyteorder("="), copy=False), header, path, mapped=mapped)
     volumes = _volumes(header)
     if volumes > 1:
-        return ImageFile(data.reshape(volumes, -1, *data.shape[1:]), _voxel_size(header))
+        return ImageFile(data.reshape(volumes, -1, *data.shape[1:]), _voxel_size(header), channels=numbered(volumes))
     angles = _tilt_angles(header, extended, len(data))
     if int(header["ispg"]) == 0 and len(data) == 1:
         data = data[0]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile
 from noiseflow.io.metadata import recorded_angles
-from noiseflow.io.ownership import NPY_HEADER_BYTES, npy_start
+from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -35,7 +35,7 @@ def read_npz(path: Path, member: str | None = None) -> ImageFile:
 
 
 def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
-    """Write an array of any data type unchanged, section by section, with the mark of `noiseflow.io.ownership`.
+    """Write an array of any data type unchanged, section by section, with the mark of `noiseflow.runs.ownership`.
 
     Returns:
         The pixels as stored.

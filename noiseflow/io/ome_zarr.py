@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
 from noiseflow.io.metadata import in_angstrom
-from noiseflow.io.ownership import MARK
+from noiseflow.runs.ownership import MARK
 
 _SMALLEST_EDGE = 64
 _CHUNK = 128
@@ -95,8 +95,7 @@ def read(path: Path, *, mapped: bool = False) -> ImageFile:
     channels: tuple[str, ...] = ()
     if data.ndim == 4 and "c" in names:
         data, omero = np.moveaxis(data, names.index("c"), 0), attributes.get("ome", attributes).get("omero", {})
-        labels = tuple(str(channel.get("label", "")) for channel in omero.get("channels", ()))
-        channels = labels if len(set(labels)) == len(data) else ()
+        channels = numbered(len(data), [str(channel.get("label", "")) for channel in omero.get("channels", ())])
         edges.pop(names.index("c"))
     if len(edges) not in (2, 3) or min(edges[-2:]) <= 0:
         return ImageFile(data, channels=channels)

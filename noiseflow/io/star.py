@@ -5,6 +5,7 @@ Sources: https://relion.readthedocs.io (tilt-series metadata), https://warpem.gi
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ _AXES = ("rlnTomoNominalTiltAxisAngle", "wrpAxisAngle")
 _SIZES = ("rlnTomoTiltSeriesPixelSize", "rlnMicrographPixelSize", "rlnMicrographOriginalPixelSize")
 _ALIGNED = ("rlnTomoZRot", "rlnTomoXShiftAngst", "rlnTomoYShiftAngst")
 
+_SECTION = re.compile(r"([0-9]{1,9})@")
 Columns = dict[str, list[str]]
 
 
@@ -41,7 +43,7 @@ def read(path: Path) -> TiltTable:
     axes = _numbers(table, _AXES, path)
     size = None if sizes is None else float(sizes[0])
     names = next((table[name] for name in _NAMES if name in table), [])
-    sections = [int(number) for name in names if (number := name.partition("@")[0]).isdigit() and "@" in name]
+    sections = [int(stated[1]) for name in names if (stated := _SECTION.match(name))]
     return TiltTable(
         angles,
         () if sections else tuple(names),
@@ -90,12 +92,20 @@ def _tables(lines: list[str]) -> list[Columns]:
             looped, names = line == "loop_", []
             tables.append({})
         elif line.startswith("_") and tables:
-            name, *value = shlex.split(line, comments=True)
+            name, *value = _split(line.partition(" #")[0])
             names.append(name[1:])
             tables[-1][name[1:]] = [] if looped else value
         elif looped:
-            values = shlex.split(line)
+            values = _split(line)
             if len(values) == len(names):
                 for name, text in zip(names, values, strict=True):
                     tables[-1][name].append(text)
     return tables
+
+
+def _split(line: str) -> list[str]:
+    """Words, of which those with spaces are in quotes; a line with an open quotation is split at spaces."""
+    try:
+        return shlex.split(line)
+    except ValueError:
+        return line.split()

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize
+from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom
-from noiseflow.io.ownership import signature
+from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -140,7 +140,7 @@ def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[ND
     if "C" not in axes or data.ndim < 4:
         return data, ()
     data = np.moveaxis(data, axes.index("C"), 0)
-    return data, tuple(names) if len(set(names)) == len(data) else ()
+    return data, numbered(len(data), names)
 
 
 def _channel_names(tiff: TiffFile) -> list[str]:

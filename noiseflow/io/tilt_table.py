@@ -25,6 +25,7 @@ class TiltTable:
         pixel_size: Å, or None if unknown.
         tilt_axis: degrees from y towards −x, or None if unknown.
         excluded: rows to leave out, from 0.
+        acquired: (row,) dose before each image, or its time, in any unit; None if unknown.
     """
 
     angles: NDArray[np.float64]
@@ -35,6 +36,7 @@ class TiltTable:
     pixel_size: float | None = None
     tilt_axis: float | None = None
     excluded: tuple[int, ...] = ()
+    acquired: NDArray[np.float64] | None = None
 
     def rows(self, chosen: Sequence[int]) -> TiltTable:
         """Some of the rows, in this order."""
@@ -45,6 +47,7 @@ class TiltTable:
             names=tuple(self.names[row] for row in order) if self.names else (),
             sections=None if self.sections is None else self.sections[order],
             transforms=None if self.transforms is None else self.transforms[order],
+            acquired=None if self.acquired is None else self.acquired[order],
             excluded=tuple(place for place, row in enumerate(order) if row in self.excluded),
         )
 

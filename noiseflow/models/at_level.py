@@ -9,6 +9,7 @@ from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.baselines import Poisson
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ModelAround
 
@@ -81,4 +82,6 @@ def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
     if isinstance(model, Digitised):
         low, high, origin = model.low + level, model.high + level, model.origin + level
         return Digitised(at_level(model.model, level), model.step, low, high, origin)
+    if isinstance(model, Poisson):
+        return Poisson(float(model.log_gain.exp()), float(model.offset) + level, spread=model.spread)
     return AtLevel(model, level)

@@ -15,8 +15,6 @@ from noiseflow.distributions.laws.textbook import PoissonDistribution as Poisson
 from noiseflow.distributions.laws.textbook import SpreadPoissonDistribution
 from noiseflow.models.base import NoiseModelBase
 
-_NEAR_STEP = 0.2  # of the rounding step: a gain this close to the step may be the step itself, as in event counting
-
 
 class Gaussian(NoiseModelBase):
     """Gaussian noise with the same standard deviation at all signals.
@@ -101,7 +99,7 @@ class Poisson(NoiseModelBase):
     ) -> None:
         """Choose the position of the grid on the levels of a converter, by the likelihood of (N,) signals and observations.
 
-        If the gain is one step, as for a counter of single events, grid and levels may coincide. With a coarser grid of unknown
+        If the gain is one step, as for a counter of single events, grid and levels coincide. With a coarser grid of unknown
         spacing some levels would be impossible, so its probabilities are spread.
         """
         step = 0.0 if behind is None else behind(self).step
@@ -109,10 +107,10 @@ class Poisson(NoiseModelBase):
             return
         gain, offset = float(self.log_gain.exp()), float(self.offset)
         places = [(gain, offset, gain >= step)]
-        if abs(gain - step) <= _NEAR_STEP * step:
-            nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
-            places += [(step, nearest + more * step, False) for more in (-2, -1, 0, 1, 2)]
-            places.append((step, 0.0, False))
+        # event counting, whose gain is one step: the residuals of a predicted signal may not show it
+        nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
+        offsets = [nearest + more * step for more in (-2, -1, 0, 1, 2)] + [0.0, float(observation.min())]
+        places += [(step, place, False) for place in offsets]
         found: list[float] = []
         for place in places:
             self._move_to(*place)

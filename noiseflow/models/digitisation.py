@@ -7,11 +7,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, optimize, special
 
 _SAMPLE = 2**18
 _MOST_LEVELS = 2**16
 _LEAST_PILED = 10
 _LEAST_ULPS = 8
+# pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
+_GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
+_SIGNIFICANT = 3  # standard errors
+_ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
+_BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
+_TINY = 1e-300
 
 
 class Digitisation(NamedTuple):
@@ -47,38 +54,52 @@ class Digitisation(NamedTuple):
         return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
 
 
-def detect_digitisation(readings: ArrayLike) -> Digitisation:
+def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) -> Digitisation:
     """Detect the rounding step and the clipping limits of pixel values.
 
     Pixel values are rounded if all of them are integer multiples of a step from the smallest one. Integers always are; other
     numbers must repeat. Rounding by the number format itself is ignored.
 
-    A clipping limit is an extreme value with too many pixels: at least ten, and more than expected from the two levels next to it
-    if the histogram is log-concave there, as noise tails and electron counts are. The largest value of an integer type is always
-    a limit if it occurs. A smallest value of 0 alone is not a clipping limit, because counts end there too.
+    A clipping limit is an extreme value with at least ten pixels, and with more than the two levels next to it allow if the
+    histogram is log-concave there, as noise tails and electron counts are. The histogram of a whole image does not show a low
+    limit, because counts with an empty background end at 0 with many pixels too. A low limit is therefore reported only if a
+    signal is given and the pixels of equal signal are more likely under clipped normal noise than under counts (a negative
+    binomial distribution, which also describes pixels whose signals differ a little). The largest value of an integer type is
+    always a limit if it occurs.
 
     Args:
         readings: pixel values of any shape and real type, detector units; NaN and infinite values are ignored.
+        signal: known or predicted clean signals shaped like `readings`, detector units; the last two axes are those of images.
+
+    Raises:
+        ValueError: the shapes differ.
 
     Example:
         >>> import noiseflow, numpy as np
-        >>> values = np.random.default_rng(0).normal(200, 40, 10_000).round().clip(0, 255)
-        >>> noiseflow.detect_digitisation(values).high
-        255.0
+        >>> signal = np.linspace(50, 250, 10_000)
+        >>> values = np.random.default_rng(0).normal(signal, 40).round().clip(0, 255)
+        >>> noiseflow.detect_digitisation(values, signal)
+        Digitisation(step=1.0, low=0.0, high=255.0, origin=0.0)
     """
-    values = np.asarray(readings.detach().cpu() if hasattr(readings, "detach") else readings)
-    if isinstance(readings, np.ma.MaskedArray):
-        values = readings.compressed()
-    if values.dtype.kind == "b":
-        values = values.astype(np.uint8)
-    values = values.reshape(-1)
-    if values.dtype.kind == "f":
-        values = values if np.isfinite(values).all() else values[np.isfinite(values)]
-    if not values.size:
+    values = np.atleast_1d(readings.detach().cpu() if hasattr(readings, "detach") else readings)
+    values = values.astype(np.uint8) if values.dtype.kind == "b" else values
+    use = ~np.ma.getmaskarray(values) & np.isfinite(np.ma.getdata(values))
+    values = np.ma.getdata(values)
+    if not use.any():
         return Digitisation()
-    step = _step(values)
-    low, high = _rail(values, step, high=False), _rail(values, step, high=True)
-    return Digitisation(step, low, high, _origin(float(values.min()), step) if step and math.isinf(low) else 0.0)
+    predicted = None if signal is None else _paired(values, signal)
+    step = _step(values[use])
+    low, high = (_limit(values, use, predicted, high=which) for which in (False, True))
+    return Digitisation(step, low, high, _origin(float(values[use].min()), step) if step and math.isinf(low) else 0.0)
+
+
+def _paired(values: NDArray[Any], signal: ArrayLike) -> NDArray[np.float64]:
+    """The signals of pixel values."""
+    given = signal.detach().cpu() if hasattr(signal, "detach") else signal
+    predicted = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    if predicted.shape != values.shape:
+        raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
+    return predicted
 
 
 def _origin(level: float, step: float) -> float:
@@ -116,21 +137,85 @@ def _spacing(levels: NDArray[np.float64]) -> float:
     return step if float(np.abs(steps - np.round(steps)).max()) < 0.02 else 0.0
 
 
-def _rail(values: NDArray[Any], step: float, *, high: bool) -> float:
+def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.float64] | None, *, high: bool) -> float:
+    """The clipping limit at one end, or infinity."""
     none = math.inf if high else -math.inf
-    extreme = values.max() if high else values.min()
+    used = values[use]
+    extreme = used.max() if high else used.min()
     if high and values.dtype.kind in "iu" and extreme == np.iinfo(values.dtype).max:
         return float(extreme)
-    at_extreme = values == extreme
-    count, rest = int(np.count_nonzero(at_extreme)), values[~at_extreme]
-    if count < _LEAST_PILED or not rest.size:
+    if signal is None and not high:
         return none
-    if step > 0:
-        away = np.round(np.abs(rest.astype(np.float64) - float(extreme)) / step)
-        piled = _piles_up(count, int(np.count_nonzero(away == 1)), int(np.count_nonzero(away == 2)))
-    else:
-        piled = count > 2 * int(np.count_nonzero(rest == (rest.max() if high else rest.min())))
-    return float(extreme) if piled and np.ptp(rest) > 0 else none
+    levels = np.unique(used if used.size <= _SAMPLE else np.r_[used[:: used.size // _SAMPLE], extreme])
+    levels = (levels[::-1] if high else levels)[:3].astype(np.float64)
+    if levels.size < 3:
+        return none
+    count, beside, beyond = (int(np.count_nonzero(used == level)) for level in levels)
+    if count < _LEAST_PILED or not _piles_up(count, beside, beyond):
+        return none
+    shown = high or signal is None or _shows(values, use, signal, levels)
+    return float(extreme) if shown else none
+
+
+def _shows(
+    values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.float64], levels: NDArray[np.float64]
+) -> bool:
+    """Whether pixels of equal signal are more likely under clipped normal noise than under counts that end at the limit.
+
+    Pixels at edges are left out, because errors of a predicted signal mix different signals there.
+    """
+    size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
+    span = ndimage.maximum_filter(signal, size) - ndimage.minimum_filter(signal, size)
+    places = np.flatnonzero(use & np.isfinite(span))
+    places = places[:: max(1, places.size // _MOST_JUDGED)]
+    order = places[np.argsort(signal.flat[places], kind="stable")]
+    gain, square = 0.0, 0.0
+    for group in np.array_split(order, min(_GROUPS, max(1, order.size // _LEAST_GROUP))):
+        noise = float((values.flat[group] - signal.flat[group]).std())
+        group = group[span.flat[group] <= noise] if signal.ndim > 1 else group
+        if group.size < _LEAST_PILED or signal.flat[group].std() > _ALIKE * noise:
+            continue
+        step = max(levels[1] - levels[0], noise / _BINS_OF_NOISE)
+        number = np.ceil((values.flat[group] - levels[0]) / step - 0.5)
+        counts, repeats = np.unique(np.where(values.flat[group] > levels[0], number.clip(1), 0), return_counts=True)
+        if counts.size > 2 and counts[0] == 0:
+            difference = _log_clipped(counts, repeats) - _log_counted(counts, repeats)
+            gain, square = gain + float(repeats @ difference), square + float(repeats @ difference**2)
+    return gain > _SIGNIFICANT * math.sqrt(square) and gain > _LEAST_PILED
+
+
+def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Log-probabilities of counts under the most likely normal distribution that is rounded and clipped at 0."""
+
+    def log_prob(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        mean, width = parameters[0], math.exp(parameters[1])
+        above, below = (counts + 0.5 - mean) / width, np.where(counts == 0, -np.inf, (counts - 0.5 - mean) / width)
+        mirror = below > 0  # differences of probabilities near 1 lose all digits
+        high, low = np.where(mirror, -below, above), np.where(mirror, -above, below)
+        found: NDArray[np.float64] = np.log(np.maximum(special.ndtr(high) - special.ndtr(low), _TINY))
+        return found
+
+    mean = float(np.average(counts, weights=repeats))
+    width = math.sqrt(float(np.average((counts - mean) ** 2, weights=repeats)))
+    start = np.array([mean, math.log(width)])
+    found = optimize.minimize(lambda each: -float(repeats @ log_prob(each)), start, method="Nelder-Mead").x
+    return log_prob(found)
+
+
+def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Log-probabilities of counts under the most likely negative binomial distribution, whose mean is that of the counts."""
+    mean = float(np.average(counts, weights=repeats))
+
+    def log_prob(log_size: float) -> NDArray[np.float64]:
+        size = math.exp(log_size)
+        ways = special.gammaln(counts + size) - special.gammaln(size) - special.gammaln(counts + 1)
+        found: NDArray[np.float64] = (
+            ways + size * math.log(size / (size + mean)) + counts * math.log(mean / (size + mean))
+        )
+        return found
+
+    best = optimize.minimize_scalar(lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded").x
+    return log_prob(float(best))
 
 
 def _piles_up(count: int, beside: int, beyond: int) -> bool:

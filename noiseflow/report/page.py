@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from noiseflow.described import printable
 from noiseflow.io import atomic_path, check_output
-from noiseflow.io.ownership import signature
 from noiseflow.report.charts import themed_svg
+from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,12 @@ class Report:
     def figure(self, figure: Figure, *, caption: str) -> None:
         """Add a matplotlib figure as PNG on white. Use it for images, and `charts` for curves."""
         stream = io.BytesIO()
-        margins = None if figure.get_layout_engine() else "tight"  # "tight" draws everything twice
+        engine = figure.get_layout_engine()
+        if engine is not None:  # otherwise `savefig` would draw everything once more for the layout
+            figure.set_dpi(110)
+            engine.execute(figure)
+            figure.set_layout_engine("none")
+        margins = "tight" if engine is None else None
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
         data = base64.b64encode(stream.getvalue()).decode()
         text = _escape(caption)

@@ -128,7 +128,7 @@ def read_shell_band(path: Path) -> ShellBand | None:
     Raises:
         ValueError: its table was modified.
     """
-    from noiseflow.io.ownership import is_own
+    from noiseflow.runs.ownership import is_own
     from recon.uncertainty.result import shell_band_path
     from recon.uncertainty.shell_band import ShellBand
 

@@ -255,7 +255,8 @@ def reconstruct(
     from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.commands.volume_run import VolumeRun
-    from recon.methods import find_method, require_setting, require_two_axes, settings_of
+    from recon.methods import find_method, settings_of
+    from recon.methods._registry import require_setting, require_two_axes
     from recon.uncertainty.result import error_bar_paths, shell_band_path
 
     output = Output(json)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.files import put_in_place
 from noiseflow.io.model_files import MODEL_SUFFIXES
-from noiseflow.io.ownership import is_own
+from noiseflow.runs.outputs import put_in_place
+from noiseflow.runs.ownership import is_own
 from recon.commands.inputs import Prepared
 from recon.fields.files import FIELD_SUFFIXES, save_field
 from recon.reconstruction import Reconstruction

@@ -16,6 +16,7 @@ from noiseflow.commands.console import Output
 from noiseflow.progress import progress_shown
 from recon.commands.results import Targets
 from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
+from recon.fields._registry import field_kinds
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
@@ -158,7 +159,8 @@ def _show_plan(
         made = {name: value for name, value in options.items() if name != "method"}
         stages, slab, share = method.plan(tilt_series, grid, settings_of(method.name, **made))
         fitted = None if slices_at_once is None else fitted_slices(grid.height, slices_at_once)
-        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted)
+        dearest = max(kind.step_cost for kind in field_kinds(options["field"]).values())
+        seconds = expected_seconds(stages, tilt_series, grid, slab, share, fitted, dearest)
         output.line(f"slab: {slab} of {grid.height} slices")
         output.line(describe(stages))
         output.line(f"expected: about {seconds:.0f} s on this machine")

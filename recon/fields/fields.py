@@ -45,6 +45,10 @@ class Field(Described, ABC):
     scale: Tensor
     relative_rate = 1.0
     """Learning rate of the field relative to that of a voxel field."""
+    num_steps: int | None = None
+    """Steps of a fit of the whole volume; None for those of the schedule."""
+    step_cost = 1.0
+    """Time of a step relative to that of grids."""
     more_memory = 0
     """Bytes that a fit of this field needs besides those of a fit of voxels."""
     voxel_size: float | None = None

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from noiseflow.installation import library_version
-from noiseflow.io.files import check_output
-from noiseflow.io.tensor_files import save_tensors
+from noiseflow.runs.outputs import check_output
+from noiseflow.runs.states import save_tensors
 from recon.fields._registry import find_field, name_of
 from recon.fields.fields import Field
 from recon.series.tilt_series import Volume

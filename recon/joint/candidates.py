@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from noiseflow import (
     Digitisation,
     Digitised,
     Gaussian,
     Mixture,
+    Poisson,
     PoissonGaussian,
     SignalDependentGaussian,
     SplineFlow,
@@ -20,47 +24,80 @@ from noiseflow import (
 )
 from noiseflow.models.wrapper import as_noise_model
 
-_CLIPPED = 0.02
-_FAR = 0.01  # noise relative to the contrast
+_CLIPPED = 0.02  # share of the pixels
 _SHARED = 6  # Gaussians of a shape shared by all signals: enough for a long tail on one side
+# electrons: signals stay this far above the end of counts, so that a single electron in vacuum is improbable (−6 nats), not
+# impossible; a hundredth of the offset that matters
+_DARK = 0.002
+_BELOW = 3  # standard deviations; a clipped pixel with a signal further below the limit exceeds it once in 700 times
 
 
-def noise_candidates(images: NDArray[Any], *, quiet: bool = False) -> list[nn.Module]:
-    """Candidate noise models for these images, simplest first, wrapped in the detected rounding and clipping.
+@dataclass(frozen=True)
+class Readings:
+    """What the pixel values of a whole series show without their signals.
+
+    Attributes:
+        digitisation: rounding and upper clipping limit.
+        lowest: smallest pixel value, detector units.
+        saturated: share of the pixels at the upper limit.
+    """
+
+    digitisation: Digitisation
+    lowest: float
+    saturated: float
+
+    @staticmethod
+    def of(images: NDArray[Any]) -> Readings:
+        """The pixel values of images of any shape."""
+        found = detect_digitisation(images)
+        return Readings(found, float(images.min()), float((images >= found.high).mean()))
+
+    def given(self, observation: Tensor, signal: Tensor, use: Tensor | None) -> Digitisation:
+        """The digitisation with the lower clipping limit that pixels with predicted signals show, (tilt, u, y)."""
+        unused = False if use is None else ~use.cpu().numpy()
+        low = detect_digitisation(np.ma.masked_array(observation.cpu().numpy(), unused), signal).low
+        return self.digitisation._replace(low=low) if low <= self.lowest else self.digitisation
+
+    def least_signal(self, noise_model: nn.Module) -> float:
+        """The lowest signal that the pixel values allow.
+
+        The mean of values that are not clipped is not below the lowest of them. A clipped signal may be below the limit, but not
+        by more than the noise explains: further down, no pixel value would depend on it.
+        """
+        model = as_noise_model(noise_model)
+        if not math.isfinite(model.low):
+            return self.lowest + _DARK * model.step
+        at_limit = model.one_pixel(torch.full((1,), model.low, device=model.device))
+        return model.low - _BELOW * float(at_limit.stddev)
+
+
+def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool = False) -> list[nn.Module]:
+    """Candidate noise models, simplest first, wrapped in rounding and clipping.
 
     All of them preserve the mean. If clipping hides a tail of many pixels, a model whose shape depends on the signal could have
     any hidden tail, and therefore any mean. In this case only models with a fixed shape, or one shared by all signals, are
     candidates: the visible tails at other signals determine the hidden ones. If there is little noise, the residuals are mostly
-    misfit of the volume, and a noise model with a learnt shape would absorb it.
+    misfit of the volume, and a noise model with a learnt shape would absorb it. Counts of electrons are candidates if pixel
+    values are rounded and not clipped at the low end.
 
     Args:
-        images: the pixel values.
+        digitisation: rounding and clipping of the pixel values.
+        clipped: share of the pixels at its limits.
         quiet: whether the noise is small compared with the contrast.
     """
-    digitisation = detect_digitisation(images)
     models: list[nn.Module] = [SignalDependentGaussian()]
     if not quiet:
-        models += [PoissonGaussian(), Mixture(_SHARED, shared_shape=True, mean_preserving=True)]
-    if not (quiet or _clipped(images, digitisation)):
+        counts = digitisation.step > 0 and math.isinf(digitisation.low)
+        models = [*([Poisson()] if counts else []), *models, PoissonGaussian()]
+        models.append(Mixture(_SHARED, shared_shape=True, mean_preserving=True))
+    if not (quiet or clipped >= _CLIPPED):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
 
-def first_noise(images: NDArray[Any]) -> nn.Module:
-    """The simple noise model of the first fits. It includes clipping, which would bias least squares."""
-    digitisation = detect_digitisation(images)
-    return Digitised(SignalDependentGaussian(), *digitisation) if _clipped(images, digitisation) else Gaussian()
-
-
-def _clipped(images: NDArray[Any], digitisation: Digitisation) -> bool:
-    """Whether clipping hides much: many pixel values are clipped, and the noise is significant compared with the contrast. A
-    dark background at zero with negligible noise does not count."""
-    on_rail = (images <= digitisation.low) | (images >= digitisation.high)
-    if on_rail.mean() < _CLIPPED:
-        return False
-    leaving = on_rail[..., 1:] != on_rail[..., :-1]
-    steps = np.abs(images[..., 1:][leaving].astype(np.float32) - images[..., :-1][leaving])
-    return bool(not steps.size or np.median(steps) > _FAR * images.std(dtype=np.float64))
+def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:
+    """The simple noise model of the first fits. It includes clipping of many pixels, which would bias least squares."""
+    return Digitised(SignalDependentGaussian(), *digitisation) if clipped >= _CLIPPED else Gaussian()
 
 
 def learns(noise_model: nn.Module) -> bool:

@@ -5,11 +5,8 @@ A journal is a folder of safetensors files with JSON metadata, written atomicall
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
@@ -21,24 +18,16 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
-from noiseflow.installation import library_version
-from noiseflow.io import atomic_path, output_folder
-from noiseflow.io.ownership import is_own
-from noiseflow.io.partials import clear_all_leftovers
 from noiseflow.progress import Progress
+from noiseflow.runs.run_folder import RunFolder
+from noiseflow.runs.states import read_state
 from recon.joint.stages import Stage
-from recon.joint.state_files import discard_states, is_state
-from recon.joint.state_files import read_state as read_state
-from recon.joint.state_files import write_state as write_state
 
-_FORMAT = "noiseflow checkpoint 2"
-_RUN_START = b'{\n "format": "noiseflow checkpoint '
-_RUN, _CURRENT, _BLOCKS = "run.json", "current.safetensors", "blocks-"
-_ROW = "[0-9]" * 7
+_CURRENT = "current.safetensors"
 _RESULT = [field.name for field in fields(FitResult) if field.name not in ("noise_model", "digitisation")]
 
 
-class Journal:
+class Journal(RunFolder):
     """Runs the fits and other stages of one reconstruction in order, and stores their results and states.
 
     A reconstruction is determined by its settings, its seed and the results of its stages, which are stored by name. A resumed
@@ -69,29 +58,9 @@ class Journal:
         interval: float = 60.0,
         report: Progress | None = None,
     ) -> None:
-        self.folder, self.interval, self.report = Path(folder), interval, report
-        self.settings, self._choices = json.loads(json.dumps(settings)), dict[str, Any]()
+        super().__init__(folder, settings, resume=resume)
+        self.interval, self.report = interval, report
         self.stop_requested = self.abandoned = self.in_fit = False
-        self._fresh = not (resume and self.exists)
-        if not self._fresh:
-            self._check_settings()
-
-    @property
-    def exists(self) -> bool:
-        """Whether the folder holds a journal."""
-        return (self.folder / _RUN).is_file()
-
-    @property
-    def resumed(self) -> bool:
-        """Whether this run continues an earlier one."""
-        return not self._fresh
-
-    def choose(self, name: str, find: Callable[[], Any]) -> Any:
-        """Return the JSON-serialisable result of `find`, or the one that the run stored before it was interrupted, so that a
-        resumed run does not depend on the state of the machine. Must be called before anything is written."""
-        if name not in self._choices:
-            self._choices[name] = find()
-        return self._choices[name]
 
     def fit(
         self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
@@ -168,32 +137,6 @@ class Journal:
         if self.stop_requested:
             raise KeyboardInterrupt(f"stopped after step {done} of {total} ({title})")
 
-    def keep(self, prefix: str = "") -> Path:
-        """The folder for finished blocks of a volume, named after the prefix of its fits; removed with the journal."""
-        if self._fresh:
-            self._start()
-        return self.folder / f"{_BLOCKS}{hashlib.blake2b(prefix.encode(), digest_size=4).hexdigest()}"
-
-    def forget(self, prefix: str) -> None:
-        """Remove the states of fits with this prefix, whose block is stored and smaller than they are."""
-        for file in filter(is_state, self.folder.glob(f"{_slug(prefix)}*.safetensors")):
-            file.unlink()
-
-    def discard(self) -> None:
-        """Remove the journal of a complete or abandoned run."""
-        for blocks in self.folder.glob(f"{_BLOCKS}{'[0-9a-f]' * 8}"):
-            clear_all_leftovers(blocks)
-            for file in blocks.glob(f"*-{_ROW}-{_ROW}.npy"):
-                if is_own(file):
-                    file.unlink()
-            if not any(blocks.iterdir()):
-                blocks.rmdir()
-        discard_states(self.folder, _RUN)
-
-    def _finished(self, name: str) -> Path:
-        digest = hashlib.blake2b(name.encode(), digest_size=4).hexdigest()
-        return self.folder / f"{_slug(name)}-{digest}.safetensors"
-
     def _current(self, name: str) -> dict[str, Any] | None:
         if self._fresh or not (self.folder / _CURRENT).exists():
             return None
@@ -207,47 +150,6 @@ class Journal:
     def _write_current(self, name: str, state: dict[str, Any]) -> None:
         if not self.abandoned:
             self._write(self.folder / _CURRENT, {"name": name, "fit": state, "rng": torch.get_rng_state()})
-
-    def _write(self, path: Path, state: dict[str, Any]) -> None:
-        if self._fresh:
-            self._start()
-        write_state(path, state)
-
-    def _start(self) -> None:
-        self._require_own()
-        self.discard()
-        description = {"format": _FORMAT, "library_version": library_version(), "settings": self.settings}
-        description["choices"] = self._choices
-        with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
-            partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
-        self._fresh = False
-
-    def _require_own(self) -> None:
-        run = self.folder / _RUN
-        head = run.read_bytes()[: len(_RUN_START)] if run.is_file() else b""
-        if head and head != _RUN_START:
-            raise FileExistsError(
-                f"{run} was not written by noiseflow and would be overwritten; move it, or name another output"
-            )
-
-    def _check_settings(self) -> None:
-        advice = f"give the same input and options, or remove --resume to start over ({self.folder})"
-        try:
-            kept = json.loads((self.folder / _RUN).read_text(encoding="utf-8"))
-            format_, settings = kept["format"], dict(kept["settings"])
-            self._choices = dict(kept.get("choices", {}))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"the checkpoint's {_RUN} is damaged; {advice}") from error
-        if format_ != _FORMAT or kept.get("library_version") != library_version():
-            raise ValueError(f"the checkpoint was written by another version of noiseflow; {advice}")
-        names = [name for name in {**settings, **self.settings} if settings.get(name) != self.settings.get(name)]
-        if names:
-            changes = ", ".join(f"{name} was {settings.get(name)}, now {self.settings.get(name)}" for name in names)
-            raise ValueError(f"the checkpoint is of another run: {changes}; {advice}")
-
-
-def _slug(name: str) -> str:
-    return re.sub("[^a-z0-9.]+", "-", name.lower())[:60]
 
 
 def _replay(

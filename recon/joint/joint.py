@@ -22,11 +22,11 @@ from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import first_noise, learns, noise_candidates
+from recon.joint.candidates import Readings, first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
-from recon.joint.run import RunFit, Runner, run_fit
+from recon.joint.run import MakeCandidates, RunFit, Runner, run_fit
 from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
@@ -164,7 +164,7 @@ class JointReconstructor:
         models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series, share=_HELD_OUT, place=(rows, settled.start.height))
-        run = self._run(facts, {"whole": task}, models, [], progress)
+        run = self._run(facts, {"whole": task}, models, progress)
         run.weight_choice = settled.weight_choice
         if stays_empty(task, run.noise_model):
             run.stages = []
@@ -178,7 +178,7 @@ class JointReconstructor:
         part, model = self._slabs(start, tilt_series, grid)
         facts, rows, _ = self._facts(part, model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return plan(facts, num_steps=self.num_steps, schedule=self.schedule), rows.stop - rows.start, share
+        return plan(facts, num_steps=self._steps(model), schedule=self.schedule), rows.stop - rows.start, share
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -293,19 +293,29 @@ class JointReconstructor:
     ) -> PlannedRun:
         """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
-        simple = given if facts.simple_is_final and given else first_noise(tilt_series.images).to(self.device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed)
-            candidates = noise_candidates(tilt_series.images, quiet=facts.quiet) if given is None else []
+        readings = Readings.of(tilt_series.images)
+        found, saturated = readings.digitisation, readings.saturated
+        simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
+
+        def candidates(task: Task, signal: Tensor) -> list[nn.Module]:
+            digitisation = readings.given(task.observation, signal, task.use)
+            clipped = saturated + float((task.observation <= digitisation.low).float().mean())
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self.seed)
+                return noise_candidates(digitisation, clipped)
+
         if facts.quiet and given is None:
-            simple, given = Gaussian().to(self.device), candidates[0].to(self.device)
+            simple, given = (
+                Gaussian().to(self.device),
+                noise_candidates(found, saturated, quiet=True)[0].to(self.device),
+            )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
         tasks = {"slab": to_choose, "whole": self._task(whole, tilt_series, share=_HELD_OUT)}
-        run = self._run(facts, tasks, models, candidates, progress)
+        run = self._run(facts, tasks, models, progress, candidates, readings.least_signal)
         run.choose()
         return run
 
@@ -314,14 +324,16 @@ class JointReconstructor:
         facts: Facts,
         tasks: dict[str, Task],
         models: dict[str, nn.Module],
-        candidates: list[nn.Module],
         progress: Progress | None,
+        candidates: MakeCandidates | None = None,
+        least_signal: Callable[[nn.Module], float] | None = None,
     ) -> PlannedRun:
-        stages = plan(facts, num_steps=self.num_steps, schedule=self.schedule)
+        stages = plan(facts, num_steps=self._steps(tasks["whole"].signal_model), schedule=self.schedule)
         runner = Runner(
             tasks,
             models,
             candidates=candidates,
+            least_signal=least_signal,
             first_weight=_QUIET_FIRST if facts.quiet else _first_weight(tasks["whole"].signal_model.field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
@@ -330,6 +342,9 @@ class JointReconstructor:
             progress=progress,
         )
         return PlannedRun(facts, stages, runner)
+
+    def _steps(self, whole: TomographySignal) -> int | None:
+        return whole.field.num_steps if self.num_steps is None else self.num_steps
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)

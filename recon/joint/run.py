@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -15,11 +15,14 @@ from torch import Tensor, nn
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.fitting.selection import simplest_sufficient
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
 from recon.joint.weight import WeightChoice, choose_weight
+
+MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
 _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
@@ -59,7 +62,8 @@ class Runner:
     Args:
         tasks: signal models and pixels of the ``slab`` and of the ``whole``.
         models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
-        candidates: candidate noise models, simplest first.
+        candidates: makes the candidate noise models for a task and its signal, simplest first.
+        least_signal: the lowest signal that a noise model allows, detector units.
         first_weight: initial weight of the search.
         generator: source of the random choices.
         run_fit: runs every fit.
@@ -77,7 +81,8 @@ class Runner:
         tasks: Mapping[str, Task],
         models: dict[str, nn.Module],
         *,
-        candidates: Sequence[nn.Module] = (),
+        candidates: MakeCandidates | None = None,
+        least_signal: Callable[[nn.Module], float] | None = None,
         first_weight: float,
         generator: torch.Generator,
         run_fit: RunFit = run_fit,
@@ -85,7 +90,8 @@ class Runner:
         expected: int = 0,
         progress: Progress | None = None,
     ) -> None:
-        self.tasks, self.models, self.candidates = tasks, models, candidates
+        self.tasks, self.models = tasks, models
+        self.candidates, self.least_signal = candidates, least_signal
         self.first_weight, self.generator, self.run_fit = first_weight, generator, run_fit
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
@@ -130,8 +136,12 @@ class Runner:
         Candidates that cannot be tabulated are excluded: they have a narrow peak for every electron, an artefact of fitting noise
         without such peaks.
         """
-        *simpler, richest = (model.to(task.observation.device) for model in self.candidates)
+        if self.candidates is None:
+            raise ValueError("a plan that chooses a noise model needs candidates")
         signal, tried = task.signal(), list[_Tried]()
+        *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
+        if self.least_signal is not None:
+            signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
 
         def nll(model: nn.Module) -> float:
             name = f"{stage.name} {len(tried) + 1}"
@@ -149,6 +159,8 @@ class Runner:
         behind = min(tried[: tried.index(chosen)], key=lambda each: each.excess, default=None)
         self.models["chosen"] = chosen.model
         self._runner_up = None if behind is None or math.isinf(behind.excess) else behind.model
+        if math.isfinite(as_noise_model(chosen.model).low):
+            self.models["simple"] = copy.deepcopy(simpler[0])  # least squares would be biased by the clipping
 
     def _finalists(self, stage: FitStage, task: Task) -> None:
         """Fit the volume with the chosen noise model and, from the same state, with the most likely simpler one.
@@ -197,6 +209,8 @@ class Runner:
     def _fit_signal(self, stage: FitStage, task: Task, name: str) -> FitResult:
         """Fit volume and response with a fixed noise model."""
         noise_model, model = self.models[stage.noise], task.signal_model
+        if self.least_signal is not None:
+            model.hold_above(self.least_signal(noise_model))
         try:
             return self._run(
                 name,

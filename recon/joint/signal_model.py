@@ -198,6 +198,12 @@ class TomographySignal(Described):
         formation = self.image_formation
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
+    def hold_above(self, least_signal: float) -> None:
+        """Set the lower bound of the signals without an object, detector units; linear images only, because bright field has no
+        offset to fit."""
+        if isinstance(self.image_formation, Linear):
+            self.image_formation.least_offset.fill_(least_signal)
+
     def parameter_groups(self, *, rate: float = 1.0, hold_response: bool = False) -> list[dict[str, Any]]:
         """Parameters with their learning rates, for Adam.
 

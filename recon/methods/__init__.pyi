@@ -3,6 +3,4 @@ from ._registry import Method as Method
 from ._registry import Settings as Settings
 from ._registry import find_method as find_method
 from ._registry import reconstruct as reconstruct
-from ._registry import require_setting as require_setting
-from ._registry import require_two_axes as require_two_axes
 from ._registry import settings_of as settings_of

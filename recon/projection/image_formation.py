@@ -83,6 +83,9 @@ class Linear(Described):
         offset_unit: unit of the offset parameter, a line integral of typical size in the data.
         estimate: whether to fit offset and beam.
 
+    Attributes:
+        least_offset: lower bound of the offset, detector units; −∞ at first.
+
     Raises:
         ValueError: gain or offset unit is zero or not finite.
 
@@ -94,6 +97,7 @@ class Linear(Described):
 
     gain: Tensor
     offset_unit: Tensor
+    least_offset: Tensor
     log_beam: nn.Parameter | None
 
     def __init__(
@@ -110,6 +114,7 @@ class Linear(Described):
             if not math.isfinite(unit) or unit == 0:
                 raise ValueError(f"{name.replace('_', ' ')} {unit} must be finite and not zero")
             self.register_buffer(name, torch.tensor(float(unit)))
+        self.register_buffer("least_offset", torch.tensor(-math.inf))
         start = torch.as_tensor(offset, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
         self.scaled_offset = nn.Parameter(start / (gain * offset_unit), requires_grad=estimate)
         log_beam = None if beam is None else nn.Parameter(beam.reshape(-1, 1, 1).log(), requires_grad=estimate)
@@ -117,9 +122,17 @@ class Linear(Described):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
+        self._hold_up()
         if self.log_beam is not None:
             line_integrals = line_integrals * _relative(self.log_beam)
         return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
+
+    @torch.no_grad()
+    def _hold_up(self) -> None:
+        """Project the offset onto values that are at least `least_offset`, detector units."""
+        least = self.least_offset / (self.gain * self.offset_unit)
+        if bool((self.scaled_offset < least).any()):
+            self.scaled_offset.clamp_(min=least)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""

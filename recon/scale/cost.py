@@ -28,6 +28,7 @@ def expected_seconds(
     slab_height: int,
     share: float = 1.0,
     num_slices: int | None = None,
+    step_cost: float = 1.0,
 ) -> float:
     """Expected run time of stages on an idle machine, in seconds, within about a factor of two.
 
@@ -37,10 +38,11 @@ def expected_seconds(
         grid: grid of the volume.
         slab_height: number of slices of the slab.
         share: share of voxels that are not skipped.
+        step_cost: time of a step relative to that of grids, see `recon.Field`.
         num_slices: number of fitted slices, counting slices in two blocks twice; by default those of the volume.
     """
     num_slices = grid.height if num_slices is None else num_slices
-    slice_step = (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
+    slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
     total = _START
     for stage in stages:
         if stage.kind in ("noise", "candidates"):

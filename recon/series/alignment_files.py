@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
-from noiseflow.io.ownership import signature
+from noiseflow.io.imod import adjusted
+from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
+_FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
 _AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
 
@@ -105,7 +107,8 @@ def read_alignment(
 
 def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None) -> Alignment:
     """The alignment of a file with one transform for each image of a stack."""
-    table = _xf_with_angles(path, tilt_series) if path.suffix.lower() == ".xf" else io.read_tilts(path)
+    tables = (".aln", ".star", ".tomostar", ".mdoc", ".com")  # others are transforms, such as .xf and .prexg of IMOD
+    table = io.read_tilts(path) if path.suffix.lower() in tables else _xf_with_angles(path, tilt_series)
     if table.transforms is None:
         raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
     table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
@@ -134,7 +137,20 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,
         )
-    return Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    alignment = Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
+    return alignment
+
+
+def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, stated: bool) -> None:
+    """Warn of shifts that may be those of larger images, if no file says which images were aligned."""
+    largest, edge = float(np.abs(alignment.shifts).max(initial=0.0)), min(tilt_series.images.shape[1:])
+    if not stated and largest > _FAR * edge:
+        warnings.warn(
+            f"{path} shifts images of {edge} pixels by up to {largest:.0f} pixels; if it was made on larger images, give "
+            "--alignment-binning, or put the stack that was aligned next to it",
+            stacklevel=4,
+        )
 
 
 def _transforms(table: io.TiltTable) -> NDArray[np.float64]:
@@ -154,8 +170,9 @@ def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
         raise ValueError(
             f"{path} has {len(transforms)} transforms, and {angle_file} has {len(refined)} angles; give the files of one series"
         )
-    angles = np.full(len(transforms), np.nan) if refined is None else refined
-    table = io.TiltTable(angles, transforms=transforms)
+    unknown = io.TiltTable(np.full(len(transforms), np.nan))
+    known = unknown if refined is None else adjusted(io.TiltTable(refined), path, path.stem)  # the offset of tilt.com
+    table = replace(unknown, angles=known.angles, transforms=transforms)
     stack = next((each for suffix in _RAW if (each := path.with_suffix(suffix)).is_file()), None)
     if stack is None:
         return table

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.registration import Registration, register
 from recon.series.screening import Screening, require_specimen, screen
+from recon.series.shrinkage import FEWEST_TILTS, Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import in_order
 
@@ -142,8 +144,13 @@ def prepare(
         alignment = alignment.joined(tilt_series)
     else:
         alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    raw = tilt_series
     if alignment is not None:
-        tilt_series = alignment.apply(tilt_series)
+        tilt_series = alignment.apply(raw)
+    shrinkage = guard("shrinkage", partial(_shrinkage, tilt_series), otherwise=None)
+    if shrinkage is not None and refine_alignment and alignment is not None:
+        alignment = shrinkage.correct(alignment)
+        tilt_series = alignment.apply(raw)
     require_specimen(tilt_series)
     guard("contrast", lambda: check_contrast(tilt_series), otherwise=None)
     # the standard orientation gives identical results for mirror images
@@ -155,6 +162,14 @@ def prepare(
     _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)
+
+
+def _shrinkage(tilt_series: TiltSeries) -> Shrinkage | None:
+    """A change of the specimen's size that matters, if there are enough tilts to measure it."""
+    if tilt_series.num_tilts < FEWEST_TILTS:
+        return None
+    found = estimate_shrinkage(tilt_series)
+    return found if found.found else None
 
 
 def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Prepared:

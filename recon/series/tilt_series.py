@@ -37,6 +37,7 @@ class TiltSeries:
         axes: (tilt,) direction of each tilt axis in the specimen, degrees from y towards −x, if there are two: 0, or a number
             near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
             orientation at zero tilt. See `recon.DualAxisProjector`.
+        dose: (tilt,) dose before each image, or its time, in any unit; None if unknown. Used for shrinkage only.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
         views: (tilt,) index of each image among the `num_views` of its file, if some of these were left out; else None.
@@ -63,6 +64,7 @@ class TiltSeries:
     axes: NDArray[np.float64] | None = None
     views: NDArray[np.int64] | None = None
     num_views: int | None = None
+    dose: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -137,6 +139,7 @@ class TiltSeries:
         object.__setattr__(part, "views", (np.arange(self.num_tilts) if self.views is None else self.views)[tilts])
         object.__setattr__(part, "num_views", self.num_views or self.num_tilts)
         object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
+        object.__setattr__(part, "dose", None if self.dose is None else self.dose[tilts])
         part._check_angles()
         return part
 
@@ -277,7 +280,7 @@ def read_tilt_series(
     size = _pixel_size(pixel_size, image_file, table, path)
     excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
     views = np.setdiff1d(np.arange(count), sorted(excluded))
-    if len(views) < 2:
+    if excluded and len(views) < 2:
         raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
     if mask is not None and mask.shape == image_file.data.shape:
         mask = mask[views]
@@ -294,6 +297,7 @@ def read_tilt_series(
         tilt_axis=table.tilt_axis if tilt_axis is None else tilt_axis,
         views=views if excluded else None,
         num_views=count if excluded else None,
+        dose=None if table.acquired is None else table.acquired[views],
     )
     empty = np.zeros(len(images), np.bool_) if mask is None else ~mask.any((1, 2))
     if not empty.any():

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.io import locked, output_folder, partial_folder
-from noiseflow.io.files import reserve
 from noiseflow.io.mapped import finish_mrc
-from noiseflow.io.ownership import signature
-from noiseflow.io.partials import link_target
 from noiseflow.progress import Progress
+from noiseflow.runs.outputs import reserve
+from noiseflow.runs.ownership import signature
+from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
 from recon.series.dual_axis import own_images

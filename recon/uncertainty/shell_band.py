@@ -18,7 +18,7 @@ from torch import Tensor
 
 from noiseflow.described import described
 from noiseflow.io import atomic_path
-from noiseflow.io.ownership import signature
+from noiseflow.runs.ownership import signature
 from recon.metrics.metrics import resolution, shells_of
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from benchmarks.rivals import Effort, best_cutoff, curves, fitted, own_sirt, sum
 from benchmarks.scenes import Results, in_turn, make_scene, plain
 from benchmarks.search import Best, best, best_fit
 from noiseflow import Gaussian
-from noiseflow.io.ownership import is_own
+from noiseflow.runs.ownership import is_own
 from recon.commands import benchmark as command
 from recon.commands.benchmark import benchmark
 from recon.joint.joint import JointReconstructor

@@ -15,6 +15,7 @@ PAGES = {
     "scale_estimates.md": ("scale.json", "scale_page", "estimates"),
     "calibration.md": ("calibration.json", "calibration_page", "page"),
     "noise_models.md": ("noise_models.json", "noise_page", "page"),
+    "fields.md": ("fields.json", "fields", "page"),
     "priors.md": ("priors.json", "priors", "page"),
     "selection.md": ("selection.json", "selection", "page"),
     "uncertainty.md": ("uncertainty.json", "uncertainty", "page"),

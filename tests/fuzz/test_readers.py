@@ -183,3 +183,38 @@ def test_any_text_is_an_angle_file_or_refused(text: str, tmp_path: Path) -> None
             assert len(found) > 0
         else:
             assert name in refused
+
+
+TABLES = {
+    "a.aln": "# RawSize = 8 8 2\n# DarkFrame = 2 3 60\n1 85 1.0 0.5 -1 1 1 1 0 -3.0\n2 85 1.0 0 0 1 1 1 0 3.0\n",
+    "a.star": "data_x\nloop_\n_rlnTomoYTilt #1\n_rlnMicrographName #2\n-3 1@a.mrc\n3 2@a.mrc\n",
+    "a.tomostar": "data_\nloop_\n_wrpAngleTilt #1\n_wrpMovieName #2\n-3 a.tif\n3 'b c.tif'\n",
+    "a.com": "$tilt\nTILTFILE a.txt\nOFFSET 1.5\nEXCLUDELIST 1-2\n",
+    "a.mdoc": "PixelSpacing = 2\n[ZValue = 0]\nTiltAngle = -3\nPriorRecordDose = 1\n[FrameSet = 1]\nTiltAngle = 3\n",
+    "a.txt": "tilt dose\n-3,5 1\n3,5 2 # last\n",
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", TABLES)
+@fuzz
+@given(place=st.integers(0, 200), length=st.integers(0, 8), text=st.text(max_size=8))
+def test_damaged_tables_of_tilts_are_read_or_refused(
+    name: str, place: int, length: int, text: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.txt").write_text(TABLES["a.txt"])
+    sound = TABLES[name]
+    (tmp_path / name).write_text(sound[:place] + text + sound[place + length :], encoding="utf-8", errors="replace")
+    refused, table = "", None
+    try:
+        table = io.read_tilts(tmp_path / name)
+    except FileNotFoundError:
+        refused = "a.txt"  # damage to its name
+    except ValueError as error:
+        refused = str(error)
+    if table is None:
+        assert name in refused or "a.txt" in refused
+        return
+    assert np.isfinite(table.angles).all()
+    for rows in (table.names, table.sections, table.transforms):
+        assert rows is None or len(rows) in (0, len(table.angles))

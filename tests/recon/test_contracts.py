@@ -109,6 +109,15 @@ def test_field_contract(name):
     assert (field.coarser() is not None) == field.has_coarser
 
 
+def test_coarser_network_is_the_same_function():
+    field = started("network", (8, 10, 12))
+    coarse = field.coarser()
+    assert coarse.network is field.network
+    z, y, x = torch.meshgrid(*(2 * torch.arange(float(size)) + 0.5 for size in (4, 5, 6)), indexing="ij")
+    between = field.at(torch.stack([z, y, x], -1).view(-1, 3)).detach()
+    torch.testing.assert_close(coarse.volume().view(-1), 2 * between)
+
+
 def started(name, shape=(6, 8, 10)):
     torch.manual_seed(0)
     field = FIELDS[name](shape, scale=0.3)

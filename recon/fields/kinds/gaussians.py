@@ -19,10 +19,17 @@ _NARROWEST, _WIDEST, _FIRST = 0.35, 3.0, 1.0
 _REACH = 3.0  # standard deviations; beyond, a Gaussian has 1 % of its peak
 _VALUES_TOGETHER = 2**19  # evaluated at a time: they stay in the cache of a core
 _LARGEST = 20.0  # peak of an initial Gaussian, units
+# gradients between two moves of Gaussians; mass, relative to the median, below which one is moved; width of the halves of a split
+# Gaussian, relative to its own, which keeps their sum near to it. At 48³ moving gains up to 0.02 dB in the volume and 0.07 dB in
+# projections, most with few Gaussians
+_MOVE_EVERY, _NEGLIGIBLE, _HALF_WIDTH = 25, 0.05, 0.8
 
 
 class GaussianField(Field):
     """The sum of anisotropic Gaussians: they follow the object, and memory is proportional to their number.
+
+    Gaussians of negligible mass are moved, in every 25th step, to those whose centres the data pull at most, which are split
+    along their longest axis. Their number is constant.
 
     Each Gaussian is evaluated within three standard deviations. The exponent at the voxels of its window is a polynomial of
     second degree, so that windows of equal size are one small matrix product, forward and backward.
@@ -36,10 +43,12 @@ class GaussianField(Field):
         >>> import recon, torch
         >>> field = recon.GaussianField((8, 8, 8), count=5)
         >>> field.volume().shape, sum(p.numel() for p in field.parameters())
-        (torch.Size([8, 8, 8]), 50)
+        (torch.Size([8, 8, 8]), 55)
     """
 
-    relative_rate = 0.15
+    relative_rate, step_cost = 0.15, 4.0
+    pull: Tensor
+    num_pulls: Tensor
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
         super().__init__(shape, scale=scale)
@@ -48,6 +57,8 @@ class GaussianField(Field):
         self.log_width = nn.Parameter(torch.full((count, 3), math.log(_FIRST)))
         self.rotation = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
         self.peak = nn.Parameter(torch.full((count,), -3.0))
+        self.register_buffer("pull", torch.zeros(count))
+        self.register_buffer("num_pulls", torch.zeros((), dtype=torch.long))
         self.start_from(torch.full((1, 1, 1), EMPTY * scale))
 
     def config(self) -> dict[str, Any]:
@@ -74,26 +85,90 @@ class GaussianField(Field):
 
     def _precision(self) -> tuple[Tensor, Tensor]:
         """Inverse covariances (n, 3, 3), and standard deviations along z, y and x (n, 3)."""
-        w, x, y, z = functional.normalize(self.rotation, dim=-1).unbind(-1)
-        rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-        rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-        rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-        axes = torch.stack(rows, -1).view(-1, 3, 3)
-        width = self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
+        axes, width = _rotations(self.rotation), self._widths()
         scaled = axes / width[:, None]
         with torch.no_grad():
             reach = ((axes * width[:, None]) ** 2).sum(-1).sqrt()
         return scaled @ scaled.mT, reach
 
+    def _note(self, gradient: Tensor) -> None:
+        """Add up how strongly the data pull at the centres, in units of their own widths."""
+        self.pull += (gradient.detach() * self._widths().mean(1, keepdim=True)).norm(dim=1)
+        self.num_pulls += 1
+
+    def _widths(self) -> Tensor:
+        return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
+
+    @torch.no_grad()
+    def _move(self) -> None:
+        """Split the Gaussians with the strongest pull, in place of those of negligible mass."""
+        mass = functional.softplus(self.peak) * self._widths().prod(1)
+        idle = (mass < _NEGLIGIBLE * mass.median()).nonzero()[:, 0]
+        idle = idle[: len(mass) // 4]
+        wanted = self.pull.masked_fill(mass < mass.median(), 0).topk(len(idle)).indices
+        width, longest = self._widths()[wanted].max(1)
+        step = _rotations(self.rotation[wanted])[torch.arange(len(wanted)), :, longest] * (0.6 * width)[:, None]
+        self.log_width[wanted, longest] += math.log(_HALF_WIDTH)
+        self.peak[wanted] = _inverse_softplus(functional.softplus(self.peak[wanted]) / (2 * _HALF_WIDTH) * 1.2)
+        for values in (self.centre, self.log_width, self.rotation, self.peak):
+            values[idle] = values[wanted]
+        self.centre[idle] += step
+        self.centre[wanted] -= step
+        self.pull.zero_()
+
+    def units_at(self, points: Tensor) -> Tensor:
+        size = (self.depth, self.height, self.width)
+        exponents, nearest, radius = self._exponents()
+        margin = int(radius.max())
+        padded = exponents.detach().new_zeros([each + 2 * margin for each in size])
+        last = points.new_tensor(size) - 1
+        cell = torch.minimum(points.detach().round().clamp_min(0), last).long() + margin
+        # the points of each voxel, one after the other
+        cell, order = (cell * cell.new_tensor(padded.stride())).sum(-1).sort()
+        count = torch.bincount(cell, minlength=padded.numel())
+        first = count.cumsum(0) - count
+        found = exponents.new_zeros(len(points))
+        for chosen, _, places in _windows(nearest, radius, padded, margin, crowd=max(1, int(count.max()))):
+            here = count[places].view(-1)
+            which = torch.repeat_interleave(first[places].view(-1) - (here.cumsum(0) - here), here)
+            point = order[which + torch.arange(len(which), device=which.device)]
+            own = torch.repeat_interleave(chosen, count[places].sum(1))
+            terms = _monomials(points[point] - nearest[own]).T
+            found = found.index_add(0, point, (exponents[own] * terms).sum(-1).exp())
+        return found
+
     def units(self) -> Tensor:
+        if torch.is_grad_enabled() and int(self.num_pulls) >= _MOVE_EVERY:
+            self._move()
+            self.num_pulls.zero_()
+        size = (self.depth, self.height, self.width)
+        found: Tensor = _Splatting.apply(*self._exponents(), size)  # type: ignore[no-untyped-call]
+        return found.transpose(1, 2)
+
+    def _exponents(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Coefficients of `_polynomials` (n, 10), nearest voxels (n, 3), and radii of the windows (n,)."""
         precision, reach = self._precision()
         nearest = self.centre.detach().round()
         last = nearest.new_tensor([self.depth, self.height, self.width]) - 1
         nearest = torch.minimum(nearest.clamp_min(0), last)
-        exponents = _polynomials(precision, nearest - self.centre, functional.softplus(self.peak).log())
-        radius = (_REACH * reach.amax(1)).round().long()
-        found: Tensor = _Splatting.apply(exponents, nearest.long(), radius, (self.depth, self.height, self.width))  # type: ignore[no-untyped-call]
-        return found.transpose(1, 2)
+        shift = nearest - self.centre
+        if shift.requires_grad:
+            shift.register_hook(self._note)  # type: ignore[no-untyped-call]
+        exponents = _polynomials(precision, shift, functional.softplus(self.peak).log())
+        return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
+
+
+def _rotations(quaternions: Tensor) -> Tensor:
+    """Rotation matrices (n, 3, 3) of quaternions (n, 4); the principal axes are the columns."""
+    w, x, y, z = functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, -1).view(-1, 3, 3)
+
+
+def _inverse_softplus(values: Tensor) -> Tensor:
+    return torch.log(torch.expm1(values.clamp(EMPTY, _LARGEST)))
 
 
 def _polynomials(precision: Tensor, shift: Tensor, log_peak: Tensor) -> Tensor:
@@ -118,7 +193,7 @@ class _Splatting(torch.autograd.Function):
     def forward(ctx: Any, exponents: Tensor, nearest: Tensor, radius: Tensor, shape: tuple[int, int, int]) -> Tensor:
         margin = int(radius.max())
         padded = exponents.new_zeros([size + 2 * margin for size in shape])
-        for chosen, monomials, places in _windows(nearest, radius, padded.shape, margin):
+        for chosen, monomials, places in _windows(nearest, radius, padded, margin):
             values = torch.exp_(exponents[chosen] @ monomials)
             padded.view(-1).index_add_(0, places.view(-1), values.view(-1))
         ctx.save_for_backward(exponents, nearest, radius)
@@ -130,7 +205,7 @@ class _Splatting(torch.autograd.Function):
         exponents, nearest, radius = ctx.saved_tensors
         margin, found = ctx.margin, torch.empty_like(exponents)
         padded = functional.pad(gradient, [margin] * 6)
-        for chosen, monomials, places in _windows(nearest, radius, padded.shape, margin):
+        for chosen, monomials, places in _windows(nearest, radius, padded, margin):
             values = torch.exp_(exponents[chosen] @ monomials)
             values.mul_(padded.view(-1)[places])
             found[chosen] = values @ monomials.T
@@ -144,18 +219,19 @@ def _inner(padded: Tensor, margin: int) -> Tensor:
 
 
 def _windows(
-    nearest: Tensor, radius: Tensor, shape: Sequence[int], margin: int
+    nearest: Tensor, radius: Tensor, padded: Tensor, margin: int, *, crowd: int = 1
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Some Gaussians with windows of equal size: their indices (n,), the monomials (10, K) of the offsets, and the flat places
-    (n, K) in a grid of this shape whose first voxel is at −margin."""
-    strides = nearest.new_tensor([shape[1] * shape[2], shape[2], 1])
+    (n, K) in the padded grid, whose first voxel is at −margin. Fewer at a time if there are up to `crowd` points in a voxel."""
+    strides = nearest.new_tensor(padded.stride())
     base = ((nearest + margin) * strides).sum(-1)
     for size in torch.unique(radius).tolist():
         span = torch.arange(-size, size + 1, device=nearest.device)
         offsets = torch.stack(torch.meshgrid(span, span, span, indexing="ij"), -1).view(-1, 3)
-        monomials = _monomials(offsets.to(torch.get_default_dtype()))
+        monomials = _monomials(offsets.to(padded.dtype))
         across = (offsets * strides).sum(-1)
-        for chosen in torch.split((radius == size).nonzero()[:, 0], max(1, _VALUES_TOGETHER // len(offsets))):
+        together = max(1, _VALUES_TOGETHER // (crowd * len(offsets)))
+        for chosen in torch.split((radius == size).nonzero()[:, 0], together):
             yield chosen, monomials, base[chosen, None] + across
 
 

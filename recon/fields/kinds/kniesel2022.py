@@ -62,6 +62,8 @@ class PaperField(CoordinateNetwork):
     """
 
     relative_rate = 0.005
+    # 72 times the products of the sine network
+    step_cost = 500.0
 
     def __init__(
         self,

@@ -73,7 +73,9 @@ class CoordinateNetwork(Field):
         torch.Size([1])
     """
 
-    relative_rate = 0.004
+    # 48³ shells: 22.5 dB after 150 steps, 23.0 after 300, 23.2 after 450 at half the rate, and 22.6 dB for grids
+    num_steps, relative_rate = 300, 0.008
+    step_cost = 8.0
     more_memory = 4 * _POINTS_TOGETHER * _ACTIVATIONS
 
     def __init__(
@@ -113,6 +115,17 @@ class CoordinateNetwork(Field):
                 (self._values(points) - target.reshape(-1)).square().mean().backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
         optimiser.zero_grad()
+
+    @property
+    def has_coarser(self) -> bool:
+        return True
+
+    def coarser(self) -> Field | None:
+        """The same network on half as many voxels along each axis."""
+        half = [(size + 1) // 2 for size in (self.depth, self.height, self.width)]
+        field = type(self)(half, scale=2 * float(self.scale), **self.config()).to(self.scale.device)
+        field.network = self.network
+        return field
 
     def units(self) -> Tensor:
         everywhere = torch.arange(self.depth * self.width * self.height, device=self.scale.device)

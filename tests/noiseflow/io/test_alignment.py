@@ -129,3 +129,20 @@ def test_an_mdoc_tells_nothing_before_its_first_section(tmp_path: Path) -> None:
         "TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n"
     )
     assert io.read_angles(tmp_path / "a.mdoc").tolist() == [1.5, -2.0]
+
+
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [
+        (["DateTime = 12-May-20 14:00:05", "DateTime = 12-May-20  14:00:45"], [0, 40]),
+        (["DateTime = 2020-05-12 14:00:05", "DateTime = 2020-05-12 13:59:55"], [10, 0]),
+        (["PriorRecordDose = 3.5", "PriorRecordDose = 0"], [3.5, 0]),
+        (["DateTime = yesterday", "DateTime = today"], None),
+        (["ExposureTime = 1", "ExposureTime = 1"], None),
+    ],
+)
+def test_an_mdoc_tells_when_images_were_taken(tmp_path: Path, entries: list[str], expected: list[float] | None) -> None:
+    sections = (f"[ZValue = {n}]\nTiltAngle = {n}\n{entry}\n" for n, entry in enumerate(entries))
+    (tmp_path / "a.mdoc").write_text("".join(sections))
+    found = io.read_tilts(tmp_path / "a.mdoc").acquired
+    assert (None if found is None else list(found - found.min())) == expected

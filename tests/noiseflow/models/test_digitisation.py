@@ -6,9 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 import noiseflow
 from noiseflow import Digitisation, detect_digitisation
+from tests.independent_scenes import Noise, independent_series, poisson
 
 READINGS = np.random.default_rng(0).normal(0.5, 0.3, 20_000).astype(np.float32)
 NONE = Digitisation()
@@ -21,13 +23,70 @@ def test_continuous_readings_are_not_digitised(scale: float, offset: float) -> N
     assert detect_digitisation(np.random.default_rng(0).random(10_000, dtype=np.float32)) == NONE
 
 
-def test_rails_are_found_only_where_readings_pile_up() -> None:
-    assert detect_digitisation(READINGS.clip(0, 1)) == Digitisation(0.0, 0.0, 1.0)
-    assert detect_digitisation(READINGS.clip(-9, 1)) == Digitisation(0.0, -math.inf, 1.0)
-    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 255).astype(np.uint8)) == Digitisation(1.0, 0.0, 255.0)
-    assert detect_digitisation(np.round(READINGS * 50)) == Digitisation(1.0, -math.inf, math.inf)
-    assert detect_digitisation(np.round(READINGS.clip(0, 1) * 20)) == Digitisation(1.0, 0.0, 20.0)
+def test_limits_are_found_only_where_values_of_equal_signal_pile_up() -> None:
+    def found(values: np.ndarray, signal: float) -> Digitisation:
+        return detect_digitisation(values, np.full(values.shape, signal))
+
+    assert found(READINGS.clip(0, 1), 0.5) == Digitisation(0.0, 0.0, 1.0)
+    assert found(READINGS.clip(-9, 1), 0.5) == Digitisation(0.0, -math.inf, 1.0)
+    assert found(np.round(READINGS.clip(0, 1) * 255).astype(np.uint8), 127.5) == Digitisation(1.0, 0.0, 255.0)
+    assert found(np.round(READINGS * 50), 25) == Digitisation(1.0, -math.inf, math.inf)
+    assert found(np.round(READINGS.clip(0, 1) * 20), 10) == Digitisation(1.0, 0.0, 20.0)
     assert detect_digitisation(np.array([3, 255, 7], np.uint8)).high == 255.0
+    assert detect_digitisation(READINGS.clip(0, 1)) == Digitisation(0.0, -math.inf, 1.0)
+
+
+def _clipped(counts: float, offset: float, read_noise: float) -> Noise:
+    def noise(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
+        images = random.poisson(counts * clean) + random.normal(offset, read_noise, clean.shape)
+        return images.round().clip(0), counts
+
+    return noise
+
+
+def _scaled(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
+    images = random.poisson(40 * clean)
+    return np.round(255 / images.max() * images).astype(np.uint8), 255 / images.max() * 40
+
+
+def _multiplied(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
+    electrons = random.poisson(5 * clean)
+    return np.where(electrons > 0, random.gamma(electrons.clip(1), 20), 0).round(), 100.0
+
+
+def _binned(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
+    return random.poisson(40 * clean, (4, *clean.shape)).mean(0), 40.0
+
+
+END_AT_ZERO: dict[str, Noise] = {
+    **{f"{counts} counts": poisson(counts) for counts in (2, 10, 40, 100)},
+    "dark offset": poisson(40, offset=10),
+    "8 bits": _scaled,
+    "binned": _binned,
+    "multiplied electrons": _multiplied,
+    "exact zeros": lambda clean, random: (
+        np.where(clean > 0, clean + random.normal(0, 0.02, clean.shape), 0).clip(0),
+        1.0,
+    ),
+}
+CLIPPED: dict[str, Noise] = {
+    "clipped": _clipped(40, 0, 3),
+    "clipped above a dark offset": _clipped(40, 2, 3),
+    "clipped below a dark offset": _clipped(40, -2, 3),
+    "few counts": _clipped(10, 0, 1.5),
+    "not rounded": lambda clean, random: ((clean + random.normal(0, 0.1, clean.shape)).clip(0), 1.0),
+}
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.7])
+@pytest.mark.parametrize("scene", ["core_shell", "beads", "vesicles_in_ice"])
+@pytest.mark.parametrize("name", [*END_AT_ZERO, *CLIPPED])
+def test_counts_that_end_at_zero_are_not_clipped_and_clipped_values_are(name: str, scene: str, blur: float) -> None:
+    """Also if the signal is predicted with errors at every edge."""
+    made = independent_series(scene, (END_AT_ZERO | CLIPPED)[name], "±70°/5°")
+    predicted = ndimage.gaussian_filter(made.clean, (0, blur, blur))
+    low = detect_digitisation(made.series.images, predicted).low
+    assert low == (0.0 if name in CLIPPED else -math.inf)
 
 
 @pytest.mark.parametrize("rate", [0.05, 0.3, 1.0, 10.0])
@@ -56,7 +115,7 @@ def test_integers_are_rounded_to_their_common_step() -> None:
 def test_readings_that_are_not_finite_do_not_hide_the_rest() -> None:
     clipped = READINGS.clip(0, 1)
     clipped[:5] = np.nan, np.inf, -np.inf, np.nan, np.inf
-    assert detect_digitisation(clipped) == Digitisation(0.0, 0.0, 1.0)
+    assert detect_digitisation(clipped, np.full(clipped.shape, 0.5)) == Digitisation(0.0, 0.0, 1.0)
     assert detect_digitisation(np.full(4, np.nan)) == NONE
     assert detect_digitisation(np.zeros(0)) == NONE
     assert detect_digitisation(np.zeros(100)) == NONE

@@ -9,7 +9,7 @@ import torch
 import noiseflow
 from benchmarks import needle as benchmark_needle
 from recon.fields.kinds.voxels import VoxelField
-from recon.joint.candidates import first_noise, noise_candidates
+from recon.joint.candidates import Readings, noise_candidates
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import total_steps
 from recon.joint.signal_model import TomographySignal
@@ -126,27 +126,43 @@ def test_penalty_does_not_depend_on_the_unit_of_attenuation():
     torch.testing.assert_close(small_signal_model(weight=0.0).penalty(), torch.tensor(0.0))
 
 
+def _candidates(images: np.ndarray, signal: np.ndarray | float = 0.5) -> list[torch.nn.Module]:
+    observation = torch.from_numpy(images.astype(np.float32))
+    found = Readings.of(images).given(observation, torch.from_numpy(np.broadcast_to(signal, images.shape).copy()), None)
+    return noise_candidates(found, float((images <= found.low).mean()))
+
+
 def test_candidate_noise_models_fit_the_detector():
     images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
-    assert not any(isinstance(model, noiseflow.Digitised) for model in noise_candidates(images))
-    assert all(model.high == 1.0 and model.step == 0.0 for model in noise_candidates(images.clip(0, 1)))
-    assert all(model.step == 1.0 for model in noise_candidates((images * 100).astype(np.int16)))
+    assert not any(isinstance(model, noiseflow.Digitised) for model in _candidates(images))
+    assert all(model.high == 1.0 and model.step == 0.0 for model in _candidates(images.clip(0, 1)))
+    assert all(model.step == 1.0 for model in _candidates((images * 100).astype(np.int16), 50))
 
 
-def test_a_dark_background_on_the_rail_does_not_count_as_clipped():
-    """Half the pixels are vacuum that reads a few counts, often none; the rest has counts by the thousand."""
+def test_counts_are_a_candidate_unless_the_lower_limit_clips():
     generator = np.random.default_rng(0)
-    bright = np.repeat([[0.0] * 20 + [3000.0] * 20], 40, 0)
-    dark_rail = np.round(bright + generator.normal(3, 3, (9, 40, 40)) * (1 + bright / 50)).clip(0)
-    assert all(model.low == 0 for model in noise_candidates(dark_rail))
-    assert isinstance(first_noise(dark_rail), noiseflow.Gaussian)
-    noisy_rail = np.round(bright + generator.normal(0, 300, (9, 40, 40))).clip(0)
-    assert isinstance(first_noise(noisy_rail), noiseflow.Digitised)
+    signal = np.repeat([[0.0] * 20 + [30.0] * 20], 40, 0)
+    counts, clipped = generator.poisson(signal, (9, 40, 40)), generator.normal(signal, 3, (9, 40, 40)).round().clip(0)
+    simplest, *_ = _candidates(counts, signal)
+    assert isinstance(simplest.model, noiseflow.Poisson)
+    assert simplest.low == -np.inf
+    assert all(
+        model.low == 0 and not isinstance(model.model, noiseflow.Poisson) for model in _candidates(clipped, signal)
+    )
+
+
+def test_no_signal_lies_below_what_the_pixel_values_allow():
+    counts = np.random.default_rng(0).poisson(np.repeat([[0.0] * 20 + [30.0] * 20], 40, 0), (9, 40, 40)) + 7
+    readings = Readings.of(counts)
+    rounded, clipped = (noiseflow.Digitised(noiseflow.Gaussian(2.0), 1.0, low=low) for low in (-np.inf, 7.0))
+    assert readings.least_signal(noiseflow.Gaussian(2.0)) == 7
+    assert readings.least_signal(rounded) == pytest.approx(7, abs=0.01)
+    assert readings.least_signal(clipped) == pytest.approx(7 - 3 * 2)
 
 
 def test_where_there_is_little_noise_no_shape_is_learnt():
     images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
-    (only,) = noise_candidates(images, quiet=True)
+    (only,) = noise_candidates(Readings.of(images).digitisation, 0.0, quiet=True)
     assert isinstance(only, noiseflow.SignalDependentGaussian)
 
 

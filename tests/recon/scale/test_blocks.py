@@ -9,7 +9,7 @@ import pytest
 
 from noiseflow import io
 from noiseflow.io.mapped import create_volume, finish_volume, is_mapped
-from noiseflow.io.ownership import is_own
+from noiseflow.runs.ownership import is_own
 from recon.methods import reconstruct
 from recon.scale.blocks import HALO
 from recon.series.alignment import Alignment

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from noiseflow.runs.states import read_state, write_state
 from recon.commands.options import method_of
 from recon.fields.kinds.kniesel2022 import CoordinateDensity
-from recon.joint.checkpoint import read_state, write_state
 from recon.joint.stages import run_stage
 from recon.methods import method_names
 from recon.methods.kniesel2022.network import PaperFlow, by_density

@@ -3,16 +3,44 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+from noiseflow.runs.outputs import atomic_path
+from noiseflow.runs.ownership import tensors_format
+from noiseflow.runs.partials import clear_all_leftovers
 
-from noiseflow.io.ownership import tensors_format
-from noiseflow.io.partials import clear_all_leftovers
-from noiseflow.io.tensor_files import save_tensors
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FORMAT = "noiseflow state 1"
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a file; if writing fails, an existing file is kept.
+
+    Args:
+        path: target.
+        tensors: contiguous CPU tensors that do not share memory.
+        metadata: texts by name.
+
+    Raises:
+        OSError: the file cannot be written, for example because the disk is full.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    with atomic_path(path) as partial:
+        try:
+            save_file(tensors, partial, metadata=dict(metadata))
+        except SafetensorError as error:  # system errors are only part of its message
+            found = re.search(r"os error (\d+)", str(error))
+            if found is None:
+                raise
+            raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
@@ -72,6 +100,8 @@ def discard_states(folder: Path, *descriptions: str) -> None:
 
 
 def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
+    from torch import Tensor
+
     if isinstance(value, Tensor):
         name = str(len(tensors))
         kept = value.detach().cpu().contiguous()

@@ -11,8 +11,8 @@ import tifffile
 
 import noiseflow
 from noiseflow import io
-from noiseflow.io.ownership import is_own
 from noiseflow.report import Report
+from noiseflow.runs.ownership import is_own
 from recon.series.tilt_series import write_angles
 
 IMAGE = np.arange(60, dtype=np.float32).reshape(3, 4, 5)

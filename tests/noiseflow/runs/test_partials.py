@@ -13,12 +13,13 @@ import pytest
 
 from noiseflow import io
 from noiseflow.commands.console import end_stopped
-from noiseflow.io.partials import REPLACED, _prefix, clear_all_leftovers
+from noiseflow.runs import outputs
+from noiseflow.runs.partials import REPLACED, _prefix, clear_all_leftovers
 from tests.processes import FORK
 
 
 def hold(path, folder):
-    with (io.files.atomic_folder if folder else io.atomic_path)(path) as partial:
+    with (outputs.atomic_folder if folder else io.atomic_path)(path) as partial:
         target = partial / "part" if folder else partial
         target.write_bytes(b"half")
         time.sleep(60)
@@ -71,7 +72,7 @@ def test_a_folder_that_was_being_replaced_is_put_back(tmp_path):
     (leftover / REPLACED / "whole").touch()
     clear_all_leftovers(tmp_path)
     assert leftover.exists()
-    io.files.clear_leftovers(path)
+    outputs.clear_leftovers(path)
     assert (path / "whole").exists()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
@@ -165,7 +166,7 @@ def test_ctrl_c_while_a_folder_is_replaced_keeps_the_old_one(tmp_path, monkeypat
             raise KeyboardInterrupt
 
     monkeypatch.setattr(pathlib.Path, "rename", interrupted)
-    with pytest.raises(KeyboardInterrupt), io.files.atomic_folder(path):
+    with pytest.raises(KeyboardInterrupt), outputs.atomic_folder(path):
         pass
     assert (path / "whole").exists()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]

@@ -13,10 +13,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from noiseflow.installation import install_command
-from noiseflow.io.folder import files_of
-from noiseflow.io.image_file import WRITE_SUFFIXES
-from noiseflow.io.ownership import require_own
-from noiseflow.io.partials import REPLACED, clear_leftovers, link_target, partial_folder
+from noiseflow.runs.ownership import require_own
+from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
 
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 
@@ -36,6 +34,8 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
+    from noiseflow.io.image_file import WRITE_SUFFIXES
+
     suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
     path = Path(path)
     if path.suffix.lower() not in suffixes:
@@ -71,6 +71,8 @@ def require_other(output: str | Path, *inputs: str | Path | None) -> None:
 
 
 def _parts(source: str | Path) -> list[Path]:
+    from noiseflow.io.folder import files_of
+
     path = Path(str(source).partition("::")[0])
     return [path, *files_of(path)] if path.is_dir() else [path]
 

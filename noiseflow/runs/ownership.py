@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from noiseflow.installation import library_version
-from noiseflow.io.image_file import MRC_SUFFIXES, TIFF_SUFFIXES
 
 MARK = "noiseflow"
 NPY_HEADER_BYTES = 1024
@@ -44,6 +43,8 @@ def require_own(path: Path, *, overwrite: bool) -> None:
 
 def is_own(path: Path) -> bool:
     """Whether a file or Zarr folder carries the mark of this program, or is an empty file."""
+    from noiseflow.io.image_file import MRC_SUFFIXES, TIFF_SUFFIXES
+
     kind = path.suffix.lower()
     try:
         if path.is_dir():

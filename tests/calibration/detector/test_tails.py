@@ -1,0 +1,27 @@
+"""Tails that no divergence of histograms sees are reported, and a model that has them is chosen."""
+
+import numpy as np
+import pytest
+
+from calibration.detector.models import Pixels, fit_models, foremost, heavy_tailed, simplest_sufficient
+
+
+def pixels(generator, number, *, telegraph):
+    """Pixel values of which 5 % jump by 12 e⁻ (random telegraph noise), if `telegraph`."""
+    electrons = generator.uniform(20, 60, number)
+    jumps = 12 * generator.integers(-1, 2, number) * (generator.random(number) < 0.05) if telegraph else 0
+    counts = 100 + 2 * (generator.poisson(electrons) + 1.5 * generator.standard_normal(number) + 2 * jumps)
+    block = np.arange(number) // 64
+    return Pixels(100 + 2 * electrons, np.round(counts), block % 2 == 1, block)
+
+
+@pytest.mark.parametrize("telegraph", [True, False])
+def test_heavy_tails_are_seen_and_modelled(telegraph):
+    found = pixels(np.random.default_rng(0), 40_000, telegraph=telegraph)
+    scores = fit_models(found, detector=(2.0, 100.0, 1.5))
+    shot = next(score for score in scores if score.name == "poisson-gaussian")
+    assert heavy_tailed(shot.model, found) == telegraph
+    chosen = simplest_sufficient(scores)
+    assert (chosen.name == "poisson-gaussian") == (not telegraph)
+    assert chosen in foremost(scores)
+    assert not heavy_tailed(chosen.model, found)

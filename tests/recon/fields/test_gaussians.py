@@ -1,0 +1,86 @@
+"""Gaussian primitives: against the formula, their gradient, and how idle ones are moved."""
+
+import math
+
+import pytest
+import torch
+
+from recon.fields.kinds.gaussians import GaussianField
+
+
+@pytest.fixture
+def field():
+    torch.manual_seed(0)
+    field = GaussianField((9, 11, 10), count=12)
+    with torch.no_grad():
+        field.centre.copy_(torch.rand(12, 3) * torch.tensor([8.0, 10.0, 9.0]))
+        field.log_width.copy_(torch.randn(12, 3) * 0.3)
+        field.rotation.copy_(torch.randn(12, 4))
+        field.peak.copy_(torch.randn(12))
+    return field
+
+
+def slow(field):
+    """The sum without windows, (z, y, x)."""
+    z, y, x = torch.meshgrid(*(torch.arange(float(size)) for size in (9, 11, 10)), indexing="ij")
+    points = torch.stack([z, y, x], -1)
+    precision, _ = field._precision()
+    apart = points[..., None, :] - field.centre
+    exponent = torch.einsum("...ni,nij,...nj->...n", apart, precision, apart)
+    return (torch.exp(-0.5 * exponent) * torch.nn.functional.softplus(field.peak)).sum(-1)
+
+
+def test_windows_lose_only_the_tails(field):
+    expected = slow(field).detach()
+    error = field.units().transpose(1, 2).detach() - expected
+    assert float(error.abs().max()) < 0.03 * float(expected.max())
+    assert float(error.sum().abs()) < 0.03 * float(expected.sum())
+
+
+def test_values_between_voxels_are_those_of_the_formula(field):
+    points = torch.rand(300, 3) * torch.tensor([8.0, 10.0, 9.0])
+    precision, _ = field._precision()
+    apart = points[:, None] - field.centre
+    exponent = torch.einsum("pni,nij,pnj->pn", apart, precision, apart)
+    expected = (torch.exp(-0.5 * exponent) * torch.nn.functional.softplus(field.peak)).sum(-1)
+    found = field.at(points)
+    assert float((found - expected).abs().max()) < 0.05 * float(expected.max())
+    found.sum().backward()
+    assert bool(torch.isfinite(field.centre.grad).all())
+    assert field.at(points[:0]).shape == (0,)
+
+
+def test_gradient_is_that_of_the_windows(field):
+    weights = torch.rand(9, 11, 10)
+    (field.units().transpose(1, 2) * weights).sum().backward()
+    found = {name: parameter.grad.clone() for name, parameter in field.named_parameters()}
+    field.zero_grad()
+    (slow(field) * weights).sum().backward()
+    for name, parameter in field.named_parameters():
+        difference = float((found[name] - parameter.grad).norm() / parameter.grad.norm())
+        assert difference < 0.15, name  # the tails
+
+
+def test_a_gaussian_starts_where_the_volume_is(field):
+    rough = torch.zeros(3, 3, 3)
+    rough[2, 0, 1] = 1.0
+    field = GaussianField((9, 9, 9), count=200)
+    field.start_from(rough)
+    near = ((field.centre.detach() - torch.tensor([7.0, 1.0, 4.0])).abs() < 3.5).all(1)
+    assert float(near.float().mean()) > 0.9
+    assert float(field.volume().sum()) == pytest.approx(27.0, rel=0.35)
+
+
+def test_idle_gaussians_are_moved_to_where_the_data_pull(field):
+    with torch.no_grad():
+        field.peak[:2] = -12.0
+    for _ in range(25):
+        (field.units() * torch.linspace(0, 1, 10)[:, None]).sum().backward()
+    before = field.volume().sum()
+    assert int(field.num_pulls) == 25
+    field.units()
+    assert int(field.num_pulls) == 0
+    assert len(field.peak) == 12
+    assert float(field.peak.min()) > -6
+    assert float(field.volume().sum()) == pytest.approx(float(before), rel=0.15)
+    assert math.isfinite(float(field.units().sum()))

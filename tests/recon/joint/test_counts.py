@@ -1,0 +1,43 @@
+"""Electron counts over an empty background: mass, offset and accuracy of the joint fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import recon
+from tests.independent_scenes import Noise, independent_series, poisson
+
+
+def _clipped(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
+    return (random.poisson(40 * clean) + random.normal(0, 3, clean.shape)).round().clip(0), 40.0
+
+
+def _psnr(volume: np.ndarray, truth: np.ndarray) -> float:
+    return float(10 * np.log10(truth.max() ** 2 / np.mean((volume - truth) ** 2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("noise", "offset", "mass"),
+    [
+        # the regulariser lowers the contrast of volumes with few counts, that of least squares too
+        (poisson(2), 0, 0.05),
+        (poisson(10), 0, 0.02),
+        (poisson(40), 0, 0.02),
+        (poisson(100), 0, 0.02),
+        (poisson(10, offset=7), 7, 0.02),
+        (_clipped, 0, 0.02),
+    ],
+    ids=["2", "10", "40", "100", "dark offset", "clipped"],
+)
+def test_the_joint_fit_of_counts_has_the_true_mass_and_is_not_below_least_squares(
+    noise: Noise, offset: float, mass: float
+) -> None:
+    made = independent_series("core_shell", noise, "±60°/2°")
+    joint, least_squares = (recon.reconstruct(made.series, method=method) for method in ("joint", "l2"))
+    volume = joint.volume.attenuation
+    assert volume.sum() == pytest.approx(made.truth.sum(), rel=mass)
+    found = joint.signal_model.response()["offset"][0]
+    assert found == pytest.approx(offset, abs=0.25 if noise is _clipped else 0.05)
+    assert _psnr(volume, made.truth) > _psnr(least_squares.volume.attenuation, made.truth) - 0.1
