@@ -170,7 +170,9 @@ def fit(
     settings = replace(settings, num_steps=num_steps - begun)
     if learns_signal:
         warn_if_spinning()
-        return loop.run(settings, progress, checkpoint)
+        loop.run(settings, progress, checkpoint)
+        result.num_steps += begun
+        return result
     with few_threads(batch_size):
         return loop.run(settings, progress, checkpoint)
 
