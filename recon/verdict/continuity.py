@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import NotTested
+from noiseflow.statistics import neighbour_products, robust_deviation
 from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 from recon.verdict.verdict import Finding
@@ -35,7 +36,7 @@ def single_tilts(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Fi
     structure = float(np.median([neighbours(image[None], 1) for image in images]))
     shared = np.array([neighbours(each[None], 1) for each in left])
     beyond = shared - ndimage.median_filter(shared, _BESIDE, mode="nearest")
-    usual = 1.4826 * float(np.median(np.abs(beyond)))
+    usual = robust_deviation(beyond, 0.0)
     far = (beyond > _LONE * usual) & (beyond > _LONE_SHARE * structure)
     far[:2] = far[-2:] = False
     evidence = {"lone tilts": int(far.sum())}
@@ -54,8 +55,8 @@ def breaks(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
     if len(flat) < 2 * _AROUND:
         raise NotTested(f"needs {2 * _AROUND} tilts")
     power = (flat**2).mean((1, 2))
-    shared = (flat[1:] * flat[:-1]).mean((1, 2))
-    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
+    shared = neighbour_products(flat, axis=0).mean((1, 2))
+    chance = np.sqrt(neighbour_products(power) / flat[0].size)
     usual = ndimage.median_filter(shared, _AROUND, mode="nearest")
     apart = (shared < _BREAK * usual) & (usual - shared > _BREAK_SCORE * chance) & (steps < _WIDE * np.median(steps))
     evidence = {"breaks": int(apart.sum())}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from noiseflow.statistics import robust_deviation
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -121,7 +122,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distort
     inside = np.linalg.pinv(covariance[1:, 1:])
     trend = float(np.sqrt(max(0.0, float(curve[1:] @ inside @ curve[1:])) / (len(curve) - 1)))
     smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
-    left = 1.4826 * float(np.median(np.abs(away - basis @ curve + mean)))
+    left = robust_deviation(away - basis @ curve + mean, 0.0)
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(errors**2)))))
     size = float(np.sqrt(max(0.0, np.mean(away**2 - errors**2))))
     return Distortion(size, smooth, rough, mean, scatter, trend, mean * float(np.sqrt(weights.sum())), measured)

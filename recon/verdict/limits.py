@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.residuals import Residuals
 from recon.verdict.verdict import Finding
@@ -65,7 +66,7 @@ def cliff(_: TiltSeries, images: Array, residuals: Residuals) -> tuple[dict[str,
     The noise is four bins wide and smears every edge in the histogram of the object over more than one bin.
     """
     residual = residuals.residual
-    width = _BIN * 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
+    width = _BIN * robust_deviation(residual)
     values, counts = np.unique(images, return_counts=True)
     if not np.median(np.diff(values[-_FEWEST:])) < width / 2:
         return {"cliff": 0.0}, []  # a histogram with so few values has steps of its own

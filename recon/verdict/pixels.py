@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.residuals import Residuals, neighbours
 from recon.verdict.verdict import Finding
@@ -99,7 +100,7 @@ def streaks(_: TiltSeries, __: Array, residuals: Residuals) -> tuple[dict[str, A
     for name, axis in (("rows", 2), ("columns", 1)):
         means = residuals.residual.mean(axis)
         apart = np.abs(means - ndimage.median_filter(means, (1, 5), mode="nearest"))
-        usual = 1.4826 * float(np.median(apart))
+        usual = robust_deviation(apart, 0.0)
         counts[name] = int((apart > np.maximum(_STREAK * usual, residuals.contrast)).sum())
     name = max(counts, key=lambda each: counts[each])
     share = counts[name] / residuals.residual[..., 0].size
@@ -148,7 +149,7 @@ def seam(_: TiltSeries, images: Array, __: Residuals) -> tuple[dict[str, Any], l
     """A step between two columns in the mean of all tilts, in which edges of the object are smeared out."""
     steps = np.diff(images.mean((0, 1), dtype=np.float64))
     apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
-    usual, where = 1.4826 * float(np.median(apart)), int(np.argmax(apart))
+    usual, where = robust_deviation(apart, 0.0), int(np.argmax(apart))
     size = float(apart[where] / max(float(images.std()), 1e-30))
     evidence = {"largest step between columns": size}
     if size < _SEAM_STEP or apart[where] < _SEAM * usual:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import NotTested
+from noiseflow.statistics import neighbour_products
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import Coarse
@@ -131,9 +132,9 @@ def foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
     measured, predicted = coarse.flat, coarse.centred(coarse.images - errors)
-    agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
+    agreement = neighbour_products(predicted, measured, axis=1).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
-    own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
+    own = neighbour_products(measured, axis=1).mean((1, 2))
     order = coarse.directions.order
     beside = np.empty_like(own)
     beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
