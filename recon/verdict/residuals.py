@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from noiseflow.statistics import neighbour_products
 from recon.series.first_guess import contrast_slab
-from recon.series.tilt_series import TiltSeries
+from recon.series.tilt_series import TiltSeries, block_mean
 
 Array = NDArray[Any]
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
@@ -58,6 +58,16 @@ class Residuals:
     def noise(self) -> float:
         """Standard deviation of the residual."""
         return float(self.residual[self.used].std())
+
+    @property
+    def missing(self) -> float:
+        """Share of the contrast that the projections lack: the coefficient of the residual on them."""
+        centred = (self.projections - self.projections.mean((1, 2), keepdims=True)) * self.used
+        return float((self.residual * centred).sum() / max(float((centred**2).sum()), 1e-30))
+
+    def blocks(self, size: int) -> Array:
+        """(tilt, y, u) means of blocks of residuals."""
+        return np.stack([block_mean(each, size, size) for each in self.residual])
 
     def unexplained(self) -> tuple[float, float]:
         """Power common to neighbouring residuals, relative to that of the images, and its standard error for white noise.

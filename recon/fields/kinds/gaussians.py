@@ -43,7 +43,7 @@ class GaussianField(Field):
         >>> import recon, torch
         >>> field = recon.GaussianField((8, 8, 8), count=5)
         >>> field.volume().shape, sum(p.numel() for p in field.parameters())
-        (torch.Size([8, 8, 8]), 50)
+        (torch.Size([8, 8, 8]), 55)
     """
 
     relative_rate, step_cost = 0.15, 4.0
