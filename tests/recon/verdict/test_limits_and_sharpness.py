@@ -142,3 +142,19 @@ def test_copies_of_images_raise_no_warning() -> None:
         warnings.simplefilter("error")
         assert np.isfinite(tilts.jumps(coarse).value)
     assert tilts.repeated(series).value > 0.3
+
+
+@pytest.mark.parametrize(("exponent", "named"), [(1.0, False), (0.7, True)])
+def test_a_response_that_compresses_strong_contrast_is_named(exponent: float, named: bool) -> None:
+    made = scene("particles", "low-dose")
+    clean = made.clean.images / made.clean.images.max()
+    noisy = clean**exponent + np.random.default_rng(0).normal(0, 0.02, clean.shape)
+    series = TiltSeries(noisy, made.noisy.tilt_angles, mode="linear")
+    assert (firing(series, clean**exponent, ["response"]) == {"response"}) == named
+
+
+def test_images_scaled_one_by_one_are_named() -> None:
+    images = scene("particles", "low-dose").noisy.images.astype(np.float64)
+    assert tilts.normalised(TiltSeries(images, np.arange(-60.0, 61, 3), mode="linear")).value == 0
+    scaled = (images - images.mean((1, 2), keepdims=True)) / images.std((1, 2), keepdims=True)
+    assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1
