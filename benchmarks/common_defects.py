@@ -144,7 +144,7 @@ def _inverted(source: Source) -> TiltSeries:
     return with_images(source, images.max() + images.min() - images)
 
 
-@way("logarithm taken before", "mode", late=True)
+@way("logarithm taken before", "mode", "response", late=True)
 def _logarithm(source: Source) -> TiltSeries:
     images = source.series.images.astype(np.float64)
     least = max(1e-3, 1e-2 * images.max())
@@ -311,7 +311,7 @@ def _vignette(source: Source) -> TiltSeries:
     return with_images(source, source.series.images * (1 - 0.2 * (y**2 + (x - 0.3) ** 2)))
 
 
-@way("saturation", "saturation", late=True)
+@way("saturation", "saturation", "response", late=True)
 def _saturation(source: Source) -> TiltSeries:
     images = source.series.images
     if source.series.mode == "linear":

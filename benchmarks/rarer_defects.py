@@ -107,7 +107,7 @@ def _partly_inverted(source: Source) -> TiltSeries:
     return with_images(source, images)
 
 
-@way("detector's response bent", "mode", "saturation")
+@way("detector's response bent", "mode", "saturation", "response")
 def _bent(source: Source) -> TiltSeries:
     """Square root of the contrast, which compresses strong contrast."""
     contrast = (source.series.images - source.empty) / (source.full - source.empty)

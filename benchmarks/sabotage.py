@@ -115,7 +115,9 @@ def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = 
 
 
 def _graded(verdict: Verdict) -> Cell:
-    return {"grade": verdict.grade, "subjects": list(verdict.subjects), "reasons": list(verdict.reasons)}
+    """Grade and reasons, and the evidence of every check, from which limits can be fitted without another run."""
+    found = {"grade": verdict.grade, "subjects": list(verdict.subjects), "reasons": list(verdict.reasons)}
+    return found | {"evidence": verdict.evidence, "not_tested": verdict.not_tested}
 
 
 def _psnr(result: Any, truth: Any) -> float | None:

@@ -256,6 +256,7 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
             "system gain K",
             f"{gain.median:.5g} counts/e⁻ (90 %: {gain.q05:.5g} … {gain.q95:.5g}); 1/K = {per_count:.5g} e⁻/count",
         ),
+        ("K for a linear response", _text(figures.if_linear, "counts/e⁻")),
         ("dark noise", _text(figures.dark_noise, "e⁻ rms")),
         ("offset", _value(figures.offset, "counts")),
         ("saturation capacity", ("" if figures.saturated else "≥ ") + f"{figures.saturation:.5g} e⁻"),
@@ -305,8 +306,9 @@ def summary_of(camera: Camera) -> dict[str, Any]:
         "dark_current",
     )
     found: dict[str, Any] = {name: getattr(figures, name) for name in names}
-    for name in ("gain", "dark_noise", "excess_factor"):
-        value = getattr(figures, name)
+    intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
+    for name, attribute in intervals.items():
+        value = getattr(figures, attribute)
         found[name] = None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
     found["electrons_per_count"] = 1 / figures.gain.median
     found["correlation_factor"] = figures.correlation.factor
@@ -335,12 +337,18 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
     def times(value: Interval, by: float) -> Interval:
         return Interval(value.median * by, value.q05 * by, value.q95 * by)
 
-    gain = times(figures.gain, factor)
+    gain, straight = times(figures.gain, factor), times(figures.if_linear, factor)
     noise = None if figures.dark_noise is None else times(figures.dark_noise, 1 / np.sqrt(factor))
     dsnu = None if figures.dsnu is None else figures.dsnu / factor
     current = None if figures.dark_current is None else figures.dark_current / factor
     return replace(
-        figures, gain=gain, dark_noise=noise, saturation=figures.saturation / factor, dsnu=dsnu, dark_current=current
+        figures,
+        gain=gain,
+        if_linear=straight,
+        dark_noise=noise,
+        saturation=figures.saturation / factor,
+        dsnu=dsnu,
+        dark_current=current,
     )
 
 

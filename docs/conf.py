@@ -64,11 +64,13 @@ html_css_files = ["pages.css"]
 
 def setup(app: Any) -> None:
     """Write the reference of the commands and the notebooks before each build."""
+    import check_table
     import command_reference
     import notebooks
     import page_dates
 
     app.connect("config-inited", command_reference.write)
+    app.connect("config-inited", check_table.write)
     app.connect("config-inited", notebooks.write_for_sphinx)
     app.connect("source-read", notebooks.link)
     app.connect("source-read", page_dates.add)

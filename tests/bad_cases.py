@@ -109,7 +109,7 @@ simulate {out}/s --tilts nan:10:1 | tilts
 simulate {out}/s --phantom unicorn | unicorn
 simulate {out}/s --noise {bad}/missing.safetensors | missing.safetensors
 simulate {out}/s --noise {bad}/pickle.safetensors | not a noise-model file
-simulate {out}/s --mode haadf | linear
+simulate {out}/s --mode sem | linear
 simulate {bad}/empty.mrc | empty.mrc
 reconstruct {bad}/missing.mrc -o {out}/v.mrc | does not exist
 reconstruct {bad}/empty.mrc -o {out}/v.mrc | is empty
@@ -144,7 +144,7 @@ reconstruct {good}/tilts.mrc --alignment {bad}/missing.xf -o {out}/v.mrc | does 
 reconstruct {good}/tilts.mrc --alignment {bad}/wrong.xf -o {out}/v.mrc | six numbers
 reconstruct {good}/tilts.mrc --alignment {bad}/short.xf -o {out}/v.mrc | 1 transforms
 reconstruct {good}/tilts.mrc --method magic -o {out}/v.mrc | choose
-reconstruct {good}/tilts.mrc --mode haadf -o {out}/v.mrc | linear
+reconstruct {good}/tilts.mrc --mode sem -o {out}/v.mrc | linear
 reconstruct {good}/tilts.mrc --thickness 0 -o {out}/v.mrc | thickness
 reconstruct {good}/tilts.mrc --thickness -4 -o {out}/v.mrc | thickness
 reconstruct {good}/tilts.mrc --weight -1 -o {out}/v.mrc | zero or more
@@ -192,7 +192,7 @@ reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 1
-compare {good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt --mode haadf | linear
+compare {good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt --mode sem | linear
 compare {good}/tilts.mrc {good}/tilts.mrc --report {bad}/empty.mrc | is a file
 compare {good}/model.safetensors {good}/tilts.mrc | is not an image but a noise model
 compare {bad}/absurd.mrc {good}/tilts.mrc | header claims

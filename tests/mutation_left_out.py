@@ -48,7 +48,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("unbounded | (ratio >= 0), -torch", "numbers", "a ratio of 0 is that of an empty interval"),
         ("unbounded | (ratio >= 0), -torch", "-torch.ones_like(ratio)", SAFE),
         ("torch.special.erfcx(-x.clamp(max=0)", "0", SAFE),
-        ("torch.special.ndtr(x.clamp(min=0))", "0", SAFE),
         ("return torch.where(x <= 0, left, right)", "x <= 0", "at 0 both forms are the same number"),
         ("far = x < -1e4", "numbers", BOTH),
         ("far = x < -1e4", "x < -10000.0", BOTH),

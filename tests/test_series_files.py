@@ -171,6 +171,19 @@ def test_images_and_angles_are_joined_by_name(images: list[str], rows: list[str]
         np.testing.assert_array_equal(image, STACK[{3.1: 0, -3.1: 1, 9.1: 2}[angle]])
 
 
+def test_a_plain_list_in_another_order_is_joined_by_the_angles_in_names(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "tilts", ["t_3.0.tif", "t_-3.0.tif", "t_9.0.tif"], STACK)
+    (folder / "a.tlt").write_text("-3.1\n3.1\n9.1\n")
+    image = io.read(folder)
+    with pytest.warns(UserWarning, match="by the angles in the names"):
+        table = io.tilts_of(folder, image)
+    found = dict(zip(image.names, table.angles, strict=True))
+    assert found == {"t_3.0.tif": 3.1, "t_-3.0.tif": -3.1, "t_9.0.tif": 9.1}
+    (folder / "a.tlt").write_text("-30\n0\n30\n")  # other angles: by order, with a warning
+    with pytest.warns(UserWarning, match="angle file is used"):
+        assert io.tilts_of(folder, image).angles.tolist() == [-30, 0, 30]
+
+
 def test_images_that_the_file_does_not_name_are_refused(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "tilts", ["a.tif", "b.tif", "x.tif"], STACK)
     (folder / "all.mdoc").write_text("".join(f"[Image = {n}.tif]\nTiltAngle = {k}\n" for k, n in enumerate("abc")))
@@ -241,6 +254,13 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="about x"):
         given = recon.read_tilt_series(tmp_path / "a_ali.mrc", angles=tmp_path / "tilt.com")
     assert given.tilt_angles.tolist() == series.tilt_angles.tolist()
+    (tmp_path / "a.xf").write_text("1 0 0 1 0 0\n" * 4)
+    io.write(tmp_path / "a.mrc", stack)
+    (tmp_path / "a.rawtlt").write_text("-19\n-9\n11\n21\n")
+    raw = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert raw.tilt_angles.tolist() == [-17.5, 12.5, 22.5]
+    refined = recon.read_alignment(tmp_path / "a.xf", raw).joined(raw).apply(raw)
+    assert refined.tilt_angles.tolist() == series.tilt_angles.tolist()
     io.write(tmp_path / "b.mrc", stack)
     (tmp_path / "b.tlt").write_text("-20\n-10\n10\n20\n")
     assert recon.read_tilt_series(tmp_path / "b.mrc").num_tilts == 4  # the command file of another stack

@@ -53,7 +53,10 @@ volume, which a method has to exceed. The last column names the field that predi
 takes it on the slab, and how far the others are behind, in nats per pixel.
 
 Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."""
-_NOT_RUN = """## Not measured
+_NOT_RUN = """The weight is the same for all and the best of none: with weights searched for each field, differences may
+change their sign. Grids take their usual 150 steps.
+
+## Not measured
 
 More than one fit per row, sizes of 64³ and more, weights and noise chosen by the fit, and the network of Kniesel et al. with
 its 256 units (`--field kniesel2022`)."""

@@ -65,6 +65,7 @@ class CameraFigures:
         dark: moments of the dark frames; None without dark frames.
         correlation: correlation of the temporal noise of neighbouring pixels.
         chi_squared: χ² per degree of freedom of the photon-transfer line.
+        if_linear: the gain if the response is linear.
         bend: exponent of the response to light; the gain is the local one at the mean signal.
         pattern: places whose noise differs at equal signal.
         outliers: number of values that stood out in one frame only and were replaced.
@@ -87,6 +88,7 @@ class CameraFigures:
     dark: Level | None
     correlation: Correlation
     chi_squared: float
+    if_linear: Interval
     bend: Response
     pattern: Pattern
     outliers: int = 0
@@ -188,6 +190,7 @@ def measure_camera(
         dark=dark,
         correlation=correlation,
         chi_squared=chi_squared,
+        if_linear=_normal(slope, error),
         bend=bend,
         pattern=pattern_of(residuals, inflation=correlation.inflation),
         outliers=outliers,

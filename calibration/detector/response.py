@@ -18,6 +18,9 @@ Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillato
 RATIO_ERROR = 0.01
 """Relative error of a given exposure ratio: stability of lamp and shutter."""
 
+WRONG_RATIO = 0.02
+"""Share of given exposure ratios that are wrong."""
+
 CLEAR = 3.0
 """Standard errors from which an exponent is reported and modelled."""
 
@@ -93,7 +96,7 @@ def response_of(
     change = 1 / (2 * EXPONENTS - 1)
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
-        weight = weight * (near / max(near.sum(), np.finfo(float).tiny) + 1 / len(EXPONENTS))  # the ratio may be wrong
+        weight = weight * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
     # the nodes and weights of a Gauss-Hermite rule of three points
     shifts = () if offset is None else ((0.0, 2 / 3), (-np.sqrt(3), 1 / 6), (np.sqrt(3), 1 / 6))
     found = [(_curve(signal - offset[0] - by * offset[1], variance, error), share) for by, share in shifts if offset]

@@ -116,6 +116,8 @@ def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list
     if image.names and image.tilt_angles is not None and len(table.angles) >= count:
         found = _by_angle(table.angles, image.tilt_angles)
         if found is not None:
+            if found != list(range(count)):
+                warnings.warn(f"{file} is joined to {stack} by the angles in the names of the images", stacklevel=3)
             return found
     if table.sections is not None and sorted(table.sections) == list(range(count)):
         return [int(row) for row in np.argsort(table.sections)]

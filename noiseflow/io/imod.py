@@ -41,9 +41,8 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
     path = stack.with_name("tilt.com")
     if path.is_file() and stack.is_file():
         entries = _entries(path)
-        older = next(
-            (name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), ""
-        )  # a line of its own, without keyword
+        # older files name the stack in a line of its own, without a keyword
+        older = next((name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), "")
         projections = entries.get("INPUTPROJECTIONS") or entries.get("INPUTFILE") or older
         if Path(projections).stem.lower().removesuffix("_ali") == stem.lower():
             return _applied(table, entries, path)

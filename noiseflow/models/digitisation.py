@@ -98,7 +98,7 @@ def _paired(values: NDArray[Any], signal: ArrayLike) -> NDArray[np.float64]:
     given = signal.detach().cpu() if hasattr(signal, "detach") else signal
     predicted = np.atleast_1d(np.asarray(given, dtype=np.float64))
     if predicted.shape != values.shape:
-        raise ValueError(f"signal has shape {predicted.shape}, readings {values.shape}; they must be equal")
+        raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
     return predicted
 
 

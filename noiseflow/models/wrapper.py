@@ -33,61 +33,30 @@ class ModelAround(NoiseModelBase):
         super().__init__()
         self.model = as_noise_model(model)
 
-    @property
-    def needs_image(self) -> bool:
-        return self.model.needs_image
 
-    @property
-    def neighbourhood(self) -> int:
-        return self.model.neighbourhood
+def _of_inner(name: str) -> property:
+    """A trait that a wrapper takes from its inner model, and sets there."""
+    own = getattr(NoiseModelBase, name)
+    return property(
+        lambda self: getattr(self.model, name), lambda self, value: setattr(self.model, name, value), None, own.__doc__
+    )
 
-    @property
-    def shared_axis(self) -> int | None:
-        return self.model.shared_axis
 
-    @property
-    def describes_single_readings(self) -> bool:
-        return self.model.describes_single_readings
-
-    @property
-    def tabulate(self) -> bool:
-        return self.model.tabulate
-
-    @tabulate.setter
-    def tabulate(self, value: bool) -> None:
-        self.model.tabulate = value
-
-    @property
-    def one_pixel(self) -> NoiseModelBase:
-        return self.model.one_pixel
-
-    @property
-    def starts_most_likely(self) -> bool:
-        return self.model.starts_most_likely
-
-    @property
-    def learning_rate(self) -> float:
-        return self.model.learning_rate
-
-    @property
-    def num_steps(self) -> int:
-        return self.model.num_steps
-
-    @property
-    def joint_learning_rate(self) -> float:
-        return self.model.joint_learning_rate
-
-    @property
-    def most_joint_steps(self) -> int | None:
-        return self.model.most_joint_steps
-
-    @property
-    def starts_anew(self) -> bool:
-        return self.model.starts_anew
-
-    @property
-    def fitted_range(self) -> tuple[float, float] | None:
-        return self.model.fitted_range
+for _name in (
+    *("needs_image", "neighbourhood", "shared_axis", "describes_single_readings", "tabulate", "one_pixel"),
+    *(
+        "starts_most_likely",
+        "fits_directly",
+        "costly",
+        "learning_rate",
+        "num_steps",
+        "joint_learning_rate",
+        "most_joint_steps",
+        "starts_anew",
+    ),
+    "fitted_range",
+):
+    setattr(ModelAround, _name, _of_inner(_name))
 
 
 class ForeignModel(NoiseModelBase):

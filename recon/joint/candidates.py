@@ -48,7 +48,7 @@ class Readings:
 
     @staticmethod
     def of(images: NDArray[Any]) -> Readings:
-        """The readings of images of any shape."""
+        """The pixel values of images of any shape."""
         found = detect_digitisation(images)
         return Readings(found, float(images.min()), float((images >= found.high).mean()))
 

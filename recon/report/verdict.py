@@ -20,6 +20,13 @@ _WORDS = {
     "bad": "Bad: do not use this volume until you have corrected the first reason.",
 }
 
+# tolerances: larger effects are drawn here
+_MOST = 4.0
+_EFFECTS = (
+    "Each check with two standard errors. Right of the dashed line an effect exceeds its tolerance; it gives a reason if it is "
+    "also significant."
+)
+
 
 def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, result: Result) -> None:
     """Add heading, grade, reasons and charts of a verdict to a report.
@@ -34,6 +41,8 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
+    effects = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
+    report.figure(_effects(effects), caption=_EFFECTS)
     residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)
     angles = residuals.tilt_angles
@@ -49,6 +58,29 @@ def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, resul
         "waves and steps indicate shifts, wrong angles, or a changing specimen. The volume absorbs a part of each difference."
     )
     report.charts(charts, caption=caption)
+
+
+def _effects(effects: list[tuple[str, dict[str, Any]]]) -> Any:
+    """All effects with two standard errors, in their tolerances."""
+    figure, axis = new_chart("Effects and their tolerances", x="size of the effect, tolerances", y="")
+    figure.set_size_inches(7, 0.16 * len(effects) + 0.8)
+    places = np.arange(len(effects))[::-1]
+    sizes, errors = (
+        np.array([abs(each[part]) / each["tolerance"] for _, each in effects]) for part in ("value", "error")
+    )
+    fired = np.array([each["cost"] >= 1 for _, each in effects])
+    for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
+        axis.errorbar(
+            np.minimum(sizes, _MOST)[which],
+            places[which],
+            xerr=np.minimum(2 * errors, _MOST)[which],
+            fmt="o",
+            color=colour,
+        )
+    axis.axvline(1, color=COLOURS["warm"], linewidth=1, linestyle="--")
+    axis.set_yticks(places, [name for name, _ in effects])
+    axis.set_xlim(-0.1, _MOST + 0.2)
+    return figure
 
 
 def _chart(title: str, unit: str, angles: NDArray[Any], curves: dict[str, NDArray[Any]]) -> Any:

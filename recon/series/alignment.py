@@ -17,6 +17,8 @@ from recon.series.tilt_series import TiltSeries, filled
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
 
 
+# mean counts per pixel, below which noise is a third of the signal and more, and hides the error of the nearest pixel
+_FEW_COUNTS = 10
 _SAME_TILT = 0.3  # degrees, and a third of the smallest step: files round angles to 0.1°, stages repeat them to 0.1°
 _SAME_SCALE = 0.02  # relative: binning by incomplete blocks loses up to one pixel in fifty
 
@@ -165,7 +167,8 @@ class Alignment:
     def apply(self, tilt_series: TiltSeries, *, shape: tuple[int, int] | None = None) -> TiltSeries:
         """Align a series so that the axis is along y through the centre; regions outside the raw images are masked.
 
-        Images are interpolated once, with cubic splines, which correlates the noise of neighbouring pixels. If the axis is
+        Images are interpolated once, with cubic splines, which correlates the noise of neighbouring pixels. Whole numbers with a
+        mean below ten are copied from the nearest pixel instead, because interpolated counts are not Poisson. If the axis is
         within 45° of x, height and width are swapped. Without rotation and fractional shifts, pixel values do not change. Large
         series are written to a temporary file.
 
@@ -181,9 +184,10 @@ class Alignment:
             raise ValueError(f"{len(self.shifts)} shifts do not match {tilt_series.num_tilts} tilts")
         size = (tilt_series.num_tilts, *(shape or self._shape(tilt_series.images.shape[1:])))
         images, mask = (mapped.temporary_map(size, kind, in_memory=mapped.IN_MEMORY) for kind in (np.float32, np.bool_))
+        counts = _are_few_counts(tilt_series.images)
         for number, (image, back) in enumerate(zip(tilt_series.images, self._back, strict=True)):
             use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
-            images[number], mask[number] = _moved(image, use, back, self.shifts[number], size[1:])
+            images[number], mask[number] = _moved(image, use, back, self.shifts[number], size[1:], nearest=counts)
         if not mask.any((1, 2)).all():
             raise ValueError("an image was moved out of view entirely; give --tilt-axis, or remove --refine-alignment")
         given = tilt_series.images.dtype
@@ -264,6 +268,13 @@ class Alignment:
         }
 
 
+def _are_few_counts(images: NDArray[Any]) -> bool:
+    """Whether images hold few counts per pixel, such as element maps."""
+    if not np.issubdtype(images.dtype, np.integer):
+        return False
+    return bool(min(image.min() for image in images) >= 0 and np.mean([image.mean() for image in images]) < _FEW_COUNTS)
+
+
 def _rotation(degrees: float) -> NDArray[np.float64]:
     """Matrix from aligned to raw positions (y, x); exact for right angles."""
     theta = np.deg2rad(degrees)
@@ -277,6 +288,8 @@ def _moved(
     back: NDArray[np.float64],
     shift: NDArray[np.float64],
     shape: tuple[int, ...],
+    *,
+    nearest: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """An aligned image and its mask."""
     from scipy.ndimage import affine_transform
@@ -285,7 +298,7 @@ def _moved(
     seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
     mask = seen > 0.99
     # quarter turns and shifts by whole pixels: values are copied
-    exact = np.array_equal(back, np.round(back)) and np.array_equal(start, np.round(start))
+    exact = nearest or (np.array_equal(back, np.round(back)) and np.array_equal(start, np.round(start)))
     source = image.astype(np.float64)
     moved = affine_transform(
         source, back, start, output_shape=shape, order=0 if exact else 3, mode="nearest", output=np.float32

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow import io
+from noiseflow.io.imod import adjusted
 from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries, write_angles
@@ -169,8 +170,9 @@ def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
         raise ValueError(
             f"{path} has {len(transforms)} transforms, and {angle_file} has {len(refined)} angles; give the files of one series"
         )
-    angles = np.full(len(transforms), np.nan) if refined is None else refined
-    table = io.TiltTable(angles, transforms=transforms)
+    unknown = io.TiltTable(np.full(len(transforms), np.nan))
+    known = unknown if refined is None else adjusted(io.TiltTable(refined), path, path.stem)  # the offset of tilt.com
+    table = replace(unknown, angles=known.angles, transforms=transforms)
     stack = next((each for suffix in _RAW if (each := path.with_suffix(suffix)).is_file()), None)
     if stack is None:
         return table

@@ -1,4 +1,4 @@
-"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, angle."""
+"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, response."""
 
 from __future__ import annotations
 
@@ -9,38 +9,48 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from noiseflow.checks import Effect
+from noiseflow.statistics import robust_deviation
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
-NAMES = ("shift along y", "shift across", "magnification", "rotation", "tilt angle", "brightness", "background")
-_TWIN, _FEWEST = 0.02, 3  # degrees within which angles are equal; smallest number of tilts for a standard deviation
-_DEGREE = 5  # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
+NAMES = (
+    "shift along y",
+    "shift across",
+    "magnification",
+    "rotation",
+    "tilt angle",
+    "brightness",
+    "background",
+    "sharpness",
+    "curvature",
+)
+# degrees within which angles are equal
+_TWIN = 0.02
+# smallest number of tilts for a standard deviation
+_FEWEST = 3
+# of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
+_DEGREE = 5
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """One type of distortion over all tilts.
+    """One type of distortion over all tilts, in pixels (at the image edge), or as a share of the contrast.
 
     Attributes:
-        size: rms over the inner tilts, without the mean and the expected random part; pixels at the image edge, or a share of
-            the contrast.
-        smooth: rms of its smooth part over the tilts, same unit.
-        rough: standard deviation around its smooth part without the expected random part, same unit; robust to outliers.
-        mean: mean over all tilts, same unit.
-        scatter: rms of the deviations from the mean in standard errors; 1 for random errors.
-        trend: rms of the coefficients of the smooth part in standard errors; 1 for random errors.
-        offset: the mean in standard errors.
+        spread: rms over the inner tilts, without the mean and the expected random part.
+        drift: rms of its smooth part over the tilts.
+        jitter: standard deviation around its smooth part without the expected random part; robust to outliers.
+        offset: mean over all tilts.
         values: (tilt,) measured values.
     """
 
-    size: float
-    smooth: float
-    rough: float
-    mean: float
-    scatter: float
-    trend: float
-    offset: float
+    spread: Effect
+    drift: Effect
+    jitter: Effect
+    offset: Effect
     values: Array
 
 
@@ -63,16 +73,14 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
 def _units(residuals: Residuals) -> tuple[float, ...]:
     """Factors from coefficients to pixels at the image edge, or to shares of the contrast."""
     edge = residuals.images.shape[2] / 2
-    return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30)
+    return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30), 1.0, 1.0
 
 
 def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
     """Yield the columns and the target of the regression for each tilt."""
     width = residuals.images.shape[2]
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
-    along = (residuals.height - residuals.height.mean())[:, None].astype(
-        np.float64
-    )  # relative to the middle of these slices
+    along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
     by_angle = _slope_over_tilts(residuals)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
@@ -80,7 +88,8 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
         columns = (down, right, along * down + across * right, along * right - across * down)
         use = residuals.used[tilt].ravel()
         brightness = image - image.mean()
-        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image)]
+        fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
+        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64)
 
 
@@ -113,15 +122,27 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distort
     mean = float((weights * values).sum() / weights.sum())
     away = values - mean
     count = len(values)
-    scatter = float(np.sqrt((away**2 * weights).sum() / max(1, count - 1)))
     place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-9) - 1
     basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
     curve = covariance @ (basis.T @ (weights * values))
     inside = np.linalg.pinv(covariance[1:, 1:])
-    trend = float(np.sqrt(max(0.0, float(curve[1:] @ inside @ curve[1:])) / (len(curve) - 1)))
+    # both are χ², of many and of few degrees of freedom
+    scatter = _score(float((away**2 * weights).sum()), max(1, count - 1))
+    trend = _score(float(curve[1:] @ inside @ curve[1:]), len(curve) - 1)
     smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
-    left = 1.4826 * float(np.median(np.abs(away - basis @ curve + mean)))
-    rough = float(np.sqrt(max(0.0, left**2 - float(np.median(errors**2)))))
-    size = float(np.sqrt(max(0.0, np.mean(away**2 - errors**2))))
-    return Distortion(size, smooth, rough, mean, scatter, trend, mean * float(np.sqrt(weights.sum())), measured)
+    left, random = robust_deviation(values - basis @ curve, 0.0), errors**2
+    rough = float(np.sqrt(max(0.0, left**2 - float(np.median(random)))))
+    size = float(np.sqrt(max(0.0, np.mean(away**2 - random))))
+    return Distortion(
+        Effect(size, size / scatter),
+        Effect(smooth, smooth / trend),
+        Effect(rough, rough / scatter),
+        Effect(mean, float(1 / np.sqrt(weights.sum()))),
+        measured,
+    )
+
+
+def _score(chi_squared: float, freedom: int) -> float:
+    """Excess of χ² over its expectation in standard deviations, positive."""
+    return max((chi_squared - freedom) / float(np.sqrt(2 * freedom)), 1e-9)

@@ -1,9 +1,9 @@
-"""Tests of alternative geometries: another tilt axis, other angles, a thicker volume, two objects."""
+"""Other geometries: a tilt axis, angles, a thickness or two objects that predict held-out gaps of tilts better."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from noiseflow.checks import Effect
 from recon.verdict.coarse import Coarse
 from recon.verdict.gap_fit import GAP, GapFit
+from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
@@ -25,21 +27,6 @@ _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
 _SEEN = 0.99
 # degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
 _WIDEST = 190.0
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Improvement of the prediction of held-out tilts by another geometry.
-
-    Attributes:
-        share: improvement relative to the error of the given geometry.
-        score: improvement in standard errors over the gaps.
-        what: description of the geometry.
-    """
-
-    share: float
-    score: float
-    what: str
 
 
 class Geometry:
@@ -78,7 +65,22 @@ class Geometry:
             gap=gap,
         )
 
-    def axis(self) -> Gain:
+    @property
+    def structure(self) -> float:
+        """Structure common to neighbouring pixels, in standard errors: the larger value of y and u."""
+        flat = self.coarse.flat
+        chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
+        return max(neighbours(flat, axis) for axis in (1, 2)) / chance
+
+    @property
+    def edge(self) -> float:
+        """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
+        used = self.coarse.used.sum((0, 1))
+        profile = ((self.coarse.images * self.coarse.used).sum((0, 1)) / np.maximum(used, 1))[used > 0]
+        raised = profile - profile.min()
+        return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
+
+    def axis(self) -> Effect:
         """The best other direction of the tilt axis.
 
         Interpolation alone reduces the noise, so each turn is compared with its opposite and with a shift.
@@ -92,11 +94,11 @@ class Geometry:
             both = {turn: self._moved(partial(_turned, turn), self.fit) for turn in (-size, size)}
             for turn, errors in both.items():
                 what = f"turned by {turn:g}°"
-                gains.append(min((self._gain(errors, other, what) for other in (shifted, both[-turn])), key=_share))
+                gains.append(min((self._gain(errors, other, what) for other in (shifted, both[-turn])), key=_value))
         if self.coarse.images.shape[1] == self.coarse.images.shape[2]:
             across = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
             gains.append(self._gain(across, self.errors, "turned by 90°"))
-        return max(gains, key=_share)
+        return _best(gains)
 
     def _moved(self, move: Callable[[Array], Array], fit: GapFit) -> Array:
         """Errors of moved images."""
@@ -106,47 +108,52 @@ class Geometry:
         )
         return fit.errors(images, used > _SEEN)
 
-    def angles(self) -> Gain:
+    def angles(self) -> Effect:
         """The best other scale of the tilt angles."""
         angles = self.coarse.tilt_angles
         scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
-        return max((self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales), key=_share)
+        return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
 
-    def thicker(self) -> Gain:
+    def thicker(self) -> Effect:
         """A volume with a depth equal to the width, if it is thinner."""
         if self.coarse.depth >= self.coarse.width:
-            return Gain(0.0, 0.0, "as deep as wide")
-        return self._with("as deep as wide", depth=self.coarse.width)
+            return Effect(0.0)
+        return _best([self._with("as deep as wide", depth=self.coarse.width)])
 
-    def two_objects(self) -> Gain:
+    def two_objects(self) -> Effect:
         """Separate volumes for parts of the series: halves, and every other tilt."""
         order = self.coarse.directions.order
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         parts = {"halves": rank < len(order) // 2, "every other tilt": rank % 2 == 0}
-        return max((self._apart(first, name) for name, first in parts.items()), key=_share)
+        return _best(self._apart(first, name) for name, first in parts.items())
 
-    def _apart(self, first: Array, name: str) -> Gain:
+    def _apart(self, first: Array, name: str) -> Effect:
         errors = np.empty_like(self.errors)
         for part in (first, ~first):
             fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part])
             errors[part] = fit.errors(self.coarse.images[part], self.coarse.used[part])
         return self._gain(errors, self.errors, name)
 
-    def _with(self, what: str, **changes: Any) -> Gain:
+    def _with(self, what: str, **changes: Any) -> Effect:
         return self._gain(self._errors(self._fit(self.smoothness, **changes)), self.errors, what)
 
-    def _gain(self, errors: Array, as_given: Array, what: str) -> Gain:
+    def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
         """Reduction of the errors relative to the given geometry; its standard error is that of the mean over the gaps."""
         per_tilt = (as_given**2 - errors**2).mean((1, 2))
         per_gap = np.array([per_tilt[tilts].mean() for tilts in self.fit.gaps])
         whole = max(float(np.mean(self.errors**2)), 1e-30)
-        error = per_gap.std(ddof=1) / np.sqrt(len(per_gap))
-        return Gain(float(per_tilt.mean()) / whole, float(per_gap.mean() / max(error, 1e-30)), what)
+        error = float(per_gap.std(ddof=1) / np.sqrt(len(per_gap))) / whole
+        return Effect(float(per_tilt.mean()) / whole, error, what)
 
 
-def _share(gain: Gain) -> float:
-    return gain.share
+def _value(effect: Effect) -> float:
+    return effect.value
+
+
+def _best(effects: Iterable[Effect]) -> Effect:
+    best = max(effects, key=_value)
+    return best._replace(value=max(0.0, best.value))
 
 
 def _turned(degrees: float, image: Array) -> Array:

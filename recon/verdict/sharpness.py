@@ -1,4 +1,4 @@
-"""Detection of blur that differs between tilts, from the row sums, which tilting preserves, and from steps in sharpness."""
+"""Blur and magnification that differ between tilts, from the row sums, which tilting preserves, and from steps in sharpness."""
 
 from __future__ import annotations
 
@@ -8,60 +8,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import NotTested
+from noiseflow.checks import Effect, NotTested
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import inverted
 from recon.verdict.residuals import Residuals
-from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_SMALLEST = 40  # pixels along y: among 512 good series, the only false positives had 24 or 32
-_GROWTH, _GROWTH_SCORE = (
-    2.5,
-    2.8,
-)  # pixels² of variance from 0° to 90°; standard errors, with a probability of 1 in 400 by chance
-_SCALES, _ALIKE, _BETTER = (
-    (0.5, 0.7, 1.4, 2.0),
-    0.9,
-    0.1,
-)  # magnifications; correlation of rows; improvement over equal magnification
-_RUN, _SPAN = (
-    8,
-    30.0,
-)  # tilts before and after a step, within this range in degrees; over larger ranges, good slabs change by 0.77
-_STEP, _STEP_SCORE = 0.75, 4.0  # lost share of the fine structure, up to 0.68 in good series; standard errors
-_LAGS = (1, 4)  # pixels: correlations at these lags exclude white noise, and their difference is fine structure
-_ADVICE = "exclude the blurred tilts, or blur all tilts equally"
+# pixels along y: among 512 good series, the only false positives had 24 or 32
+_SMALLEST = 40
+_SCALES = (0.5, 0.7, 1.4, 2.0)
+# tilts before and after a step
+_RUN = 8
+# degrees that they may span: over larger ranges, the fine structure of good slabs changes by 0.77
+_SPAN = 30.0
+# pixels: correlations at these lags exclude white noise, and their difference is fine structure
+_LAGS = (1, 4)
 
 
-def sharpness_findings(tilt_series: TiltSeries, residuals: Residuals) -> tuple[dict[str, Any], list[Finding]]:
-    """Evidence and findings about blur that differs from tilt to tilt.
+def growing_blur(images: Array, angles: Array) -> Effect:
+    """Variance of a blur that grows with the tilt, pixels² towards 90°.
 
-    A volume absorbs most of such a blur, because each tilt determines the sharpness in its own direction. The test therefore uses
-    the sums of rows of line integrals, which are common to all tilts, and neighbouring tilts, which are nearly equal.
+    A volume absorbs most of such a blur, because each tilt determines the sharpness in its own direction. The test therefore
+    uses the sums of rows of line integrals, which are common to all tilts.
     """
-    if residuals.images.shape[1] < _SMALLEST:
+    if images.shape[1] < _SMALLEST:
         raise NotTested(f"needs {_SMALLEST} rows")
-    images, angles = _integrals(tilt_series, residuals), residuals.tilt_angles
     growth, score = _growth(*blurs(images), angles)
+    return Effect(max(growth, 0.0), abs(growth / score) if score else np.inf)
+
+
+def focus_step(images: Array, angles: Array) -> Effect:
+    """The largest significant loss of fine structure from one range of tilts to the next, as a share."""
+    if images.shape[1] < _SMALLEST:
+        raise NotTested(f"needs {_SMALLEST} rows")
     step, where = _step(images, angles)
-    evidence = {"blur": {"growth": growth, "score": score, "step": step}}
-    findings = _magnified(images.sum(2))
-    if growth > _GROWTH and score > _GROWTH_SCORE:
-        words = f"the blur of the images grows with their tilt, to {np.sqrt(growth):.1f} pixels towards 90°"
-        findings.append(Finding("resolution", min(2.9, growth / _GROWTH), words, _ADVICE))
-    if step > _STEP:
-        words = (
-            f"between {angles[where - 1]:g}° and {angles[where]:g}° the fine structure changes by {min(step, 1):.0%}: tilts on "
-            "one side are out of focus"
-        )
-        findings.append(Finding("resolution", min(2.9, 1 + (step - _STEP) / (1 - _STEP)), words, _ADVICE))
-    return evidence, findings
+    return Effect(step, what=f"{angles[where - 1]:g}° and {angles[where]:g}°")
 
 
-def _magnified(masses: Array) -> list[Finding]:
-    """Whether the row sums (tilt, y) of both halves of the series agree only at different magnifications."""
+def magnified(images: Array) -> Effect:
+    """Improvement of the correlation of row sums of both halves of the series at different magnifications."""
+    masses = images.sum(2)
     half = len(masses) // 2
     first, second = masses[:half].mean(0), masses[half:].mean(0)
     y = np.arange(len(first)) - (len(first) - 1) / 2
@@ -71,19 +58,16 @@ def _magnified(masses: Array) -> list[Finding]:
         return float(np.corrcoef(*stretched)[0, 1])
 
     best = max(_SCALES, key=alike)
-    if alike(best) < max(_ALIKE, alike(1.0) + _BETTER):
-        return []
-    words = f"the second half of the tilts shows the specimen {best:g} times as large as the first"
-    return [Finding("magnification", 6.0, words, "rescale all images to one pixel size", "seen")]
+    return Effect(alike(best) - alike(1.0) if alike(best) > 0.9 else 0.0, what=f"{best:g}")
 
 
-def _integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
+def sharp_integrals(tilt_series: TiltSeries, residuals: Residuals, images: Array | None = None) -> Array:
     """(tilt, y, u) line integrals sorted by angle; masked pixels are replaced by the prediction of the volume."""
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     beam = None if tilt_series.beam is None else tilt_series.beam[order]
     mask = None if residuals.used.all() else residuals.used
     ordered = replace(tilt_series, images=residuals.images, tilt_angles=residuals.tilt_angles, mask=mask, beam=beam)
-    return inverted(estimate_response(ordered), residuals.images)
+    return inverted(estimate_response(ordered), residuals.images if images is None else images)
 
 
 def blurs(images: Array) -> tuple[Array, Array]:
@@ -128,7 +112,7 @@ def _step(images: Array, angles: Array) -> tuple[float, int]:
         error = float(np.sqrt((before.var(ddof=1) + after.var(ddof=1)) / _RUN))
         narrow = max(np.ptp(angles[start - _RUN : start]), np.ptp(angles[start : start + _RUN])) <= _SPAN
         share = lost / max(float(before.mean()), float(after.mean()), 1e-30)
-        if lost > _STEP_SCORE * error and share > largest and narrow:
+        if lost > 4 * error and share > largest and narrow:
             largest, where = share, start
     return largest, where
 

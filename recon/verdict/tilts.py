@@ -1,4 +1,4 @@
-"""Findings about the tilts: range, gaps, steps, duplicate images, images that do not match their angle."""
+"""Statistics of the tilts: range, gaps, duplicate images, and images that do not match their neighbours or their angle."""
 
 from __future__ import annotations
 
@@ -8,167 +8,124 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from noiseflow.checks import NotTested
-from recon.series.screening import Screening
+from noiseflow.checks import Effect, NotTested
+from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
-from recon.verdict.verdict import Finding
 
 Array = NDArray[Any]
-_WEDGE, _GAP, _FEWEST = (
-    90.0,
-    15.0,
-    20,
-)  # degrees without data, above which most directions are not measured; gap, degrees; smallest number of tilts
-_LEFT_OUT = 0.1  # of the tilts: too many for exceptions
-_FOREIGN, _FOREIGN_SHARE = 0.3, 0.1  # share of a tilt's structure that the others predict; share of the tilts
-_BLANK = 0.3  # of the structure of neighbouring tilts: an image with less is blank and cannot be predicted
-_TWINS = 0.2  # of the structure: duplicates differ only by noise
-_JUMP, _AROUND = 3.0, 9  # relative to the change between surrounding tilts, and their number; good series reach 0.9
-_JUMP_SHARE = 0.1  # of the structure of the images; remaining misalignment of a low-noise needle gives 0.001
-_RADIANS = 1.6
-_DRIFT = 0.2  # relative beam drift: the fit follows it, but not exactly
+# degrees: closer tilts have one direction
+_SAME = 0.02
+# share of a tilt's structure that the others must predict, or that it must have itself relative to its neighbours
+_FOREIGN = 0.3
+# tilts around a tilt with which it is compared; at least twice as many are needed
+_AROUND = 9
+# share of the structure below which differences are harmless; remaining misalignment of a low-noise needle gives 0.001
+_LARGE = 0.1
 
 
-def coverage(angles: Array) -> tuple[dict[str, Any], list[Finding]]:
-    """Range, gaps and number of the tilts."""
+def largest_gaps(angles: Array) -> tuple[float, float, int]:
+    """The widest and the second widest range of directions without tilts, degrees, and the number of directions."""
     directions = np.unique(np.round(np.mod(angles, 180), 3))
     gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
-    wedge, inner = float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0
-    steps = np.diff(directions)
-    evidence = {
-        "tilts": len(angles),
-        "degrees without data": wedge,
-        "largest gap inside": inner,
-        "median step": float(np.median(steps)),
-        "in order": bool((np.diff(angles) > 0).all() or (np.diff(angles) < 0).all()),
-    }
-    findings = []
-    if np.abs(angles).max() < _RADIANS:
-        words = f"all tilt angles lie within ±{np.abs(angles).max():.2f}°, as if they were radians"
-        findings.append(Finding("angles", 10.0, words, "give the tilt angles in degrees", "seen"))
-    if wedge > _WEDGE:
-        words = f"{wedge:.0f}° of 180° have no tilts, so most directions of the volume are not measured"
-        findings.append(
-            Finding("range", wedge / _WEDGE, words, "add tilts, or trust only structures that face the beam", "seen")
-        )
-    if inner > _GAP and len(directions) >= _FEWEST:
-        words = f"the tilts leave a gap of {inner:.0f}° inside their range"
-        findings.append(
-            Finding(
-                "range", min(2.9, inner / _GAP), words, "add tilts there, or expect streaks in these directions", "seen"
-            )
-        )
-    if len(directions) < _FEWEST:
-        words = f"{len(directions)} tilt angles are too few for fine detail"
-        findings.append(Finding("range", min(2.9, _FEWEST / len(directions)), words, "take more tilts", "seen"))
-    return evidence, findings
+    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(directions)
 
 
-def repeats(tilt_series: TiltSeries) -> tuple[dict[str, Any], list[Finding]]:
-    """Exactly equal images, which noise excludes for separate exposures."""
-    groups: dict[bytes, int] = {}
-    for image in tilt_series.images:
-        key = np.ascontiguousarray(image).tobytes()
-        groups[key] = groups.get(key, 0) + 1
-    repeated = sum(count - 1 for count in groups.values())
-    if repeated == 0:
-        return {"repeated images": 0}, []
-    share = repeated / tilt_series.num_tilts
-    words = f"{repeated} of {tilt_series.num_tilts} images are exact copies of another image"
-    finding = Finding("repeats", min(2.9, 1 + 3 * share), words, "remove the copies", "seen")
-    return {"repeated images": repeated}, [finding]
+def repeated(tilt_series: TiltSeries) -> Effect:
+    """Share of images that are exactly equal to another, which noise excludes for separate exposures."""
+    different = {np.ascontiguousarray(image).tobytes() for image in tilt_series.images}
+    return Effect(1 - len(different) / tilt_series.num_tilts)
 
 
-def twins(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
-    """Images at the same angle must differ only by noise, which is independent between neighbouring rows."""
-    close = np.diff(np.sort(coarse.directions.angles)) < 0.02
+def normalised(tilt_series: TiltSeries) -> Effect:
+    """1 if every image has the same mean and deviation, or the same quantiles: each was scaled by itself."""
+    values = [image[use].astype(np.float64) for image, use in zip(tilt_series.images, tilt_series.used, strict=True)]
+    moments = np.array([(each.mean(), each.std()) for each in values])
+    ends = np.array([np.quantile(each, (0.01, 0.99)) for each in values])
+    counts = all(np.array_equal(each, np.round(each)) for each in values)  # whose quantiles are equal without scaling
+    for pairs, scale in ((moments, moments[:, 1].mean()), (ends, 0.0 if counts else np.ptp(ends, axis=1).mean())):
+        if np.ptp(pairs, axis=0).max() < 1e-3 * scale:
+            return Effect(1.0)
+    return Effect(0.0)
+
+
+def twins(coarse: Coarse) -> Effect:
+    """Share of the structure by which images of one direction differ; noise is independent between neighbouring rows."""
+    close = np.diff(np.sort(coarse.directions.angles)) < _SAME
     if not close.any() or coarse.images.shape[1] < 2:
-        return {}, []
+        return Effect(0.0)
     difference = np.diff(coarse.arranged(), axis=0)[close]
-    share = neighbours(difference, 1) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30)
-    evidence = {"twins differ by": share}
-    if share < _TWINS:
-        return evidence, []
-    words = f"images of the same angle differ by {share:.0%} of their structure"
-    return evidence, [
-        Finding("angles", min(6.0, 3 * share / _TWINS), words, "check the list of tilt angles and its signs", "seen")
-    ]
+    return Effect(neighbours(difference, 1) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30))
 
 
-def jumps(coarse: Coarse) -> tuple[dict[str, Any], list[Finding]]:
-    """Neighbouring tilts that differ much more than those around them, although a rotating object changes smoothly.
+def jumps(coarse: Coarse) -> Effect:
+    """Largest difference of neighbouring tilts relative to those around, although a rotating object changes smoothly.
 
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
     images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
-    apart = np.diff(angles) > 0.02
+    apart = np.diff(angles) > _SAME
     if apart.sum() < _AROUND or images.shape[1] < 2:
-        raise NotTested(f"needs two rows and {_AROUND + 1} tilts")
+        raise NotTested(f"needs two rows and {_AROUND + 1} directions")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
     shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
     usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
-    whole = max(neighbours(coarse.centred_on_all, 1), 1e-30)
-    large = shared * steps**2 > _JUMP_SHARE * whole
+    large = shared * steps**2 > _LARGE * max(neighbours(coarse.centred_on_all, 1), 1e-30)
     ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # exact copies give usual = 0
     largest = int(np.argmax(ratios))
-    evidence = {"largest jump": float(ratios[largest])}
-    if ratios[largest] < _JUMP:
-        return evidence, []
     first, second = np.flatnonzero(apart)[largest] + (0, 1)
-    words = (
-        f"between {angles[first]:g}° and {angles[second]:g}° the images change {ratios[largest]:.0f} times as much as between "
-        "the tilts around: angles are in the wrong order there, or the specimen moved"
-    )
-    strength = min(2.9, ratios[largest] / _JUMP)
-    return evidence, [Finding("angles", strength, words, "check the list of angles and the images of these tilts")]
+    return Effect(float(ratios[largest]), what=f"{angles[first]:g}° and {angles[second]:g}°")
 
 
-def foreign(coarse: Coarse, errors: Array) -> tuple[dict[str, Any], list[Finding]]:
-    """Tilts that the others predict much worse than the rest, by the structure common to predicted and measured rows."""
+def foreign(coarse: Coarse, errors: Array) -> Effect:
+    """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows."""
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
     measured, predicted = coarse.flat, coarse.centred(coarse.images - errors)
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
-    order = coarse.directions.order
-    beside = np.empty_like(own)
+    order, beside = coarse.directions.order, np.empty_like(own)
     beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
-    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _BLANK * beside
-    foreign = (agreement + 3 * chance < _FOREIGN * own) | blank
-    share = float(foreign.mean())
-    evidence = {"tilts unlike the others": int(foreign.sum())}
-    if share <= _FOREIGN_SHARE:
-        return evidence, []
-    named = ", ".join(f"{angle:g}°" for angle in coarse.tilt_angles[foreign][:5])
-    words = f"{int(foreign.sum())} of {len(foreign)} tilts hardly resemble the prediction from the others ({named} …)"
-    advice = "check these images and their angles, or exclude them"
-    return evidence, [Finding("tilts", min(4.0, 1 + share / _LEFT_OUT), words, advice)]
+    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
+    found = (agreement + 3 * chance < _FOREIGN * own) | blank
+    return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
 
 
-def screened(screening: Screening | None) -> tuple[dict[str, Any], list[Finding]]:
-    """How many tilts were excluded, and how much the beam drifts."""
-    if screening is None:
-        return {}, []
-    share, drift = float(screening.bad.mean()), screening.drift
-    evidence = {"tilts thrown out": int(screening.bad.sum()), "beam drift": drift}
-    findings = []
-    if share > _LEFT_OUT:
-        words = (
-            f"{int(screening.bad.sum())} of {len(screening.bad)} tilts were excluded because they do not fit the others"
-        )
-        findings.append(
-            Finding(
-                "tilts",
-                min(3.5, 1 + (share - _LEFT_OUT) / _LEFT_OUT),
-                words,
-                "align the series, or check the list of angles",
-            )
-        )
-    if drift > _DRIFT:
-        words = f"the beam changes by {drift:.0%} from tilt to tilt"
-        findings.append(Finding("beam", min(2.9, drift / _DRIFT), words, "normalise the images by their incident beam"))
-    return evidence, findings
+def single(coarse: Coarse, errors: Array) -> Effect:
+    """Largest deviation of a tilt's prediction error from those of its neighbours, in typical deviations."""
+    images, left = coarse.directions.arranged(coarse.flat), coarse.arranged(errors)
+    if images.shape[1] < 2 or len(images) < 2 * _AROUND:
+        raise NotTested(f"needs two rows and {2 * _AROUND} tilts")
+    structure = float(np.median([neighbours(image[None], 1) for image in images]))
+    shared = np.array([neighbours(each[None], 1) for each in left])
+    beyond = shared - ndimage.median_filter(shared, _AROUND + 2, mode="nearest")
+    beyond[:2] = beyond[-2:] = 0  # tilts at the ends have few neighbours
+    beyond[beyond < _FOREIGN * structure] = 0
+    worst = int(np.argmax(beyond))
+    named = _named(coarse.tilt_angles[coarse.directions.order][[worst]])
+    return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=named)
+
+
+def broken(coarse: Coarse) -> Effect:
+    """Lost share of the structure common to neighbouring images at the only break of the series."""
+    flat, angles = coarse.directions.arranged(coarse.flat), np.sort(coarse.directions.angles)
+    steps = np.diff(angles)
+    if len(flat) < 2 * _AROUND:
+        raise NotTested(f"needs {2 * _AROUND} tilts")
+    power = (flat**2).mean((1, 2))
+    shared = (flat[1:] * flat[:-1]).mean((1, 2))
+    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
+    usual = ndimage.median_filter(shared, _AROUND, mode="nearest")
+    lost = np.where(steps < 1.5 * np.median(steps), 1 - shared / np.maximum(usual, 1e-30), 0.0)
+    apart = (lost > 0.5) & (usual - shared > 4 * chance)
+    if apart.sum() != 1:  # several breaks mean wrong angles, which other checks detect
+        return Effect(0.0)
+    where = int(np.argmax(apart))
+    return Effect(float(lost[where]), what=f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on")
+
+
+def _named(angles: Array) -> str:
+    return ", ".join(f"{angle:g}°" for angle in angles[:5])

@@ -131,3 +131,21 @@ def test_nine_pixels_of_an_emccd_have_its_excess_factor_and_no_correlation():
     assert found.figures.gain.median == pytest.approx(200.0, rel=0.03)
     assert found.figures.excess_factor.q05 < 2.0 < found.figures.excess_factor.q95
     assert found.figures.excess_factor.median == pytest.approx(2.0, abs=0.35)
+
+
+def test_a_given_exposure_ratio_tells_the_exponent():
+    generator = np.random.default_rng(8)
+    scene = sim.random_scene(generator, 192)
+    around = scene.mean()
+    bent_pair, straight = (
+        ExposurePair(
+            bent(generator, scene, power, around=around), bent(generator, 16 * scene, power, around=around), 16.0
+        )
+        for power in (0.95, 1.0)
+    )
+    found = measure_exposures([bent_pair])
+    assert reasons(found) == {"nonlinear response"}
+    assert found.figures.gain.median == pytest.approx(1.9, rel=0.05)
+    found = measure_exposures([straight])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median

@@ -20,7 +20,8 @@ _REACH = 3.0  # standard deviations; beyond, a Gaussian has 1 % of its peak
 _VALUES_TOGETHER = 2**19  # evaluated at a time: they stay in the cache of a core
 _LARGEST = 20.0  # peak of an initial Gaussian, units
 # gradients between two moves of Gaussians; mass, relative to the median, below which one is moved; width of the halves of a split
-# Gaussian, relative to its own, which keeps their sum near to it
+# Gaussian, relative to its own, which keeps their sum near to it. At 48³ moving gains up to 0.02 dB in the volume and 0.07 dB in
+# projections, most with few Gaussians
 _MOVE_EVERY, _NEGLIGIBLE, _HALF_WIDTH = 25, 0.05, 0.8
 
 
@@ -42,7 +43,7 @@ class GaussianField(Field):
         >>> import recon, torch
         >>> field = recon.GaussianField((8, 8, 8), count=5)
         >>> field.volume().shape, sum(p.numel() for p in field.parameters())
-        (torch.Size([8, 8, 8]), 50)
+        (torch.Size([8, 8, 8]), 55)
     """
 
     relative_rate, step_cost = 0.15, 4.0
@@ -115,10 +116,37 @@ class GaussianField(Field):
         self.centre[wanted] -= step
         self.pull.zero_()
 
+    def units_at(self, points: Tensor) -> Tensor:
+        size = (self.depth, self.height, self.width)
+        exponents, nearest, radius = self._exponents()
+        margin = int(radius.max())
+        padded = exponents.detach().new_zeros([each + 2 * margin for each in size])
+        last = points.new_tensor(size) - 1
+        cell = torch.minimum(points.detach().round().clamp_min(0), last).long() + margin
+        # the points of each voxel, one after the other
+        cell, order = (cell * cell.new_tensor(padded.stride())).sum(-1).sort()
+        count = torch.bincount(cell, minlength=padded.numel())
+        first = count.cumsum(0) - count
+        found = exponents.new_zeros(len(points))
+        for chosen, _, places in _windows(nearest, radius, padded, margin, crowd=max(1, int(count.max()))):
+            here = count[places].view(-1)
+            which = torch.repeat_interleave(first[places].view(-1) - (here.cumsum(0) - here), here)
+            point = order[which + torch.arange(len(which), device=which.device)]
+            own = torch.repeat_interleave(chosen, count[places].sum(1))
+            terms = _monomials(points[point] - nearest[own]).T
+            found = found.index_add(0, point, (exponents[own] * terms).sum(-1).exp())
+        return found
+
     def units(self) -> Tensor:
         if torch.is_grad_enabled() and int(self.num_pulls) >= _MOVE_EVERY:
             self._move()
             self.num_pulls.zero_()
+        size = (self.depth, self.height, self.width)
+        found: Tensor = _Splatting.apply(*self._exponents(), size)  # type: ignore[no-untyped-call]
+        return found.transpose(1, 2)
+
+    def _exponents(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Coefficients of `_polynomials` (n, 10), nearest voxels (n, 3), and radii of the windows (n,)."""
         precision, reach = self._precision()
         nearest = self.centre.detach().round()
         last = nearest.new_tensor([self.depth, self.height, self.width]) - 1
@@ -127,9 +155,7 @@ class GaussianField(Field):
         if shift.requires_grad:
             shift.register_hook(self._note)  # type: ignore[no-untyped-call]
         exponents = _polynomials(precision, shift, functional.softplus(self.peak).log())
-        radius = (_REACH * reach.amax(1)).round().long()
-        found: Tensor = _Splatting.apply(exponents, nearest.long(), radius, (self.depth, self.height, self.width))  # type: ignore[no-untyped-call]
-        return found.transpose(1, 2)
+        return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
 
 
 def _rotations(quaternions: Tensor) -> Tensor:
@@ -192,9 +218,11 @@ def _inner(padded: Tensor, margin: int) -> Tensor:
     return padded
 
 
-def _windows(nearest: Tensor, radius: Tensor, padded: Tensor, margin: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def _windows(
+    nearest: Tensor, radius: Tensor, padded: Tensor, margin: int, *, crowd: int = 1
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Some Gaussians with windows of equal size: their indices (n,), the monomials (10, K) of the offsets, and the flat places
-    (n, K) in the padded grid, whose first voxel is at −margin."""
+    (n, K) in the padded grid, whose first voxel is at −margin. Fewer at a time if there are up to `crowd` points in a voxel."""
     strides = nearest.new_tensor(padded.stride())
     base = ((nearest + margin) * strides).sum(-1)
     for size in torch.unique(radius).tolist():
@@ -202,7 +230,8 @@ def _windows(nearest: Tensor, radius: Tensor, padded: Tensor, margin: int) -> It
         offsets = torch.stack(torch.meshgrid(span, span, span, indexing="ij"), -1).view(-1, 3)
         monomials = _monomials(offsets.to(padded.dtype))
         across = (offsets * strides).sum(-1)
-        for chosen in torch.split((radius == size).nonzero()[:, 0], max(1, _VALUES_TOGETHER // len(offsets))):
+        together = max(1, _VALUES_TOGETHER // (crowd * len(offsets)))
+        for chosen in torch.split((radius == size).nonzero()[:, 0], together):
             yield chosen, monomials, base[chosen, None] + across
 
 

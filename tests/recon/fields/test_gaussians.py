@@ -37,6 +37,19 @@ def test_windows_lose_only_the_tails(field):
     assert float(error.sum().abs()) < 0.03 * float(expected.sum())
 
 
+def test_values_between_voxels_are_those_of_the_formula(field):
+    points = torch.rand(300, 3) * torch.tensor([8.0, 10.0, 9.0])
+    precision, _ = field._precision()
+    apart = points[:, None] - field.centre
+    exponent = torch.einsum("pni,nij,pnj->pn", apart, precision, apart)
+    expected = (torch.exp(-0.5 * exponent) * torch.nn.functional.softplus(field.peak)).sum(-1)
+    found = field.at(points)
+    assert float((found - expected).abs().max()) < 0.05 * float(expected.max())
+    found.sum().backward()
+    assert bool(torch.isfinite(field.centre.grad).all())
+    assert field.at(points[:0]).shape == (0,)
+
+
 def test_gradient_is_that_of_the_windows(field):
     weights = torch.rand(9, 11, 10)
     (field.units().transpose(1, 2) * weights).sum().backward()

@@ -51,6 +51,7 @@ def test_maps_take_the_alignment_of_another_channel(maps):
         > 0.95
     )
     assert len(aligned[0]) == len(aligned[1])
+    assert {each.tilt_series.images.dtype for each in found.values()} == {np.dtype(np.uint16)}  # counts stay Poisson
 
 
 def test_the_sum_needs_equal_tilts(maps):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.verdict.distortions import distortions
-from recon.verdict.image_findings import image_findings
 from recon.verdict.residuals import Residuals
+from recon.verdict.table import CHECKS
 
 Array = NDArray[Any]
 TILTS, ROWS, WIDTH = 31, 40, 64
@@ -36,9 +37,9 @@ def seen(change: Array, *, first_row: float = 0.0, noise: float = 0.002) -> Resi
 def test_a_stretch_across_the_axis_is_no_shift_along_it(first_row: float) -> None:
     """Slices far from the middle of the images are judged about their own middle."""
     found = distortions(seen(np.linspace(-1, 1, TILTS), first_row=first_row))
-    assert found["magnification"].smooth > 0.2
-    assert found["shift along y"].size < 0.1
-    assert found["shift across"].size < 0.1
+    assert found["magnification"].drift.value > 0.2
+    assert found["shift along y"].spread.value < 0.1
+    assert found["shift across"].spread.value < 0.1
 
 
 def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
@@ -47,8 +48,8 @@ def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
     ends[[0, -1]] = -6, 6
     found, calm = (distortions(seen(change))["magnification"] for change in (ends, 0 * ends))
     assert abs(found.values[0]) > 20 * abs(calm.values).max()
-    assert found.size == calm.size
-    assert found.trend == calm.trend
+    assert found.spread == calm.spread
+    assert found.drift == calm.drift
 
 
 @pytest.mark.parametrize(("width", "told"), [(64, True), (256, False)])
@@ -65,5 +66,7 @@ def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int,
         np.linspace(-60, 60, TILTS),
         np.arange(ROWS),
     )
-    _, findings = image_findings(residuals, distortions(residuals))
-    assert ("alignment" in {finding.subject for finding in findings}) == told
+    row = CHECKS["axis off the middle"]
+    found = distortions(residuals)["shift across"].offset
+    assert found.value == pytest.approx(0.3, abs=0.03)
+    assert (found.value > row.tolerance(SimpleNamespace(edge=width / 2))) == told

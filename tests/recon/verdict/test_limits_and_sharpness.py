@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,13 @@ import pytest
 
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
+from noiseflow.checks import Finding, Guard, run
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.verdict import tilts
+from recon.verdict.case import Case
 from recon.verdict.coarse import coarse_series
-from recon.verdict.judge import PIXELS
-from recon.verdict.limits import cliff, saturation
-from recon.verdict.residuals import Residuals
-from recon.verdict.sharpness import blurs, sharpness_findings
+from recon.verdict.sharpness import blurs
+from recon.verdict.table import CHECKS
 
 NAMES = ("half of the tilts out of focus", "blur that grows with the tilt")
 
@@ -30,16 +31,31 @@ def spoilt(phantom: str, noise: str, name: str) -> TiltSeries:
     return spoil(scene(phantom, noise), name, other=scene(phantom, noise, 9), seed=5).series
 
 
-def residuals(series: TiltSeries, clean: Any) -> Residuals:
-    return Residuals.of(series, clean.astype(np.float32))
+@dataclass(frozen=True)
+class Shown:
+    """Projections as a result."""
+
+    projections: Any
+    volume: Any = None
+    fit_result: Any = None
+    noise_model: Any = None
 
 
-def pixel_part(series: TiltSeries, left: Residuals) -> tuple[dict[str, Any], list[Any]]:
-    """Evidence and findings of all checks of pixel values."""
-    parts = [check(series, left.images, left) for check in PIXELS.values()]
-    return {name: value for part, _ in parts for name, value in part.items()}, [
-        each for _, found in parts for each in found
-    ]
+LIMITS = ("saturation", "saturated vacuum", "pixels at a limit", "end of the pixel values")
+BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
+LOCAL = ("spikes", "dead lines", "dead pixels", "streaks", "filled borders", "steps between columns", "compression")
+PIXELS = (*LIMITS, *LOCAL, "fixed pattern", "uneven response")
+
+
+def measured(series: TiltSeries, clean: Any, names: Iterable[str]) -> dict[str, Finding]:
+    """Findings of some checks, from clean images as projections."""
+    rows = [CHECKS[name] for name in names]
+    return run(rows, Case(series, Shown(clean.astype(np.float32))), Guard())
+
+
+def firing(series: TiltSeries, clean: Any, names: Iterable[str]) -> set[str]:
+    """Reasons of some checks that fire."""
+    return {each.reason for each in measured(series, clean, names).values() if each.cost >= 1}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -48,18 +64,14 @@ def pixel_part(series: TiltSeries, left: Residuals) -> tuple[dict[str, Any], lis
 )
 def test_tilts_more_blurred_than_others_are_named(phantom: str, noise: str, name: str) -> None:
     series = spoilt(phantom, noise, name)
-    _, findings = sharpness_findings(series, residuals(series, series.images))
-    assert {finding.subject for finding in findings} == {"resolution"}
+    assert firing(series, series.images, BLUR) == {"resolution"}
 
 
 @pytest.mark.parametrize("noise", ["clipped", "low-dose", "8-bit", "outliers"])
 @pytest.mark.parametrize("phantom", ["shells", "filaments", "slab", "atoms"])
 def test_good_series_are_neither_blurred_nor_cut_off(phantom: str, noise: str) -> None:
     made = scene(phantom, noise, seed=2)
-    left = residuals(made.noisy, made.clean.images)
-    for check in (saturation, cliff):
-        assert check(made.noisy, left.images, left)[1] == []
-    assert sharpness_findings(made.noisy, left)[1] == []
+    assert not firing(made.noisy, made.clean.images, (*LIMITS, *BLUR))
 
 
 def test_a_mask_keeps_what_it_hides_from_looking_blurred() -> None:
@@ -68,9 +80,9 @@ def test_a_mask_keeps_what_it_hides_from_looking_blurred() -> None:
     mask[20:, 4:44, 4:44] = False
     images[~mask] = images.mean()
     series = TiltSeries(images, made.noisy.tilt_angles, mode="linear", mask=mask)
-    assert sharpness_findings(series, residuals(series, made.clean.images))[1] == []
+    assert not firing(series, made.clean.images, BLUR)
     bare = TiltSeries(images, made.noisy.tilt_angles, mode="linear")
-    assert sharpness_findings(bare, residuals(bare, made.clean.images))[1] != []
+    assert firing(bare, made.clean.images, BLUR)
 
 
 def test_blur_is_measured_in_pixels() -> None:
@@ -84,27 +96,24 @@ def test_blur_is_measured_in_pixels() -> None:
 @pytest.mark.parametrize(
     ("phantom", "noise"), [("shells", "clipped"), ("particles", "low-dose"), ("filaments", "8-bit")]
 )
-@pytest.mark.parametrize(("name", "check"), [("saturation", saturation), ("overflow of the number type", cliff)])
-def test_values_cut_off_or_wrapped_around_are_named(phantom: str, noise: str, name: str, check: Any) -> None:
+@pytest.mark.parametrize("name", ["saturation", "overflow of the number type"])
+def test_values_cut_off_or_wrapped_around_are_named(phantom: str, noise: str, name: str) -> None:
     series = spoilt(phantom, noise, name)
-    left = residuals(series, scene(phantom, noise).clean.images)
-    assert [finding.subject for finding in check(series, left.images, left)[1]][:1] == ["saturation"]
+    assert firing(series, scene(phantom, noise).clean.images, LIMITS) == {"saturation"}
 
 
 def test_few_counts_have_no_pile_at_their_highest() -> None:
     means = 0.3 * scene("particles", "low-dose").clean.images
     counts = np.random.default_rng(0).poisson(means).astype(np.uint8)
     series = TiltSeries(counts, np.arange(-60.0, 61, 3), mode="linear")
-    left = residuals(series, means)
-    for check in (saturation, cliff):
-        assert check(series, left.images, left)[1] == []
+    assert not firing(series, means, LIMITS)
 
 
 def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     made = scene("shells", "clipped")
     series = spoilt("shells", "clipped", "half of the columns with another gain")
-    assert "pattern" in {each.subject for each in pixel_part(series, residuals(series, made.clean.images))[1]}
-    assert pixel_part(made.noisy, residuals(made.noisy, made.clean.images))[1] == []
+    assert "pattern" in firing(series, made.clean.images, PIXELS)
+    assert not firing(made.noisy, made.clean.images, PIXELS)
 
 
 @pytest.mark.parametrize(
@@ -113,10 +122,9 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
 def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> None:
     made = scene(phantom, noise)
     series = spoilt(phantom, noise, "one region black in all images")
-    found = pixel_part(series, residuals(series, made.clean.images))[1]
-    assert any("have a constant value in all tilts" in each.sentence for each in found)
+    assert "lines" in firing(series, made.clean.images, PIXELS)
     masked = replace(series, mask=made.noisy.images == series.images)
-    assert pixel_part(masked, residuals(masked, made.clean.images))[0]["dead pixels"] == 0
+    assert measured(masked, made.clean.images, PIXELS)["dead pixels"].effect.value == 0
 
 
 @pytest.mark.parametrize(
@@ -124,7 +132,7 @@ def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> 
 )
 def test_vacuum_without_noise_is_not_dead(phantom: str, noise: str) -> None:
     clean = scene(phantom, noise).clean
-    assert pixel_part(clean, residuals(clean, clean.images))[0]["dead pixels"] == 0
+    assert measured(clean, clean.images, PIXELS)["dead pixels"].effect.value == 0
 
 
 def test_copies_of_images_raise_no_warning() -> None:
@@ -132,7 +140,21 @@ def test_copies_of_images_raise_no_warning() -> None:
     coarse = coarse_series(series, VolumeGrid.of(series, None))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        evidence, _ = tilts.jumps(coarse)
-        _, findings = tilts.repeats(series)
-    assert np.isfinite(evidence["largest jump"])
-    assert "repeats" in {each.subject for each in findings}
+        assert np.isfinite(tilts.jumps(coarse).value)
+    assert tilts.repeated(series).value > 0.3
+
+
+@pytest.mark.parametrize(("exponent", "named"), [(1.0, False), (0.7, True)])
+def test_a_response_that_compresses_strong_contrast_is_named(exponent: float, named: bool) -> None:
+    made = scene("particles", "low-dose")
+    clean = made.clean.images / made.clean.images.max()
+    noisy = clean**exponent + np.random.default_rng(0).normal(0, 0.02, clean.shape)
+    series = TiltSeries(noisy, made.noisy.tilt_angles, mode="linear")
+    assert (firing(series, clean**exponent, ["response"]) == {"response"}) == named
+
+
+def test_images_scaled_one_by_one_are_named() -> None:
+    images = scene("particles", "low-dose").noisy.images.astype(np.float64)
+    assert tilts.normalised(TiltSeries(images, np.arange(-60.0, 61, 3), mode="linear")).value == 0
+    scaled = (images - images.mean((1, 2), keepdims=True)) / images.std((1, 2), keepdims=True)
+    assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1

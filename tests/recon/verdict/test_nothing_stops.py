@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ from noiseflow.checks import Guard, NotTested
 from recon.report import page
 from recon.series import prepare as preparing
 from recon.series.tilt_series import TiltSeries
+from recon.verdict import case, table
 from recon.verdict import judge as judging
 from tests.commands import run_command
 
 Outcome = tuple[TiltSeries, Any]
 BEFORE = {"check_contrast": "contrast", "screen": "screening", "_warn_of_outliers": "outliers"}
-SHARED = ("coarse_series", "Geometry", "distortions", "expected_images", "contrast_slab", "_good")
+SHARED = ("coarse_series", "Geometry", "distortions", "expected_images", "contrast_slab", "sharp_integrals")
 PARTS = [name for name in dir(page) if name.startswith("_add_")]
 
 
@@ -34,9 +36,9 @@ def broken(*_: Any, **__: Any) -> Any:
     raise ZeroDivisionError("broken on purpose")
 
 
-@pytest.mark.parametrize("name", judging.CHECKS)
+@pytest.mark.parametrize("name", table.CHECKS)
 def test_a_broken_check_is_not_tested(name: str, outcome: Outcome, monkeypatch: Any) -> None:
-    monkeypatch.setitem(judging.CHECKS, name, broken)
+    monkeypatch.setitem(table.CHECKS, name, replace(table.CHECKS[name], measure=broken))
     verdict = judging.judge(*outcome)
     assert verdict.not_tested[name] == "ZeroDivisionError: broken on purpose"
     assert verdict.grade in ("good", "doubtful", "bad")
@@ -44,7 +46,7 @@ def test_a_broken_check_is_not_tested(name: str, outcome: Outcome, monkeypatch: 
 
 @pytest.mark.parametrize("part", SHARED)
 def test_what_checks_share_may_break(part: str, outcome: Outcome, monkeypatch: Any) -> None:
-    monkeypatch.setattr(judging, part, broken)
+    monkeypatch.setattr(case, part, broken)
     assert "ZeroDivisionError: broken on purpose" in judging.judge(*outcome).not_tested.values()
 
 
@@ -67,8 +69,8 @@ def test_a_broken_part_of_the_report_is_left_out(part: str, outcome: Outcome, tm
 
 def test_a_run_with_every_check_broken_keeps_its_volume(outcome: Outcome, tmp_path: Path, monkeypatch: Any) -> None:
     recon.write_tilt_series(tmp_path / "tilts.mrc", outcome[0])
-    for name in judging.CHECKS:
-        monkeypatch.setitem(judging.CHECKS, name, broken)
+    for name in table.CHECKS:
+        monkeypatch.setitem(table.CHECKS, name, replace(table.CHECKS[name], measure=broken))
     for part in BEFORE:
         monkeypatch.setattr(preparing, part, broken)
     for part in ("add_verdict", *PARTS):
@@ -78,7 +80,7 @@ def test_a_run_with_every_check_broken_keeps_its_volume(outcome: Outcome, tmp_pa
     assert (tmp_path / "v.mrc").exists()
     assert (tmp_path / "report" / "index.html").exists()
     assert found["verdict"]["grade"] == "good"
-    assert set(judging.CHECKS) | set(BEFORE.values()) <= set(found["verdict"]["not_tested"])
+    assert set(table.CHECKS) | set(BEFORE.values()) <= set(found["verdict"]["not_tested"])
 
 
 def test_a_check_that_does_not_apply_gives_its_reason() -> None:

@@ -1,0 +1,158 @@
+"""Checks as rows of a table: a measured effect with its error fires if it is significant and larger than its tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
+
+from noiseflow.checks.guard import Guard
+
+Engine = Literal["fact", "distortion", "predictive"]
+Grade = Literal["good", "doubtful", "bad"]
+Case = TypeVar("Case")
+# a fact of the file explains what is inferred from it, and a parameter explains a statistic without one
+_ENGINES = ("fact", "distortion", "predictive")
+# tolerances: an effect this large spoils everything
+_BAD = 3.0
+# tolerances: beyond it, larger effects are no better explanations
+_MOST = 6.0
+# standard errors, for normal errors exceeded by chance in one of 16 000 tests: a verdict makes about fifty
+SIGNIFICANT = 4.0
+
+
+class Effect(NamedTuple):
+    """What a check measured.
+
+    Attributes:
+        value: in the unit of the check.
+        error: standard error of the value; 0 for facts.
+        what: words for its sentence, such as the name of the worst tilt.
+    """
+
+    value: float
+    error: float = 0.0
+    what: str = ""
+
+
+@dataclass(frozen=True)
+class Check(Generic[Case]):
+    """One assumption: what is measured, what is expected, and when a deviation matters.
+
+    Attributes:
+        name: what is tested, unique in its table.
+        reason: one word for programs; checks with the same reason explain each other.
+        engine: ``fact`` (seen in the files), ``distortion`` (a parameter), or ``predictive`` (a statistic without parameter).
+        measure: from the case to the effect; raises `NotTested` where it does not apply.
+        unit: unit of effect and tolerance.
+        tolerance: largest harmless deviation from `null`, or a function of the case.
+        sentence: description, with the fields of `Effect` in braces.
+        advice: what to try.
+        null: value without a fault.
+        score: standard errors from which the deviation is significant.
+        local: whether it affects only a part of the result, which is then never bad.
+    """
+
+    name: str
+    reason: str
+    engine: Engine
+    measure: Callable[[Case], Effect]
+    unit: str
+    tolerance: float | Callable[[Case], float]
+    sentence: str
+    advice: str
+    null: float = 0.0
+    score: float = SIGNIFICANT
+    local: bool = False
+
+    def finding(self, case: Case) -> Finding:
+        """Measure a case."""
+        effect = self.measure(case)
+        tolerance = self.tolerance(case) if callable(self.tolerance) else self.tolerance
+        size = abs(effect.value - self.null)
+        cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
+        cost = cost if size >= self.score * effect.error else 0.0
+        return Finding(
+            self.name,
+            self.reason,
+            self.engine,
+            effect,
+            self.unit,
+            tolerance,
+            min(cost, _BAD - 0.1) if self.local else cost,
+            self.sentence.format(**effect._asdict()),
+            self.advice,
+        )
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome of a check.
+
+    Attributes:
+        name, reason, engine, unit, advice: those of the check.
+        effect: what was measured.
+        tolerance: in the unit of the effect.
+        cost: size in tolerances, 0 if it is not significant; from 1 on, the check fires.
+        sentence: description with numbers.
+    """
+
+    name: str
+    reason: str
+    engine: Engine
+    effect: Effect
+    unit: str
+    tolerance: float
+    cost: float
+    sentence: str
+    advice: str
+
+    @property
+    def bad(self) -> bool:
+        """Whether it spoils the whole result."""
+        return self.cost >= _BAD
+
+    def as_dict(self) -> dict[str, Any]:
+        """For programs, and for limits that are fitted later."""
+        return {
+            "reason": self.reason,
+            "value": self.effect.value,
+            "error": self.effect.error,
+            "what": self.effect.what,
+            "unit": self.unit,
+            "tolerance": self.tolerance,
+            "cost": self.cost,
+        }
+
+
+def run(checks: Iterable[Check[Case]], case: Case, guard: Guard) -> dict[str, Finding]:
+    """The findings of all checks by name; those that fail or do not apply are remembered by the guard.
+
+    Example:
+        >>> from noiseflow.checks import Check, Effect, Guard, ranked, run
+        >>> darkest = lambda images: Effect(min(images))
+        >>> table = [Check("darkest", "offset", "fact", darkest, "counts", 5.0, "the offset is {value:g}", "subtract it")]
+        >>> found = run(table, [20.0, 30.0], Guard())
+        >>> [finding.sentence for finding in ranked(found.values())]
+        ['the offset is 20']
+    """
+    found: dict[str, Finding] = {}
+    for check in checks:
+        finding = guard(check.name, lambda check=check: check.finding(case), otherwise=None)  # type: ignore[misc]
+        if finding is not None:
+            found[check.name] = finding
+    return found
+
+
+def ranked(findings: Iterable[Finding], most: int = 4) -> list[Finding]:
+    """The findings that fire, facts first, then by cost; one for each reason, at most `most`."""
+    fired = (each for each in findings if each.cost >= 1)
+    first: dict[str, Finding] = {}
+    for finding in sorted(fired, key=lambda each: (_ENGINES.index(each.engine), -each.cost)):
+        first.setdefault(finding.reason, finding)
+    return list(first.values())[:most]
+
+
+def grade(findings: list[Finding]) -> Grade:
+    """The grade of ranked findings."""
+    return "good" if not findings else "bad" if any(each.bad for each in findings) else "doubtful"

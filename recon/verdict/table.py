@@ -1,0 +1,293 @@
+"""The checks of a reconstruction, one row each: what is measured, what is tolerated, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from noiseflow.checks import Check, Effect, NotTested
+from recon.verdict import case as cases
+from recon.verdict import fits, pixels, sharpness, tilts
+from recon.verdict.case import FEWEST, Case, at_edge
+from recon.verdict.response import bent_response
+
+PIXELS = 0.25  # rms of shifts; a volume absorbs a part of every shift, so the true ones are larger
+ROTATION = 0.06  # pixels at the edge, common to all images; correct reconstructions reach 0.049
+OFF_MIDDLE = 0.12  # pixels, common to all images, which no volume absorbs; correct reconstructions reach 0.06
+SMOOTH_SHIFT = 0.13  # pixels rms of a drift, the true one being larger
+MAGNIFICATION = 0.15  # pixels at the edge; series that are too noisy for a significant trend reach 0.11
+BRIGHTNESS = 0.18  # share of the contrast; total variation reduces weak contrast by up to 0.14 at some tilts
+GAIN = 0.06  # share of the error of held-out tilts; 60 independent correct series gain at most 0.05
+FEW = 0.002  # share of pixels or lines: one in five hundred is harmless
+TILTS = 0.1  # share of the tilts: more are no exceptions
+ALIGN = "align the series first, or use --refine-alignment"
+AXIS = "give --tilt-axis, or use --refine-alignment"
+ANGLES = "check the list of tilt angles, its order and its signs"
+FLATS = "correct the images with flats and darks first"
+MASK = "mask them with --mask FILE, or exclude these images"
+BEAM = "normalise the images by their incident beam, or check the mode"
+
+
+def of(name: str, part: str) -> Callable[[Case], Effect]:
+    """A part of a distortion."""
+    found = attrgetter(part)
+
+    def measure(case: Case) -> Effect:
+        effect: Effect = found(case.distortions[name])
+        return effect
+
+    return measure
+
+
+def jitter_of_angles(case: Case) -> float:
+    """Pixels at the edge from tilt to tilt: a degree, more than the repeatability of a stage, but more than what noise leaves."""
+    return float(max(0.9, np.deg2rad(1) * case.edge))
+
+
+def _strong(case: Case) -> str:
+    return "high" if case.series.mode == "linear" else "low"
+
+
+def _vacuum_limit(case: Case) -> Effect:
+    if case.series.mode == "linear":
+        return Effect(0.0)
+    return pixels.saturated(case.residuals, "high")
+
+
+def _in_radians(case: Case) -> Effect:
+    widest = float(np.abs(case.series.tilt_angles).max())
+    return Effect(10.0 if widest < 1.6 else 0.0, what=f"{widest:.2f}")
+
+
+def _gap(case: Case, which: int) -> Effect:
+    if _in_radians(case).value:
+        raise NotTested("the angles are in radians")
+    return Effect(tilts.largest_gaps(case.series.tilt_angles)[which])
+
+
+def _inner_gap(case: Case) -> Effect:
+    if tilts.largest_gaps(case.series.tilt_angles)[2] < FEWEST:
+        raise NotTested("there are few tilts")
+    return _gap(case, 1)
+
+
+def _few(case: Case) -> Effect:
+    count = tilts.largest_gaps(case.series.tilt_angles)[2]
+    return Effect(FEWEST / count if count < FEWEST else 0.0, what=str(count))
+
+
+def _pixel(measure: Callable[..., Effect], *more: Any) -> Callable[[Case], Effect]:
+    return lambda case: measure(case.residuals, *more)
+
+
+Row = Check[Case]
+# fmt: off
+FACTS: tuple[Row, ...] = (
+    Row("angles in radians", "angles", "fact", _in_radians, "", 1.0,
+        "all tilt angles lie within ±{what}°, as if they were radians", "give the tilt angles in degrees"),
+    Row("missing wedge", "range", "fact", lambda case: _gap(case, 0), "°", 90.0,
+        "{value:.0f}° of 180° have no tilts, so most directions of the volume are not measured",
+        "add tilts, or trust only structures that face the beam", local=True),
+    Row("gap inside the range", "range", "fact", _inner_gap, "°", 15.0,
+        "the tilts leave a gap of {value:.0f}° inside their range",
+        "add tilts there, or expect streaks in these directions", local=True),
+    Row("number of tilts", "range", "fact", _few, "", 1.0,
+        "{what} tilt angles are too few for fine detail", "take more tilts", local=True),
+    Row("repeated images", "repeats", "fact", lambda case: tilts.repeated(case.series), "of the tilts", 0.0,
+        "{value:.0%} of the images are exact copies of another image", "remove the copies", local=True),
+    Row("images scaled one by one", "beam", "fact", lambda case: tilts.normalised(case.series), "", 0.5,
+        "every image has the same mean and deviation, or the same range: each was scaled by itself",
+        "give the images as recorded", local=True),
+    Row("images of one direction", "angles", "fact", lambda case: tilts.twins(case.coarse), "of the structure", 0.1,
+        "images of the same direction differ by {value:.0%} of their structure", ANGLES),
+    Row("excluded tilts", "tilts", "fact", cases.excluded, "of the tilts", TILTS,
+        "{value:.0%} of the tilts were excluded because they do not fit the others",
+        "align the series, or check the list of angles"),
+    # relative; the fit follows a smaller drift exactly
+    Row("drift of the beam", "beam", "fact", cases.beam_drift, "", 0.2,
+        "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
+    Row("saturation", "saturation", "fact", lambda case: pixels.saturated(case.residuals, _strong(case)), "of the pixels",
+        0.005, "{value:.1%} of the pixels and all their neighbours are at the limit of strong contrast, {what}",
+        "use a series that is not saturated, or mask these parts", local=True),
+    # a saturated vacuum loses only weak contrast
+    Row("saturated vacuum", "saturation", "fact", _vacuum_limit, "of the pixels", 0.3,
+        "{value:.1%} of the pixels and all their neighbours are at the upper limit, {what}",
+        "use a series that is not saturated, or mask these parts", local=True),
+    # 0.0003 in correct series
+    Row("pixels at a limit", "saturation", "fact", lambda case: pixels.piled(case.residuals, _strong(case)), "of the pixels",
+        0.004, "{value:.1%} of the pixels are at the limit of strong contrast, {what}, more than just inside it",
+        "use a series that is not saturated, or mask these parts", local=True),
+    # ratio; 3.2 in correct series
+    Row("end of the pixel values", "saturation", "fact", _pixel(pixels.cliff), "", 12.0,
+        "the pixel values end abruptly at {what}, as if brighter ones had wrapped around or been removed",
+        "check the data type in which the images were saved", local=True),
+    Row("spikes", "outliers", "fact", _pixel(pixels.spikes), "of the pixels", 0.0,
+        "{value:.2%} of the pixels deviate from the others by more than 5 times their range",
+        "mask the spikes with --mask FILE, or replace them", local=True),
+    Row("dead lines", "lines", "fact", _pixel(pixels.dead_lines), "of the lines", 0.0,
+        "{value:.1%} of the {what} have a constant value in all tilts, unlike their neighbours", MASK, local=True),
+    Row("dead pixels", "lines", "fact", _pixel(pixels.dead_pixels), "of the pixels", FEW,
+        "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
+    Row("streaks", "lines", "fact", _pixel(pixels.streaks), "of the lines", FEW,
+        "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
+    Row("filled borders", "lines", "fact", _pixel(pixels.borders), "of the images", TILTS,
+        "{value:.0%} of the images have borders with a constant value", "mask these borders with --mask FILE", local=True),
+    # standard deviations of all pixels, at most 0.13 in correct series; typical steps
+    Row("steps between columns", "pattern", "fact", _pixel(pixels.seam), "of the contrast", 0.25,
+        "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS, score=12.0,
+        local=True),
+    # ratio, 1.15 in correct series
+    Row("compression", "pattern", "fact", _pixel(pixels.blocks), "", 0.6,
+        "pixel values step at the borders of blocks of 8 pixels, {value:.1f} times as much as inside them",
+        "use images without lossy compression", null=1.0, local=True),
+    # relative to the mean; sections that fill their volume reach 0.85, truncated objects 1.66 and more
+    Row("faces of the volume", "thickness", "fact", cases.cut_off, "", 1.3,
+        "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
+        "remove --thickness, or give a larger value", local=True),
+    Row("magnification of the halves", "magnification", "fact", lambda case: sharpness.magnified(case.integrals),
+        "of correlation", 0.1, "the second half of the tilts shows the specimen {what} times as large as the first",
+        "rescale all images to one pixel size"),
+    # correct series have 0.42
+    Row("break of the series", "specimen", "fact", lambda case: tilts.broken(case.coarse), "of the structure", 0.5,
+        "the images {what} do not match at the border: the specimen changed",
+        "reconstruct both parts separately, or check whether one of them was flipped", local=True),
+    Row("visible object", "noise", "fact", cases.invisible, "", 1.0,
+        "neighbouring pixels of the images are not correlated: no object is visible",
+        "use a longer exposure, or check the file"),
+)
+
+DISTORTIONS: tuple[Row, ...] = (
+    # correct and inverted phantoms differ by at least 0.12
+    Row("contrast", "mode", "distortion", cases.inverted, "of the images", 0.05,
+        "the contrast looks inverted: as given and inverted, a volume explains {what}", "or --invert-contrast"),
+    Row("tilt axis", "axis", "distortion", lambda case: case.other_geometries.axis(), "of the error", GAIN,
+        "images {what} explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS, score=2.5),
+    # smaller angles make any object smoother: 60 independent correct series gain at most 0.1
+    Row("scale of the angles", "angles", "distortion", lambda case: case.other_geometries.angles(), "of the error", 0.1,
+        "tilt angles {what} explain held-out tilts better: their error decreases by {value:.0%}", ANGLES, score=2.5),
+    Row("one object", "specimen", "distortion", lambda case: case.other_geometries.two_objects(), "of the error", GAIN,
+        "two parts of the series contradict each other ({what}): each alone is explained better, by {value:.0%}",
+        "reconstruct the parts separately; the specimen moved or changed between them", score=2.5),
+    Row("thickness", "thickness", "distortion", lambda case: case.other_geometries.thicker(), "of the error", GAIN,
+        "the volume is too thin: one {what} explains held-out tilts better by {value:.0%}",
+        "remove --thickness, or give a larger value", score=2.5),
+    Row("other tilt axes", "axis", "distortion", lambda case: fits.other_axis(case.alignment), "", 1.0,
+        "another tilt axis explains the images nearly as well, {what} standard errors behind",
+        "give the direction with --tilt-axis", local=True),
+    # of the size: moves the edge of a specimen of 48 pixels by a third of a pixel; the shape is right
+    Row("size of the specimen", "specimen", "distortion", cases.changing_size, "of the size", 0.03,
+        "the specimen changes its size by {value:+.1%} over the series ({what} order)",
+        "give --refine-alignment, which corrects it, or use the tilts that were taken first", local=True),
+    Row("shifts across the axis", "alignment", "distortion", of("shift across", "spread"), "pixels", PIXELS,
+        "the images are shifted across the axis relative to the volume, by at least {value:.2f} pixels rms", ALIGN),
+    Row("shifts along the axis", "alignment", "distortion", of("shift along y", "spread"), "pixels", PIXELS,
+        "the images are shifted along the axis relative to the volume, by at least {value:.2f} pixels rms", ALIGN),
+    Row("drift across the axis", "alignment", "distortion", of("shift across", "drift"), "pixels", at_edge(SMOOTH_SHIFT),
+        "the images drift across the axis relative to the volume, by at least {value:.2f} pixels rms", ALIGN),
+    Row("drift along the axis", "alignment", "distortion", of("shift along y", "drift"), "pixels", at_edge(SMOOTH_SHIFT),
+        "the images drift along the axis relative to the volume, by at least {value:.2f} pixels rms", ALIGN),
+    Row("axis off the middle", "alignment", "distortion", of("shift across", "offset"), "pixels", at_edge(OFF_MIDDLE),
+        "the tilt axis is off the middle of the images, by at least {value:.2f} pixels", ALIGN, score=2.8),
+    Row("rotation of each image", "axis", "distortion", of("rotation", "spread"), "pixels", 2 * PIXELS,
+        "the images are rotated relative to the volume, by at least {value:.2f} pixels at their edge", AXIS),
+    Row("drift of the rotation", "axis", "distortion", of("rotation", "drift"), "pixels", at_edge(SMOOTH_SHIFT),
+        "the images rotate along the series, by at least {value:.2f} pixels at their edge", AXIS),
+    # 3 errors: wrong axes by 5° have 3.2, correct series with 20 tilts and more at most 2.8
+    Row("rotation", "axis", "distortion", of("rotation", "offset"), "pixels", at_edge(ROTATION),
+        "the images are rotated relative to the volume, by at least {value:.2f} pixels at their edge", AXIS, score=3.0),
+    Row("magnification of each image", "geometry", "distortion", of("magnification", "spread"), "pixels", 2 * PIXELS,
+        "the images grow and shrink relative to the volume, by {value:.2f} pixels at their edge",
+        "check the angle file, --tilt-axis and the specimen, or use --refine-alignment"),
+    Row("drift of the magnification", "geometry", "distortion", of("magnification", "drift"), "pixels",
+        at_edge(MAGNIFICATION), "the images grow and shrink along the series, by {value:.2f} pixels at their edge",
+        "check the angle file, --tilt-axis and the specimen, or use --refine-alignment"),
+    Row("each angle", "geometry", "distortion", of("tilt angle", "jitter"), "pixels", jitter_of_angles,
+        "the images seem taken at other angles, by {value:.2f} pixels at their edge", ANGLES),
+    Row("brightness of each image", "beam", "distortion", of("brightness", "spread"), "of the contrast", BRIGHTNESS,
+        "the brightness changes from tilt to tilt by {value:.0%} of the contrast relative to the volume", BEAM),
+    Row("drift of the brightness", "beam", "distortion", of("brightness", "drift"), "of the contrast", BRIGHTNESS,
+        "the brightness drifts along the series by {value:.0%} of the contrast relative to the volume", BEAM),
+    Row("background of each image", "beam", "distortion", of("background", "spread"), "of the contrast", BRIGHTNESS,
+        "the background changes from tilt to tilt by {value:.0%} of the contrast relative to the volume", BEAM),
+    Row("drift of the background", "beam", "distortion", of("background", "drift"), "of the contrast", BRIGHTNESS,
+        "the background drifts along the series by {value:.0%} of the contrast relative to the volume", BEAM),
+    # 60 independent correct series have at most 0.09
+    Row("response", "response", "distortion",
+        lambda case: bent_response(case.integrals, case.predicted_integrals), "of the signal", 0.15,
+        "the response is not linear: it loses {value:.0%} of the signal at the strongest contrast",
+        "give images with a linear response (gamma 1, not saturated), and check --mode", score=2.5),
+    # pixels² towards 90°; 2.8 errors have a probability of 1 in 400 by chance
+    Row("blur that grows with the tilt", "resolution", "distortion",
+        lambda case: sharpness.growing_blur(case.integrals, case.residuals.tilt_angles), "pixels²", 2.5,
+        "the blur of the images grows with their tilt, by a variance of {value:.1f} pixels² towards 90°",
+        "exclude the blurred tilts, or blur all tilts equally", score=2.8, local=True),
+    # correct series lose up to 0.68
+    Row("focus", "resolution", "distortion",
+        lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure", 0.75,
+        "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
+        "exclude the blurred tilts, or blur all tilts equally", local=True),
+    # relative to the change between surrounding tilts, 0.9 in correct series
+    Row("changes between tilts", "angles", "distortion", lambda case: tilts.jumps(case.coarse), "", 3.0,
+        "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong order "
+        "there, or the specimen moved", "check the list of angles and the images of these tilts", local=True),
+    # typical deviations, up to 4.1 in correct series
+    Row("single tilts", "tilts", "distortion", lambda case: tilts.single(case.coarse, case.geometry.single_errors()), "",
+        6.0, "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
+        "check its angle, or exclude it", local=True),
+    Row("tilts unlike the others", "tilts", "distortion", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+        "check these images and their angles, or exclude them"),
+    # line integral at the sides relative to the mean
+    Row("field of view", "field", "distortion", cases.beyond_the_sides, "of the mean signal", 0.4,
+        "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
+        "use a larger field of view, or a smaller object"),
+    Row("fixed pattern", "pattern", "distortion", _pixel(pixels.pattern), "of the contrast", 0.02,
+        "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
+    # 0.019 in correct series
+    Row("uneven response", "pattern", "distortion", _pixel(pixels.uneven), "of the structure", 0.03,
+        "all residuals contain the same smooth structure, {value:.1%} of that of the images, at every tilt",
+        "correct the images with flats and darks, or for uneven illumination", score=15.0, local=True),
+)
+
+PREDICTIVE: tuple[Row, ...] = (
+    # coefficient of the difference to the image blurred by one pixel; regularised correct volumes have up to 2.5
+    Row("convergence", "convergence", "predictive", cases.too_smooth, "", 3.0,
+        "the volume is much smoother than the images", "use more iterations (--steps), or a smaller --weight", local=True),
+    # nats per pixel; final steps normally change it by some thousandths
+    Row("course of the fit", "fit", "predictive", lambda case: fits.jump(getattr(case.result, "fit_result", None)),
+        "nats", 0.1, "the held-out likelihood at the end was {value:.2g} nats per pixel worse than before",
+        "compare with --method l2 or sirt, and report this series"),
+    Row("weight of the regulariser", "weight", "predictive",
+        lambda case: fits.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "", 0.5,
+        "held-out pixels prefer a weight of the regulariser {what}",
+        "compare with --method l2, and align the series", local=True),
+    # shifted objects have at most 0.6
+    Row("moving background", "beam", "predictive",
+        lambda case: pixels.moving_background(case.residuals) if _left(case) else Effect(0.0), "of the residuals", 0.65,
+        "{value:.0%} of the structure common to the residuals is smooth and differs between tilts: the background moves",
+        "subtract the background of each image first", local=True),
+    Row("structure of the residuals", "residuals", "predictive", cases.left_in_residuals, "of the structure",
+        cases.tolerable_residual, "the residuals contain {value:.0%} of the images' structure",
+        "look for the moving part in the residuals of the report"),
+    Row("held-out gaps of tilts", "consistency", "predictive", cases.inconsistent, "of the structure", cases.tolerable,
+        "{value:.0%} of the structure of held-out gaps of tilts is not explained by the others",
+        "check axis, shifts and angles of the series"),
+    # error of the explained share: above it, the other checks cannot detect defects
+    Row("noise", "noise", "predictive", lambda case: Effect(case.gap.error), "of the structure", 0.1,
+        "noise limits the test: the explained share of held-out tilts has an error of ±{value:.0%}",
+        "average exposures, or bin the images", local=True),
+)
+
+# fmt: on
+
+
+def _left(case: Case) -> bool:
+    share, error, _ = cases.left_in_residuals(case)
+    return share - 3 * error > cases.tolerable_residual(case)
+
+
+CHECKS: dict[str, Row] = {row.name: row for row in (*FACTS, *DISTORTIONS, *PREDICTIVE)}
+"""All checks by name."""
