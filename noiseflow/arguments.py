@@ -89,6 +89,20 @@ def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
     return flat.bool()
 
 
+def as_weights(weights: Any, observation: Tensor) -> Tensor:
+    """Weights as a float64 tensor (N,) on the device of the observation.
+
+    Raises:
+        ValueError: the sizes differ, or weights are negative, not finite, or all 0.
+    """
+    flat = real(weights, "weights").reshape(-1).to(observation.device).double()
+    if flat.numel() != observation.numel():
+        raise ValueError(f"weights has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    if not bool((torch.isfinite(flat) & (flat >= 0)).all()) or not bool((flat > 0).any()):
+        raise ValueError("some weights are negative, NaN or infinite, or all are 0; give at least one positive weight")
+    return flat
+
+
 def check_precision(signal: Tensor, observation: Tensor) -> None:
     """Check that the number format resolves the noise of finite (N,) pixels.
 

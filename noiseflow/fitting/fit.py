@@ -12,9 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import as_mask, check, check_order, check_precision, real
+from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
@@ -25,6 +26,8 @@ from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
 from noiseflow.threads import few_threads, warn_if_spinning
+
+_CELLS = 2**13  # about as many cells as a fit has
 
 _log = logging.getLogger("noiseflow")
 _PART = 2**20  # pixels predicted at once
@@ -37,6 +40,7 @@ def fit(
     observation: Tensor | NDArray[Any],
     *,
     mask: Tensor | NDArray[np.bool_] | None = None,
+    weights: Tensor | NDArray[Any] | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
@@ -70,6 +74,8 @@ def fit(
         observation: noisy images, a tensor or array of any shape and real type, detector units; images (..., y, x) if the
             noise model depends on neighbouring pixels.
         mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
+        weights: how much each pixel counts, shaped like `observation`, at least 0; all count alike by default. Pixels of weight 0
+            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`).
         skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
             in `Digitised`. The result holds the wrapped model; a log message reports it.
@@ -116,6 +122,8 @@ def fit(
         signal = real(signal, "signal")
     observation = real(observation, "observation")
     use = as_mask(mask, observation)
+    counted = None if weights is None else as_weights(weights, observation)
+    use = use if counted is None else use & (counted > 0)
     judge = float(held_out) if np.ndim(held_out) == 0 else as_mask(held_out, observation, "held_out")
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
@@ -140,9 +148,27 @@ def fit(
     axis = model.shared_axis
     choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
     pixels = choose(_as_floating(observation), use, judge, _own_generator(generator))
-    num_steps = model.num_steps if num_steps is None else num_steps
+    settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
+    num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
+    direct = train_noise and checkpoint is None and resume is None and pixels.train.ndim == 1
+    if (
+        isinstance(signal_model, KnownSignal)
+        and direct
+        and model.learns
+        and model.fits_directly
+        and not model.needs_image
+    ):
+        with few_threads(_CELLS):
+            return fit_directly(
+                model, signal_model.flat, pixels, result, num_steps=num_steps, weight=counted, standardise=standardise
+            )
+    if weights is not None:
+        raise ValueError(
+            f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
+            "out with a mask, or use a flow or a Mixture"
+        )
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
         learning_rate,

@@ -15,7 +15,7 @@ from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.contest import Contest, mean_and_error
-from noiseflow.models import baselines, flow, mixture, physical, physics_flow
+from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
@@ -77,7 +77,7 @@ class Selection:
     """All candidates, simplest first, and the chosen one.
 
     Attributes:
-        candidates: all candidates in the given order, simplest first.
+        candidates: the candidates that were fitted, in the given order, simplest first.
         chosen: the `simplest_sufficient` candidate. Its `nll` and `excess` are those of the comparison; its model was then
             fitted to the validation pixels too, unless `refit` was False.
         digitisation: detected rounding and clipping, included in every candidate.
@@ -94,11 +94,12 @@ def default_candidates() -> dict[str, nn.Module]:
         "Gaussian": baselines.Gaussian(),
         "PoissonGaussian": physical.PoissonGaussian(),
         "SignalDependentGaussian": flow.SignalDependentGaussian(),
-        "Mixture": mixture.Mixture(),
+        "ExcessNoise": excess_noise.ExcessNoise(),
+        "SharedMixture8": mixture.Mixture(8, shared_shape=True),
         "RadialFlow": flow.RadialFlow(),
+        "PhysicsFlow": physics_flow.PhysicsFlow(),
         "Mixture8": mixture.Mixture(8),
         "SplineFlow": flow.SplineFlow(),
-        "PhysicsFlow": physics_flow.PhysicsFlow(),
     }
 
 
@@ -142,11 +143,11 @@ def select(
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. All candidates are first fitted briefly to
-    some of the pixels; those whose held-out likelihood is then far behind (0.02 nats and three standard errors) are screened out.
-    The others are fitted fully, with the learning rate and number of steps of each model. A model that is behind but still
-    improving is fitted further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then
-    fitted again to all pixels except a tenth, which are used for early stopping.
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit, and those that start
+    at their maximum likelihood, are fitted once; `costly` ones only if no simpler model suffices. Others are first fitted briefly
+    to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats and three standard errors); the
+    rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is
+    then fitted again to all pixels except a tenth, which are used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
@@ -211,8 +212,10 @@ def _needs_converter(model: NoiseModelBase) -> bool:
 def _judged(contest: Contest) -> tuple[Candidate, ...]:
     """All candidates with their held-out likelihoods."""
     best, found = contest.best(), []
-    for name, score in contest.scores.items():
-        model = contest.models[name]
+    for name, model in contest.models.items():
+        if name not in contest.scores:
+            continue
+        score = contest.scores[name]
         excess, error = mean_and_error(best - score, contest.pixels.judging_blocks)
         out = name in contest.screened_out
         shown = model.module if isinstance(model, ForeignModel) else model

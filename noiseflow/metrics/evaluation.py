@@ -70,6 +70,8 @@ class Evaluation:
         ks: Kolmogorov–Smirnov distance of the PIT from the uniform distribution.
         ks_floor: distance that the true model exceeds with a probability of 5 %.
         num_pixels: number of pixels used.
+        num_outside: number of pixels whose signal is outside the range that the model was fitted to, where it extrapolates; 0 if
+            the model does not store its range.
         tails: shares beyond 3, 4 and 5 standard deviations in each signal bin, observed and under the model.
     """
 
@@ -81,6 +83,7 @@ class Evaluation:
     ks: float
     ks_floor: float
     num_pixels: int
+    num_outside: int
     tails: tuple[Tails, ...]
 
     @property
@@ -139,8 +142,14 @@ def evaluate(
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
+        num_outside=_num_outside(noise_model, signal),
         tails=tuple(tails(noise_model, signal[g], observation[g]) for g in groups),
     )
+
+
+def _num_outside(noise_model: nn.Module, signal: Tensor) -> int:
+    low, high = getattr(noise_model, "fitted_range", None) or (-math.inf, math.inf)
+    return int(((signal < low) | (signal > high)).sum())
 
 
 @torch.no_grad()

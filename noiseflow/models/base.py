@@ -185,8 +185,21 @@ class NoiseModelBase(Described, ABC):
         return
 
     @property
+    def settles(self) -> bool:
+        """Whether `standardise` ends with `settle` and takes ``settle=False`` to leave it out. Default: False."""
+        return False
+
+    @property
     def starts_most_likely(self) -> bool:
         """Whether `standardise` reaches nearly the maximum of the likelihood, so that few steps suffice. Default: False."""
+        return False
+
+    @property
+    def fits_directly(self) -> bool:
+        """Whether fits to known signals use a quasi-Newton method on cells of alike pixels (`noiseflow.fitting.direct`).
+
+        The learnt part of the density must be smooth in a twentieth of the noise's standard deviation. Default: False.
+        """
         return False
 
     @property
@@ -212,6 +225,11 @@ class NoiseModelBase(Described, ABC):
     @property
     def starts_anew(self) -> bool:
         """Whether the model should be standardised again whenever its signal has improved. Default: False."""
+        return False
+
+    @property
+    def costly(self) -> bool:
+        """Whether a fit takes so long that `select` tries the model only if no simpler one suffices. Default: False."""
         return False
 
     @property

@@ -29,6 +29,8 @@ class Gaussian(NoiseModelBase):
         tensor([0.5000, 0.7000])
     """
 
+    fits_directly = True
+
     def __init__(self, scale: float = 0.1) -> None:
         super().__init__()
         check(scale=scale)

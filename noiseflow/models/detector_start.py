@@ -14,9 +14,11 @@ from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32
-_SCORED, _CLIMBED, _COMB = 2048, 8192, 32768
+_SCORED, _CLIMBED, _COMB = 512, 2048, 32768
 _NUM_CLIMBS = 3
-_SETTLED, _SETTLED_BEHIND, _SETTLING_STEPS = 49152, 16384, 12
+_SETTLED, _SETTLING_STEPS = 16384, 12
+# Levels up to which pixels are counted, and ranges of signals, each a small fraction of a standard deviation of shot noise.
+_MOST_LEVELS, _RANGES = 512, 96
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
 _FLATTEST = 0.04
 
@@ -154,13 +156,12 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     offsets are therefore optimised with many pixels.
     """
     change = detector.change
-    part = _part(signal, _SETTLED if noise_model is detector else _SETTLED_BEHIND)  # intervals are slower
-    signal, observation = signal[part], observation[part]
+    signal, observation, weight = few_pixels(signal, observation)
     start, learns = change.detach().clone(), change.requires_grad
 
     def loss() -> Tensor:
         log_prob: Tensor = noise_model(signal).log_prob(observation)
-        return -log_prob.double().mean()
+        return -torch.dot(log_prob.double(), weight)
 
     change.requires_grad_(True)
     found = [(_settled(change, start, loss), change.detach().clone())]
@@ -171,6 +172,24 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     with torch.no_grad():
         change.copy_(min(found, key=lambda each: each[0])[1])
     change.requires_grad_(learns)
+
+
+def few_pixels(signal: Tensor, observation: Tensor, *, most: int = _SETTLED) -> tuple[Tensor, Tensor, Tensor]:
+    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels.
+
+    Returns:
+        Signals, observations and weights, (C,) each; the weights sum to 1.
+    """
+    levels, level = torch.unique(observation, return_inverse=True)
+    if levels.numel() > _MOST_LEVELS:
+        part = _part(signal, most)
+        return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
+    root = torch.sqrt((signal - signal.min()).double())
+    row = torch.floor(root / root.max().clamp(min=1e-30) * (_RANGES - 1)).long()
+    _, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
+    count = torch.bincount(cell).double()
+    mean, value = (torch.bincount(cell, each.double()) / count for each in (signal, levels[level]))
+    return mean.to(signal.dtype), value.to(observation.dtype), count / count.sum()
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:

@@ -78,8 +78,9 @@ class Digitised(ModelAround):
         kept, seen = self._before_rails(values, observation, mirror=by_level)
         if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
             kept, seen = torch.ones_like(kept), observation
-        span = {"span": (float(values.min()), float(values.max()))} if by_level else {}
-        self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **span)
+        options: dict[str, Any] = {"span": (float(values.min()), float(values.max()))} if by_level else {}
+        options |= {"settle": False} if self.model.settles and not self.model.needs_image else {}
+        self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **options)
         if not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
             self.model.settle(
                 values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high, self.origin)

@@ -28,7 +28,7 @@ _ALIGNED = 30.0
 _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
-_FITTED, _ITERATIONS = 16384, 60
+_FITTED, _ITERATIONS = 8192, 40
 
 
 class ExcessNoise(ElectronCounter):
@@ -59,6 +59,7 @@ class ExcessNoise(ElectronCounter):
         True
     """
 
+    costly = True
     origin: Tensor
 
     def __init__(
@@ -90,7 +91,7 @@ class ExcessNoise(ElectronCounter):
         """True, because `standardise` finds the maximum of the likelihood."""
         return True
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+    def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters from the second and third moments of (N,) observations at each signal level."""
         s, residual = signal.double(), observation.double() - signal.double()
         groups = torch.tensor_split(torch.argsort(s), max(4, min(32, s.numel() // 200)))
@@ -107,7 +108,8 @@ class ExcessNoise(ElectronCounter):
         with torch.no_grad():
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(gain), offset, math.log(read), math.log(squared - 1)]))
-        self.settle(signal, observation)
+        if settle:
+            self.settle(signal, observation)
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
@@ -118,8 +120,9 @@ class ExcessNoise(ElectronCounter):
             signal, observation: detector units.
             behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
         """
-        every = max(1, signal.numel() // _FITTED)
-        seen, values = signal[::every].double(), observation[::every].double()
+        from noiseflow.models.detector_start import few_pixels
+
+        seen, values, weight = few_pixels(signal.double(), observation.double(), most=_FITTED)
         model = self if behind is None else behind(self)
         climber = lbfgs([self.change], max_iter=_ITERATIONS)
         best, kept = math.inf, self.change.detach().clone()
@@ -127,7 +130,7 @@ class ExcessNoise(ElectronCounter):
         def loss() -> Tensor:
             nonlocal best, kept
             climber.zero_grad()
-            value: Tensor = -model(seen).log_prob(values).clamp(min=-60.0).mean()
+            value: Tensor = -torch.dot(model(seen).log_prob(values).clamp(min=-60.0).double(), weight)
             value.backward()  # type: ignore[no-untyped-call]
             if float(value.detach()) < best:
                 best, kept = float(value.detach()), self.change.detach().clone()

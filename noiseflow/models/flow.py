@@ -95,6 +95,10 @@ class ConditionalFlow(NoiseModelBase):
             self.surroundings = conditioning_network(2, width, num_inputs=neighbourhood**2 - 1)
 
     @property
+    def fits_directly(self) -> bool:
+        return not self.needs_image
+
+    @property
     def needs_image(self) -> bool:
         """Whether the model uses a neighbourhood and needs images."""
         return self.neighbourhood > 1

@@ -44,6 +44,7 @@ class Mixture(NoiseModelBase):
     """
 
     standardises_by_level = True
+    fits_directly = True
     joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(

@@ -20,6 +20,8 @@ _LEAST_READ_NOISE = 1e-3
 class ElectronCounter(NoiseModelBase):
     """A detector of electrons, whose first three parameters are gain, offset and read noise."""
 
+    settles = True
+
     @abstractmethod
     def _parameters_now(self) -> tuple[Tensor, ...]:
         """Gain, offset, read noise and any further parameters, float64 scalars."""
@@ -93,12 +95,13 @@ class PoissonGaussian(ElectronCounter):
         electrons = (read_noise.double() / gain).clamp(min=_LEAST_READ_NOISE).expand(signal.shape)
         return UnevenPoissonGaussian(signal, gain, offset, electrons)
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+    def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters to the maximum of the likelihood of (N,) signals and observations, from many starting points.
 
         If single electrons are resolved, the likelihood has many maxima, one for each alignment of the electron peaks with the
         pixel values; the starting points cover them. The parameters are then scaled by the curvature of the likelihood, so that
-        one learning rate suits both well-determined gains and poorly determined offsets.
+        one learning rate suits both well-determined gains and poorly determined offsets. A converter around the model passes
+        ``settle=False`` and calls `settle` itself.
         """
         from noiseflow.models.detector_start import find_detector, likelihood_axes
 
@@ -108,7 +111,8 @@ class PoissonGaussian(ElectronCounter):
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(found.gain), found.offset, math.log(found.read_noise)]))
             self.axes.copy_(axes)
-        self.settle(signal, observation)
+        if settle:
+            self.settle(signal, observation)
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None

@@ -43,6 +43,9 @@ class PhysicsFlow(NoiseModelBase):
     """
 
     most_joint_steps = PoissonGaussian.most_joint_steps
+    fits_directly = True
+    settles = True
+    costly = True
 
     def __init__(
         self,
@@ -72,9 +75,9 @@ class PhysicsFlow(NoiseModelBase):
             shift = self._latent_mean(signal, self.detector, self.correction)
         return [Affine(shift, torch.zeros_like(shift)), *maps]
 
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+    def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Find the maximum-likelihood detector for (N,) signals and observations."""
-        self.detector.standardise(signal, observation)
+        self.detector.standardise(signal, observation, settle=settle)
         self.correction.standardise(signal, observation)
 
     def settle(

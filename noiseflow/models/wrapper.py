@@ -44,7 +44,16 @@ def _of_inner(name: str) -> property:
 
 for _name in (
     *("needs_image", "neighbourhood", "shared_axis", "describes_single_readings", "tabulate", "one_pixel"),
-    *("starts_most_likely", "learning_rate", "num_steps", "joint_learning_rate", "most_joint_steps", "starts_anew"),
+    *(
+        "starts_most_likely",
+        "fits_directly",
+        "costly",
+        "learning_rate",
+        "num_steps",
+        "joint_learning_rate",
+        "most_joint_steps",
+        "starts_anew",
+    ),
     "fitted_range",
 ):
     setattr(ModelAround, _name, _of_inner(_name))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -151,3 +152,34 @@ def test_tails_show_what_the_divergence_does_not() -> None:
     assert tail.p_value[1] < 1e-6
     fair = metrics.evaluate(noiseflow.Gaussian(1.0), torch.zeros(40_000), torch.randn(40_000, generator=random))
     assert min(p for tail in fair.tails for p in tail.p_value) > 1e-4
+
+
+def test_weights_count_as_repeated_pixels() -> None:
+    """Noise of two widths: with weights, the fit is that of the pixels repeated."""
+    random = torch.Generator().manual_seed(3)
+    width = torch.where(torch.arange(20_000) % 2 == 0, 0.1, 0.3)
+    signal = torch.rand(20_000, generator=random)
+    observation = signal + width * torch.randn(20_000, generator=random)
+    weights = torch.where(width < 0.2, 3, 1)
+    result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, weights=weights)
+    found = float(result.noise_model.log_scale.exp())
+    assert found == pytest.approx(math.sqrt((3 * 0.1**2 + 0.3**2) / 4), rel=0.03)
+    narrow = noiseflow.fit(noiseflow.SplineFlow(), signal, observation, weights=(width < 0.2).int())
+    spread = narrow.noise_model(torch.tensor(0.5)).variance.sqrt()
+    assert float(spread) == pytest.approx(0.1, rel=0.05)
+
+
+def test_weights_that_cannot_be_used_are_refused() -> None:
+    for weights in (-OBSERVATION, torch.zeros(5000), torch.ones(4999), torch.full((5000,), torch.nan)):
+        with pytest.raises(ValueError, match="weights"):
+            noiseflow.fit(noiseflow.Gaussian(), SIGNAL, OBSERVATION, weights=weights)
+    with pytest.raises(ValueError, match="weights"):
+        noiseflow.fit(noiseflow.PoissonGaussian(), SIGNAL, OBSERVATION, weights=torch.ones(5000), num_steps=1)
+
+
+def test_evaluation_counts_the_pixels_where_the_model_extrapolates() -> None:
+    noise_model = noiseflow.fit(
+        noiseflow.Mixture(1), SIGNAL[1000:4000], OBSERVATION[1000:4000], num_steps=10
+    ).noise_model
+    assert metrics.evaluate(noise_model, SIGNAL, OBSERVATION).num_outside == 2000
+    assert metrics.evaluate(noiseflow.Gaussian(), SIGNAL, OBSERVATION).num_outside == 0

@@ -96,6 +96,7 @@ def test_unusable_data_is_refused(signal: torch.Tensor, observation: torch.Tenso
 class Explodes(noiseflow.Gaussian):
     """A Gaussian whose likelihood is NaN on some calls."""
 
+    fits_directly = False
     calls = 0
 
     def forward(self, signal: torch.Tensor):  # type: ignore[no-untyped-def]

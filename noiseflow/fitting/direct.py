@@ -1,0 +1,123 @@
+"""Fits to known signals by a quasi-Newton method on cells of alike pixels: seconds of Adam become tenths."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from noiseflow.fitting.cells import Cells, gather
+from noiseflow.fitting.pixel_split import FitPixels, thinned
+from noiseflow.fitting.result import FitResult
+from noiseflow.fitting.steps import lbfgs
+from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.standardisation import Standardisation
+
+# Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops.
+_ROUND, _PATIENCE = 10, 4
+_STANDARDISED, _FINAL, _PART = 1_000_000, 100_000, 32_768
+
+
+def fit_directly(
+    noise_model: NoiseModelBase,
+    signal: Tensor,
+    pixels: FitPixels,
+    result: FitResult,
+    *,
+    num_steps: int,
+    weight: Tensor | None = None,
+    standardise: bool = True,
+) -> FitResult:
+    """Maximise the likelihood of single pixels by L-BFGS; keep the weights that are best on the held-out pixels.
+
+    Args:
+        noise_model: a model that `fits_directly`.
+        signal: (N,) signals.
+        pixels: training and held-out pixels.
+        result: filled in and returned.
+        num_steps: largest number of iterations.
+        weight: (N,) weights of the pixels; 1 by default.
+        standardise: measure the scaling of the data first.
+
+    Raises:
+        ValueError: the likelihood is not finite.
+    """
+    started = time.perf_counter()
+    if standardise:
+        with torch.no_grad():
+            chosen = thinned(pixels.train, _STANDARDISED)
+            noise_model.standardise(signal[chosen], pixels.observation[chosen])
+    train, judge = (_cells(noise_model, signal, pixels, part, weight) for part in (pixels.train, pixels.judge))
+    optimiser = lbfgs(
+        [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND
+    )
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        value = _loss(noise_model, train)
+        value.backward()  # type: ignore[no-untyped-call]
+        return value
+
+    best, kept, since = _held_out(noise_model, judge), copy.deepcopy(noise_model.state_dict()), 0
+    result.history[0] = best
+    while result.num_steps < num_steps and since < _PATIENCE:
+        optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
+        before = [p.detach().clone() for p in noise_model.parameters()]
+        optimiser.step(loss)  # type: ignore[no-untyped-call]
+        result.num_steps += optimiser.param_groups[0]["max_iter"]
+        found = _held_out(noise_model, judge)
+        if not math.isfinite(found):
+            break
+        result.history[result.num_steps] = found
+        since = 0 if found < best else since + 1
+        if found < best:
+            best, kept = found, copy.deepcopy(noise_model.state_dict())
+        if all(torch.equal(p, q) for p, q in zip(before, noise_model.parameters(), strict=True)):
+            break
+    noise_model.load_state_dict(kept)
+    if not math.isfinite(best):
+        raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")
+    chosen = thinned(pixels.judge, _FINAL)
+    with torch.no_grad():
+        result.held_out_nll = -float(_log_prob(noise_model, signal[chosen], pixels.observation[chosen]).mean())
+    result.seconds = time.perf_counter() - started
+    return result
+
+
+def _cells(
+    noise_model: NoiseModelBase, signal: Tensor, pixels: FitPixels, part: Tensor, weight: Tensor | None
+) -> Cells:
+    observation, signal = pixels.observation[part], signal[part]
+    with torch.no_grad():
+        fixed = [
+            noise_model.fixed_part(s, o)
+            for s, o in zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
+        ]
+    values = observation if fixed[0] is None else torch.cat([each for each in fixed if each is not None])
+    scale = Standardisation().to(signal.device)
+    scale.set_from(signal, observation)
+    limits = {"low": noise_model.low, "high": noise_model.high}
+    return gather(scale, signal, values, None if weight is None else weight[part], **limits)
+
+
+def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:
+    if cells.values.ndim > 1:
+        found = noise_model.log_prob_from(cells.signal, cells.values)
+    else:
+        found = noise_model(cells.signal).log_prob(cells.values)
+    return -torch.dot(found.to(cells.weight.dtype), cells.weight)
+
+
+@torch.no_grad()
+def _held_out(noise_model: NoiseModelBase, cells: Cells) -> float:
+    return float(_loss(noise_model, cells))
+
+
+def _log_prob(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
+    parts = zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
+    found: list[Any] = [noise_model(s).log_prob(o).double() for s, o in parts]
+    return torch.cat(found)
