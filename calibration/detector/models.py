@@ -351,7 +351,7 @@ def _fitted(
         torch.from_numpy(values[chosen]).float().to(device) for values in (pixels.signal, pixels.observation)
     )
     found: dict[str, nn.Module] = {}
-    digitisation = noiseflow.detect_digitisation(pixels.observation)
+    digitisation = noiseflow.detect_digitisation(pixels.observation, pixels.signal)
     if detector is not None and "poisson-gaussian" in names:
         model: nn.Module = noiseflow.PoissonGaussian(*detector)
         found["poisson-gaussian"] = noiseflow.Digitised(model, *digitisation) if digitisation.found else model

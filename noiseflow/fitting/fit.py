@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,12 +16,14 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.fitting.beginning import SHARE, begin
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal, check_signal_model
+from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.baselines import Gaussian
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
@@ -65,6 +68,10 @@ def fit(
 
     The loss is the mean negative log-likelihood of the training pixels, plus the ``penalty()`` of the signal model if it has one.
     Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
+
+    A joint fit begins with a quarter of its steps by least squares, then fits the noise model to the residuals, and then both:
+    from a rough signal, a noise model would take the errors of the signal for outliers. It does not if `warm_up` or
+    ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -169,21 +176,37 @@ def fit(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
             "out with a mask, or use a flow or a Mixture"
         )
+    settings = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
+    learns_signal = any(parameter.requires_grad for parameter in signal_model.parameters())
+    begun = 0
+    if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
+        begun = round(SHARE * num_steps)
+        if resume is None and begun:
+            options: dict[str, Any] = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
+            begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
         learning_rate,
-        standardise=standardise and resume is None,
+        standardise=standardise and resume is None and not begun,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
     )
     if resume is not None:
         loop.load_state(resume)
-    schedule = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
-    if loop.signal_optimiser is not None:
+    settings = replace(settings, num_steps=num_steps - begun)
+    if learns_signal:
         warn_if_spinning()
-        return loop.run(schedule, progress, checkpoint)
+        loop.run(settings, progress, checkpoint)
+        result.num_steps += begun
+        return result
     with few_threads(batch_size):
-        return loop.run(schedule, progress, checkpoint)
+        return loop.run(settings, progress, checkpoint)
+
+
+def _starts_cold(noise_model: NoiseModelBase, signal_model: nn.Module) -> bool:
+    """Whether a joint fit begins with least squares: not for Gaussian noise, which is least squares, and not for repeated
+    exposures, which start from their mean."""
+    return noise_model.learns and not isinstance(noise_model, Gaussian) and not isinstance(signal_model, StaticScene)
 
 
 def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:

@@ -79,7 +79,7 @@ class SliceProjector(Projector):
             self.transposed = self._by_panels(dtype)
         else:
             self._set_entries(
-                *_joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
+                *joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
             )
 
     def __repr__(self) -> str:
@@ -94,7 +94,7 @@ class SliceProjector(Projector):
         """The transposed matrix, built from a few tilts at a time; all at once would need several times its memory."""
         size = (self.depth, self.width, self.detector_width)
         parts = [slice(start, start + _PANEL) for start in range(0, self.num_tilts, _PANEL)]
-        entries = (_joseph(self.tilt_angles[part], self.detector_offset[part], *size) for part in parts)
+        entries = (joseph(self.tilt_angles[part], self.detector_offset[part], *size) for part in parts)
         return panelled_by_groups(
             ((voxels, rays, weights) for rays, voxels, weights in entries),
             (self.depth * self.width, self.num_tilts * self.detector_width),
@@ -194,7 +194,7 @@ class _Product(torch.autograd.Function):
         return _Product.apply(gradient, projector, not transposed), None, None  # type: ignore[no-untyped-call]
 
 
-def _joseph(
+def joseph(
     angles: NDArray[np.float64], offsets: NDArray[np.float64], depth: int, width: int, detector_width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Row (ray), column (voxel) and weight of every non-zero element of the matrix."""

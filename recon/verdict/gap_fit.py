@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from recon.projection.projector import _joseph
+from noiseflow.statistics import neighbour_products
+from recon.projection.projector import joseph
 from recon.series.views import Directions
 
 Array = NDArray[Any]
@@ -48,7 +49,7 @@ class GapFit:
     ) -> None:
         angles = np.asarray(tilt_angles, dtype=np.float64)
         offsets = np.full(angles.shape, detector_offset)
-        rays, voxels, weights = _joseph(angles, offsets, depth, width, detector_width)
+        rays, voxels, weights = joseph(angles, offsets, depth, width, detector_width)
         matrix = np.zeros((len(angles) * detector_width, depth * width + 1), np.float32)
         matrix[rays, voxels] = weights
         matrix[:, -1] = np.sqrt(np.mean(matrix[:, :-1].sum(1) ** 2))
@@ -125,7 +126,7 @@ def shared(images: Array) -> float:
 
     Rows are fitted independently, so noise that is independent between rows does not contribute on average.
     """
-    return float(np.mean(images[:, 1:] * images[:, :-1])) if images.shape[1] > 1 else float(np.mean(images**2))
+    return float(np.mean(neighbour_products(images, axis=1))) if images.shape[1] > 1 else float(np.mean(images**2))
 
 
 @dataclass(frozen=True)

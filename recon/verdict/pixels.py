@@ -118,7 +118,9 @@ def streaks(residuals: Residuals) -> Effect:
         means = residuals.residual.mean(axis)
         apart = np.abs(means - ndimage.median_filter(means, (1, 5), mode="nearest"))
         usual = robust_deviation(apart, 0.0)
-        shares[name] = float((apart > np.maximum(8 * usual, residuals.contrast)).mean())
+        # where counts are few, most lines are empty, and the others scatter by more than is usual
+        scatter = residuals.residual.std(axis) / residuals.residual.shape[axis] ** 0.5
+        shares[name] = float((apart > np.maximum(8 * np.maximum(usual, scatter), residuals.contrast)).mean())
     worst = max(shares, key=lambda name: shares[name])
     return Effect(shares[worst], what=worst)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.statistics import neighbour_products
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, block_mean
 
@@ -86,11 +87,11 @@ class Residuals:
         """Correlation of neighbouring residuals along y, along u, and from tilt to tilt."""
         power = max(float(np.mean(self.residual**2)), 1e-30)
         r = self.residual
-        along = {"y": r[:, 1:] * r[:, :-1], "u": r[:, :, 1:] * r[:, :, :-1], "tilt": r[1:] * r[:-1]}
+        along = {name: neighbour_products(r, axis=axis) for name, axis in (("y", 1), ("u", 2), ("tilt", 0))}
         return {name: float(product.mean()) / power if product.size else 0.0 for name, product in along.items()}
 
 
 def neighbours(images: Array, axis: int) -> float:
     """Mean product of neighbouring pixels of (tilt, y, u) images along an axis; zero if the axis has one pixel."""
-    along = np.moveaxis(images, axis, 0)
-    return float(np.mean(along[1:] * along[:-1])) if len(along) > 1 else 0.0
+    products = neighbour_products(images, axis=axis)
+    return float(np.mean(products)) if products.size else 0.0

@@ -11,7 +11,8 @@ from recon.series.alignment import Alignment
 from recon.series.shrinkage import acquisition_orders, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom
-from recon.verdict.judge import CHECKS, Case
+from recon.verdict.case import Case
+from recon.verdict.table import CHECKS
 
 ANGLES, SIZE, MIDDLE = np.arange(-60, 61, 4.0), 32, 15.5
 NAMES = list(acquisition_orders(ANGLES))
@@ -78,8 +79,9 @@ def test_corrected_images_give_the_volume_of_the_middle_of_the_dose():
 def test_the_verdict_tells_of_shrinkage_and_of_too_few_tilts():
     series, _, _ = shrunken("shells", -0.08, "dose-symmetric")
     result = recon.reconstruct(series, method="sirt", num_steps=10)
-    _, findings = CHECKS["size of the specimen"](Case(series, result))
-    assert [finding.subject for finding in findings] == ["specimen"]
+    finding = CHECKS["size of the specimen"].finding(Case(series, result))
+    assert finding.cost >= 1
+    assert finding.reason == "specimen"
     few = series.select(slice(None, None, 6))
     guard = recon.prepare(few).guard
     assert "shrinkage" not in guard.not_tested
