@@ -43,7 +43,7 @@ sample {good}/model.safetensors {bad}/complex.npy -o {out}/n.mrc | complex128
 sample {good}/model.safetensors {bad}/words.npy -o {out}/n.mrc | holds <U1
 sample {good}/model.safetensors {bad}/objects.npy -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/pickle.npy -o {out}/n.mrc | cannot be read
-sample {good}/model.safetensors {bad}/four.npy -o {out}/n.mrc | 4 dimensions
+sample {good}/model.safetensors {bad}/four.npy -o {out}/n.mrc | --channel
 sample {good}/model.safetensors {bad}/nothing.npy -o {out}/n.mrc | no pixels
 sample {good}/model.safetensors {bad}/absurd.npy -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/colour.tif -o {out}/n.mrc | colour
@@ -55,7 +55,7 @@ sample {good}/model.safetensors {bad}/text.dm3 -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.dm4 -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.emd -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.ser -o {out}/n.mrc | cannot be read
-sample {good}/model.safetensors {bad}/text.emi -o {out}/n.mrc | no image
+sample {good}/model.safetensors {bad}/text.emi -o {out}/n.mrc | .ser
 sample {good}/model.safetensors {bad}/text.hspy -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.h5 -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.nxs -o {out}/n.mrc | cannot be read

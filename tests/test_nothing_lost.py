@@ -400,5 +400,5 @@ def test_a_noise_model_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None
 @pytest.mark.parametrize("name", ["batch", "calibrate", "compare", "demo", "reconstruct", "sample", "simulate"])
 def test_commands_that_write_say_how_to_overwrite(name: str, capsys) -> None:
     with pytest.raises(SystemExit):
-        main([name, "-h"])
+        main([name, "--help-all" if name in ("calibrate", "reconstruct") else "-h"])
     assert "--overwrite" in capsys.readouterr().out

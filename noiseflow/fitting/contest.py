@@ -37,6 +37,8 @@ class Contest:
         seed: int,
         num_steps: int | None,
         progress: Progress | None,
+        *,
+        skip_needless: bool,
     ) -> None:
         self.models, self.pixels, self.seed = models, pixels, seed
         self.steps = {name: model.num_steps if num_steps is None else num_steps for name, model in models.items()}
@@ -47,7 +49,7 @@ class Contest:
         self.screened_out: set[str] = set()
         self._gained = dict.fromkeys(models, 0.0)  # in the last fit, nats per pixel
         self._went_on: set[str] = set()
-        self._progress, self._done = progress, 0
+        self._progress, self._done, self._skips = progress, 0, skip_needless
 
     def screen(self) -> None:
         """Fit every model briefly to some pixels; screen out models far behind the best that do not catch up."""
@@ -55,7 +57,7 @@ class Contest:
             if not model.costly:
                 self._enter(name)
         for name, model in self.models.items():
-            if model.costly and not self._is_needless(name):
+            if model.costly and not (self._skips and self._is_needless(name)):
                 self._enter(name)
         for name in self.scores:
             model = self.models[name]

@@ -144,8 +144,9 @@ def select(
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
     If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit, and those that start
-    at their maximum likelihood, are fitted once; `costly` ones only if no simpler model suffices. Others are first fitted briefly
-    to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats and three standard errors); the
+    at their maximum likelihood, are fitted once; of the default candidates, `costly` ones only if no simpler model suffices.
+    Others are first fitted briefly to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats
+    and three standard errors); the
     rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is
     then fitted again to all pixels except a tenth, which are used for early stopping.
 
@@ -194,7 +195,7 @@ def select(
             name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model
             for name, model in wrapped.items()
         }
-    contest = Contest(wrapped, pixels, seed, num_steps, progress)
+    contest = Contest(wrapped, pixels, seed, num_steps, progress, skip_needless=candidates is None)
     contest.screen()
     contest.finish()
     judged = _judged(contest)

@@ -41,6 +41,7 @@ from recon.methods._names import method_names
             "pixel_size",
             "exclude_views",
             "alignment",
+            "save_alignment",
             "alignment_binning",
             "mask",
             "mask_nan",
