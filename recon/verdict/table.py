@@ -285,8 +285,7 @@ PREDICTIVE: tuple[Row, ...] = (
 
 
 def _left(case: Case) -> bool:
-    share, error, _ = cases.left_in_residuals(case)
-    return share - 3 * error > cases.tolerable_residual(case)
+    return cases.left_in_residuals(case).value > cases.tolerable_residual(case)
 
 
 CHECKS: dict[str, Row] = {row.name: row for row in (*FACTS, *DISTORTIONS, *PREDICTIVE)}

@@ -163,7 +163,12 @@ def test_damaged_dm3_files_are_read_or_refused(wounds: list[tuple[str, float, in
 @given(content=st.binary(min_size=1, max_size=3000))
 def test_any_bytes_are_refused_or_read(suffix: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
-    assert faults(read(path, content), path) == []
+    try:
+        found = read(path, content)
+    except ModuleNotFoundError as error:  # of an extra, which the message names
+        assert "[camera-formats]" in str(error)  # noqa: PT017
+        return
+    assert faults(found, path) == []
 
 
 @fuzz

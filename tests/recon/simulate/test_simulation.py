@@ -30,7 +30,7 @@ def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise)
     plan = Simulation(
         "shells", 16, {"clean": angles, "test": np.array([-50.0, 5.0])}, acquisition, acquisition.noise(), 3
     )
-    unit = plan.write(tmp_path / "new", lambda done, note: steps.append(done))
+    unit = plan.write(tmp_path / "new", lambda task, done, total, note: steps.append(done))
     density = make_phantom("shells", 16, generator=np.random.default_rng(3))
     clean, expected_unit = clean_tilt_series(density, angles, acquisition=acquisition)
     assert unit == pytest.approx(expected_unit, rel=1e-5)
