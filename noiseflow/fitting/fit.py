@@ -100,7 +100,8 @@ def fit(
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
         progress: called with a task, completed and expected steps, and a note.
-        checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C.
+        checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C; never by fits to
+            known signals that need no batches, which are short.
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
         parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
@@ -159,7 +160,8 @@ def fit(
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
-    direct = train_noise and checkpoint is None and resume is None and pixels.train.ndim == 1
+    # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
+    direct = train_noise and resume is None and pixels.train.ndim == 1
     if (
         isinstance(signal_model, KnownSignal)
         and direct
