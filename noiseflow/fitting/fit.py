@@ -168,9 +168,8 @@ def fit(
         and not model.needs_image
     ):
         with few_threads(_CELLS):
-            return fit_directly(
-                model, signal_model.flat, pixels, result, num_steps=num_steps, weight=counted, standardise=standardise
-            )
+            options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
+            return fit_directly(model, signal_model.flat, pixels, result, **options)
     if weights is not None:
         raise ValueError(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
