@@ -168,7 +168,12 @@ def fit(
         and not model.needs_image
     ):
         with few_threads(_CELLS):
-            options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
+            options: dict[str, Any] = {
+                "num_steps": num_steps,
+                "weight": counted,
+                "standardise": standardise,
+                "progress": progress,
+            }
             return fit_directly(model, signal_model.flat, pixels, result, **options)
     if weights is not None:
         raise ValueError(
@@ -181,7 +186,7 @@ def fit(
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
         begun = round(SHARE * num_steps)
         if resume is None and begun:
-            options: dict[str, Any] = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
+            options = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
             begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
