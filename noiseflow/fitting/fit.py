@@ -170,9 +170,13 @@ def fit(
         and not model.needs_image
     ):
         with few_threads(_CELLS):
-            return fit_directly(
-                model, signal_model.flat, pixels, result, num_steps=num_steps, weight=counted, standardise=standardise
-            )
+            options: dict[str, Any] = {
+                "num_steps": num_steps,
+                "weight": counted,
+                "standardise": standardise,
+                "progress": progress,
+            }
+            return fit_directly(model, signal_model.flat, pixels, result, **options)
     if weights is not None:
         raise ValueError(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
@@ -184,7 +188,7 @@ def fit(
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
         begun = round(SHARE * num_steps)
         if resume is None and begun:
-            options: dict[str, Any] = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
+            options = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
             begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
