@@ -49,6 +49,7 @@ def fit_network(
         start = JointReconstructor(noise_model=Gaussian, seed=seed).signal_model(tilt_series, grid)
         field = PaperField(grid.shape, width=width, scale=2 * _DENSITY_SCALE / DENSEST / grid.width)
         nn.init.constant_(field.network.last.bias, _EMPTY)  # type: ignore[union-attr, arg-type]
+        field.relative_rate = 1.0  # the rates here are those of the network
         rate = min(_HIGHEST_RATE, _RATE_TIMES_WIDTH / width)
         model = TomographySignal(field, start.projector, start.image_formation, weight=0.0, learning_rate=rate)
         images = torch.from_numpy(np.ascontiguousarray(tilt_series.images.transpose(0, 2, 1), dtype=np.float32))

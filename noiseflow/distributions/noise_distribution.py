@@ -116,9 +116,7 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature, shape of the batch; the function takes observations ``(Q, *batch)``."""
-        nodes, weights = self.quadrature()
-        values = function(nodes)  # infinite at impossible observations
-        return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
+        return weighted_sum(function, *self.quadrature())
 
     @property
     def mean(self) -> Tensor:
@@ -144,6 +142,12 @@ class NoiseDistribution(PixelBatch, Distribution):
         nodes, lengths = panels(low.detach(), high.detach(), count)
         weights = lengths * torch.exp(self.log_prob(nodes))
         return nodes, weights / weights.detach().sum(0)
+
+
+def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: Tensor) -> Tensor:
+    """Sum of ``weights · function(nodes)`` over the first axis; nodes without weight do not count."""
+    values = function(nodes)  # infinite at impossible observations
+    return torch.where(weights > 0, weights * values, torch.zeros_like(weights)).sum(0)
 
 
 def bisect_quantile(

@@ -16,6 +16,7 @@ from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
+from noiseflow.progress import Progress
 
 # Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops.
 _ROUND, _PATIENCE = 10, 4
@@ -31,6 +32,7 @@ def fit_directly(
     num_steps: int,
     weight: Tensor | None = None,
     standardise: bool = True,
+    progress: Progress | None = None,
 ) -> FitResult:
     """Maximise the likelihood of single pixels by L-BFGS; keep the weights that are best on the held-out pixels.
 
@@ -42,6 +44,7 @@ def fit_directly(
         num_steps: largest number of iterations.
         weight: (N,) weights of the pixels; 1 by default.
         standardise: measure the scaling of the data first.
+        progress: called with a task, completed and expected steps, and a note.
 
     Raises:
         ValueError: the likelihood is not finite.
@@ -73,6 +76,8 @@ def fit_directly(
         if not math.isfinite(found):
             break
         result.history[result.num_steps] = found
+        if progress is not None:
+            progress("fit", result.num_steps, num_steps, f"held-out NLL {found:.4f}")
         since = 0 if found < best else since + 1
         if found < best:
             best, kept = found, copy.deepcopy(noise_model.state_dict())

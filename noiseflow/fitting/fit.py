@@ -100,7 +100,8 @@ def fit(
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         generator: source of the random choices.
         progress: called with a task, completed and expected steps, and a note.
-        checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C.
+        checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C; never by fits to
+            known signals that need no batches, which are short.
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
         parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
@@ -159,7 +160,8 @@ def fit(
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
-    direct = train_noise and checkpoint is None and resume is None and pixels.train.ndim == 1
+    # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
+    direct = train_noise and resume is None and pixels.train.ndim == 1
     if (
         isinstance(signal_model, KnownSignal)
         and direct
@@ -168,9 +170,13 @@ def fit(
         and not model.needs_image
     ):
         with few_threads(_CELLS):
-            return fit_directly(
-                model, signal_model.flat, pixels, result, num_steps=num_steps, weight=counted, standardise=standardise
-            )
+            options: dict[str, Any] = {
+                "num_steps": num_steps,
+                "weight": counted,
+                "standardise": standardise,
+                "progress": progress,
+            }
+            return fit_directly(model, signal_model.flat, pixels, result, **options)
     if weights is not None:
         raise ValueError(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
@@ -182,7 +188,7 @@ def fit(
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
         begun = round(SHARE * num_steps)
         if resume is None and begun:
-            options: dict[str, Any] = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
+            options = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
             begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(

@@ -53,7 +53,7 @@ class Schedule:
         settle: signal steps on the slab before noise models are compared.
         candidate: steps of each candidate noise model; its likelihood then differs from the converged one by less than the
             tolerance of the choice.
-        adapt: signal steps on the slab under the chosen noise model, and under the most likely simpler one.
+        adapt: signal steps on the slab under the chosen noise model, and under every simpler one.
         refine: noise-model steps on the slab after the signal has improved; more would fit the misfit of the slab.
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
@@ -88,7 +88,7 @@ class FitStage:
         name: unique name within a plan; the journal stores the result of the stage under it.
         kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
-            one and with the most likely simpler one, and chooses one of the two; ``weights`` compares regulariser weights;
+            one and with every simpler one, and chooses again; ``weights`` compares regulariser weights;
             ``fields`` compares fields, see `recon.joint.field_choice`.
         where: the slab or the whole volume.
         noise: the simple noise model of the first fits, or the chosen model.

@@ -96,7 +96,7 @@ class Runner:
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
         self.result = FitResult(models["simple"])
-        self._runner_up: nn.Module | None = None  # the most likely noise model simpler than the chosen one
+        self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._done, self._expected = 0, expected
 
     def run(self, stages: Sequence[FitStage]) -> None:
@@ -156,33 +156,31 @@ class Runner:
             if excess <= _TOLERATED:
                 break
         chosen = _simplest(tried, task)
-        behind = min(tried[: tried.index(chosen)], key=lambda each: each.excess, default=None)
         self.models["chosen"] = chosen.model
-        self._runner_up = None if behind is None or math.isinf(behind.excess) else behind.model
+        self._simpler = [each.model for each in tried[: tried.index(chosen)] if math.isfinite(each.excess)]
         if math.isfinite(as_noise_model(chosen.model).low):
             self.models["simple"] = copy.deepcopy(simpler[0])  # least squares would be biased by the clipping
 
     def _finalists(self, stage: FitStage, task: Task) -> None:
-        """Fit the volume with the chosen noise model and, from the same state, with the most likely simpler one.
+        """Fit the volume with the chosen noise model and, from the same state, with every simpler one; choose again.
 
         A flexible noise model also describes errors of a rough signal, and may seem better until the signal has converged. On a
-        needle with 10 counts, Poisson noise was 0.007 nats worse before, and 0.08 better after twenty steps.
+        needle with 10 counts, noise with the shape of counts was behind two mixtures before, by 0.15 and 0.03 nats, and 0.07 and
+        0.13 ahead after twenty steps.
         """
-        model, runner_up = task.signal_model, self._runner_up
-        start = copy.deepcopy(model.state_dict()) if runner_up is not None else {}
-        chosen = self._fit_signal(stage, task, stage.name)
-        self.result = chosen
-        if runner_up is None:
-            return
-        richer, adapted = self.models["chosen"], copy.deepcopy(model.state_dict())
-        model.load_state_dict(start)
-        self.models["chosen"] = runner_up
-        simpler = self._fit_signal(stage, task, f"{stage.name} 2")
-        tried = [_Tried(runner_up, _last_nll(simpler)), _Tried(richer, _last_nll(chosen))]
-        if _simplest(tried, task).model is runner_up:
-            self.result = simpler
-        else:
-            self.models["chosen"] = richer
+        model, richest = task.signal_model, self.models["chosen"]
+        start = copy.deepcopy(model.state_dict()) if self._simpler else {}
+        tried, fits = list[_Tried](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
+        for number, noise_model in enumerate([richest, *self._simpler], 1):
+            if tried:
+                model.load_state_dict(start)
+            self.models["chosen"] = noise_model
+            result = self._fit_signal(stage, task, stage.name if number == 1 else f"{stage.name} {number}")
+            tried.append(_Tried(noise_model, _last_nll(result)))
+            fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
+        chosen = _simplest([*tried[1:], tried[0]], task).model
+        self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
+        if adapted:
             model.load_state_dict(adapted)
 
     def _weights(self, stage: FitStage, task: Task) -> None:

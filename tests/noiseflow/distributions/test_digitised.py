@@ -237,6 +237,17 @@ def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up
     assert float(nodes.min()) == pytest.approx(-0.2 - 7.35, abs=0.02)  # quantiles of 1e-13
 
 
+def test_moments_of_any_number_of_levels() -> None:
+    """Narrow and wide noise in one batch: the narrow one sees the rounding, the wide one has more levels than can be added up."""
+    law = noiseflow.Digitised(noiseflow.Poisson(1.0), 1.0, 0.0, 1e12)(
+        torch.tensor([0.5, 2.0, 1e8], dtype=torch.float64)
+    )
+    assert_close(law.mean, torch.tensor([0.5, 2.0, 1e8], dtype=torch.float64), rtol=1e-6, atol=0)
+    assert_close(law.variance, torch.tensor([0.5, 2.0, 1e8], dtype=torch.float64), rtol=1e-3, atol=0)
+    halves = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-4, 0.0)(SIGNALS[:1] * 0)
+    assert_close(halves.mean, torch.full_like(halves.mean, (2 * math.pi) ** -0.5), rtol=1e-3, atol=0)
+
+
 def test_a_rescaled_converter_digitises_what_is_rescaled() -> None:
     law = made(0.25, 0.0, 1.0)
     found = law.rescaled(torch.tensor(2.0).double(), torch.tensor(0.1).double())

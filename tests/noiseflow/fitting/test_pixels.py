@@ -77,6 +77,12 @@ def test_masked_pixels_do_not_move_a_fit() -> None:
         assert torch.equal(parameters, found[0][1])
 
 
+class ByBatches(noiseflow.Gaussian):
+    """Gaussian noise that is trained on batches, as models of images are."""
+
+    fits_directly = False
+
+
 def test_a_resumed_fit_draws_the_pixels_that_an_unbroken_one_would_have() -> None:
     """The resuming run brings a generator of another state; what is drawn next must come from the checkpoint."""
     generator = torch.Generator().manual_seed(0)
@@ -85,7 +91,7 @@ def test_a_resumed_fit_draws_the_pixels_that_an_unbroken_one_would_have() -> Non
     held_out = torch.rand(5000, generator=generator) < 0.1
 
     def fitted(seed: int, resume: dict[str, Any] | None = None) -> tuple[torch.Tensor, list[dict[str, Any]]]:
-        model, states = noiseflow.Gaussian(1.0), []
+        model, states = ByBatches(1.0), []
         noiseflow.fit(
             *(model, signal, observation),
             num_steps=30,

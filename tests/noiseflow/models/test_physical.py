@@ -392,14 +392,14 @@ def test_readings_pull_an_estimate_below_the_offset_back(noise: torch.nn.Module)
     assert float(signal.grad.mean()) == pytest.approx(0.4 / 0.25, rel=0.1)
 
 
-@pytest.mark.parametrize(("gain", "read_noise"), [(-1.0, 1.0), (1.0, 0.0)])
-def test_impossible_detector_is_refused(gain: float, read_noise: float) -> None:
-    with pytest.raises(ValueError, match="must be positive"):
+@pytest.mark.parametrize(("gain", "read_noise", "name"), [(-1.0, 1.0, "gain"), (1.0, 0.0, "read_noise")])
+def test_impossible_detector_is_refused(gain: float, read_noise: float, name: str) -> None:
+    with pytest.raises(ValueError, match=name):
         noiseflow.PoissonGaussian(gain=gain, read_noise=read_noise)
 
 
 def test_mixture_without_components_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="num_components"):
         noiseflow.Mixture(0)
 
 

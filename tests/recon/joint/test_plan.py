@@ -170,7 +170,7 @@ def test_what_is_done_is_what_was_planned(clipped, options):
     planned, *_ = fit.plan(clipped)
     fit(clipped)
     signal = [(s.name, s.num_steps) for s in planned if s.kind in ("signal", "finalists")]
-    assert [step for step in done if step[0] != "adapt 2" and "choose weight" not in step[0]] == signal
+    assert [step for step in done if not step[0].startswith("adapt ") and "choose weight" not in step[0]] == signal
     assert any("choose weight" in name for name, _ in done) == any(s.kind == "weights" for s in planned)
 
 
