@@ -82,11 +82,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("math.isfinite(edge) else 0.0", "numbers", SAFE),
         ("value.numel() else 0.0", "numbers", "of no values, none is moved"),
         (
-            "if first.numel() else 1",
-            "numbers",
-            "sums over the levels of no pixels: there are none, of however many levels",
-        ),
-        (
             "* _SHARE_OF_STEP <= self.step",
             "torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step",
             "from where on double precision is taken: both are exact there",

@@ -104,7 +104,16 @@ class Case:
     @cached_property
     def geometry(self) -> Geometry:
         """Predictions of held-out gaps of tilts."""
-        return Geometry(self.coarse)
+        own, used = self.own
+        residual = (self.coarse.images - own) * used
+        sign = np.random.default_rng(0).choice([-1.0, 1.0], size=(*own.shape[:2], 1))
+        return Geometry(self.coarse, own + sign * residual)
+
+    @cached_property
+    def own(self) -> tuple[Array, Array]:
+        """(tilt, y, u) coarse line integrals of the volume's own projections, and the pixels in use."""
+        expected = self.expected[evenly(self.coarse.tilts, len(self.expected))]
+        return line_integrals(self.series.select(self.coarse.tilts), expected, self.coarse.binning)
 
     @property
     def other_geometries(self) -> Geometry:
@@ -123,9 +132,7 @@ class Case:
     @cached_property
     def own_gap(self) -> Unexplained:
         """The same for the projections of the volume, which are consistent with each other."""
-        some = self.series.select(self.coarse.tilts)
-        expected = self.expected[evenly(self.coarse.tilts, len(self.expected))]
-        own, used = line_integrals(some, expected, self.coarse.binning)
+        own, used = self.own
         return unexplained((own - own[used].mean()) * used, self.geometry.fit.errors(own, used))
 
 

@@ -34,12 +34,13 @@ class Geometry:
 
     Attributes:
         coarse: the series.
+        replicate: (tilt, y, u) the volume's own projections with the residuals in random signs: a series of the given geometry.
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
     """
 
-    def __init__(self, coarse: Coarse) -> None:
-        self.coarse = coarse
+    def __init__(self, coarse: Coarse, replicate: Array) -> None:
+        self.coarse, self.replicate = coarse, replicate
         self.smoothness = min(_SMOOTHNESS, key=lambda each: float(np.mean(self._errors(self._fit(each)) ** 2)))
         self.fit = self._fit(self.smoothness)
         self.errors = self._errors(self.fit)
@@ -129,14 +130,23 @@ class Geometry:
         return _best(self._apart(first, name) for name, first in parts.items())
 
     def _apart(self, first: Array, name: str) -> Effect:
-        errors = np.empty_like(self.errors)
+        errors, expected = np.empty_like(self.errors), np.empty_like(self.errors)
         for part in (first, ~first):
-            fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part])
-            errors[part] = fit.errors(self.coarse.images[part], self.coarse.used[part])
-        return self._gain(errors, self.errors, name)
+            fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
+            errors[part] = fit.errors(self.coarse.images[part], used)
+            expected[part] = fit.errors(self.replicate[part], used)
+        return self._beyond_expected(errors, expected, name)
 
     def _with(self, what: str, **changes: Any) -> Effect:
-        return self._gain(self._errors(self._fit(self.smoothness, **changes)), self.errors, what)
+        fit = self._fit(self.smoothness, **changes)
+        return self._beyond_expected(self._errors(fit), fit.errors(self.replicate, self.coarse.used), what)
+
+    def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
+        """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
+        any volume smoother, which predicts some objects better."""
+        gain = self._gain(errors, self.errors, what)
+        chance = self._gain(expected, self.fit.errors(self.replicate, self.coarse.used), what)
+        return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
         """Reduction of the errors relative to the given geometry; its standard error is that of the mean over the gaps."""

@@ -180,6 +180,7 @@ def uneven(residuals: Residuals) -> Effect:
     images, residual = residuals.images, residuals.residual
     residual = residual - _by_signal(images - residual, residual)
     mean = residual.mean(0, keepdims=True)
+    mean = mean - mean.mean()  # an offset is no pattern
     steady, whole = neighbours(mean, 1), max(neighbours(images - images.mean(), 1), 1e-30)
     chance = float(np.mean(residual**2)) / len(images) / float(np.sqrt(mean.size))
     if steady < 0.3 * neighbours(residual, 1):  # shifted tilts have at most 0.2 of it in common

@@ -18,7 +18,7 @@ PIXELS = 0.25  # rms of shifts; a volume absorbs a part of every shift, so the t
 ROTATION = 0.06  # pixels at the edge, common to all images; correct reconstructions reach 0.049
 OFF_MIDDLE = 0.12  # pixels, common to all images, which no volume absorbs; correct reconstructions reach 0.06
 SMOOTH_SHIFT = 0.13  # pixels rms of a drift, the true one being larger
-MAGNIFICATION = 0.15  # pixels at the edge; series that are too noisy for a significant trend reach 0.11
+MAGNIFICATION = 0.3  # pixels at the edge; unconverged volumes of 29 correct independent series reach 0.23
 BRIGHTNESS = 0.18  # share of the contrast; total variation reduces weak contrast by up to 0.14 at some tilts
 GAIN = 0.06  # share of the error of held-out tilts; 60 independent correct series gain at most 0.05
 FEW = 0.002  # share of pixels or lines: one in five hundred is harmless
@@ -193,8 +193,6 @@ DISTORTIONS: tuple[Row, ...] = (
         "the tilt axis is off the middle of the images, by at least {value:.2f} pixels", ALIGN, score=2.8),
     Row("rotation of each image", "axis", "distortion", of("rotation", "spread"), "pixels", 2 * PIXELS,
         "the images are rotated relative to the volume, by at least {value:.2f} pixels at their edge", AXIS),
-    Row("drift of the rotation", "axis", "distortion", of("rotation", "drift"), "pixels", at_edge(SMOOTH_SHIFT),
-        "the images rotate along the series, by at least {value:.2f} pixels at their edge", AXIS),
     # 3 errors: wrong axes by 5° have 3.2, correct series with 20 tilts and more at most 2.8
     Row("rotation", "axis", "distortion", of("rotation", "offset"), "pixels", at_edge(ROTATION),
         "the images are rotated relative to the volume, by at least {value:.2f} pixels at their edge", AXIS, score=3.0),
