@@ -52,10 +52,10 @@ def test_an_unknown_option_of_a_file_is_named_with_the_nearest_one(
     tilts: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tilts.with_name("run.toml")
-    file.write_text("thicknes = 3\n", encoding="utf-8")
+    file.write_text("depth_thickness = 3\n", encoding="utf-8")
     with pytest.raises(RuntimeError, match="1"):
         run("reconstruct", tilts, "-o", tilts.with_name("a.npy"), "--options", file)
-    assert "'thicknes'" in (told := capsys.readouterr().err)
+    assert "'depth_thickness'" in (told := capsys.readouterr().err)
     assert "thickness" in told
 
 
