@@ -34,8 +34,7 @@ class Options:
         out: folder of results and figures.
         output: console output.
         overwrite: replace existing figures; otherwise only those that this program wrote.
-        method: method of `sabotage`; None for the joint fit, or least squares if quick.
-        in_turn: whether `sabotage` applies each defect to one scene only, alternating between scenes.
+        method: method of `sabotage`; None for SIRT.
     """
 
     size: int
@@ -46,7 +45,6 @@ class Options:
     output: Output
     overwrite: bool = False
     method: str | None = None
-    in_turn: bool = False
 
     def results(self, name: str) -> Results:
         """The stored results of a benchmark on this scene; each scene and effort has its own file."""
@@ -161,7 +159,7 @@ def needle(options: Options) -> dict[str, Any]:
 
 def sabotage(options: Options) -> dict[str, Any]:
     """Tilt series with deliberate defects: whether the verdict detects them and names the reason."""
-    method = options.method or ("l2" if options.quick else "joint")
+    method = options.method or "sirt"
     results = options.results_of_series("sabotage", method)
     benchmark_sabotage.run(
         results,
@@ -170,7 +168,6 @@ def sabotage(options: Options) -> dict[str, Any]:
         method=method,
         seed=options.scene["seed"],
         quick=options.quick,
-        in_turn=options.in_turn,
     )
     return _told(options, results, benchmark_sabotage.table(results.cells))
 

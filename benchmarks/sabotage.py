@@ -1,11 +1,16 @@
-"""Tilt series with deliberate defects: each must be reconstructed correctly, or graded doubtful or bad for the true reason."""
+"""Independent tilt series, unspoilt and spoilt: each must be reconstructed correctly, or graded below good for the true reason.
+
+Scenes and ways of spoiling are split at random into halves: limits are set on the used half, and the kept half judges them.
+Evidence of every check is stored, so that limits can be fitted without another run.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -13,7 +18,7 @@ import numpy as np
 from benchmarks import rarer_defects  # noqa: F401  (registers its ways, after those of spoiling)
 from benchmarks.defects import WAYS, Source, Spoilt
 from benchmarks.needle import load
-from benchmarks.scenes import Cell, Results, Scene, make_scene
+from benchmarks.scenes import Cell, Results, Scene
 from noiseflow.checks import Verdict
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import compare
@@ -21,40 +26,44 @@ from recon.series.screening import require_specimen, screen
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, draw_noise, stored_type
 from recon.verdict.judge import judge
+from tests.independent_scenes import NOISES, RANGES, SCENES, IndependentSeries, independent_series
 
-SCENES = (("shells", "clipped"), ("particles", "low-dose"), ("filaments", "8-bit"))
-STANDARD = tuple(
-    (phantom, noise)
-    for phantom in ("shells", "virions", "filaments", "particles", "slab")
-    for noise in ("clipped", "skewed", "outliers", "low-dose", "8-bit")
-)
-TILTS = "-60:60:3"
 RIGHT = 0.3  # dB below the series without defects
+SEED = 38
+"""Seed of the halves and of the unspoilt series; the spoilt ones use the next."""
+# a truncated object and a nonlinear detector are faults, and so are fewer tilts than fine detail needs
+PHANTOMS = [name for name in SCENES if name != "truncated_object"]
+QUIET = ["Poisson 10", "Poisson 100", "Poisson 40, read noise", "scan noise"]
+LOUD = [*QUIET, "detector blur", "outliers", "Poisson 2"]
+TILTS = list(RANGES)[:2] + list(RANGES)[3:]
+UNSPOILT, SMALL = 110, 32
+STEPS = {"sirt": 20}
 _OTHER = 9  # added to the seed to get another object of the same type
-Result = tuple[TiltSeries, Any, Verdict[Any]]
 
 
-def run(
-    results: Results,
-    line: Callable[[str], None],
-    *,
-    size: int,
-    method: str,
-    seed: int,
-    quick: bool,
-    in_turn: bool = False,
-) -> None:
-    """Compute the result of each good series and of each scene with each defect; existing results are kept.
+def kept(names: Iterable[str]) -> set[str]:
+    """The half of the names that judges."""
+    mixed = sorted(names)
+    Random(SEED).shuffle(mixed)
+    return set(mixed[::2])
 
-    If `in_turn`, each defect is applied to one scene only, alternating between scenes, which takes a third of the time.
-    """
-    for phantom, noise in SCENES if quick else STANDARD:
-        _cell(results, line, f"good/{phantom}, {noise}", partial(_good, phantom, noise, size, method, seed))
-    _cell(results, line, "good/needle", lambda: _graded(_result(load(), method, seed)[2]))
-    for number, (phantom, noise) in enumerate(SCENES[:1] if quick else SCENES):
-        for name in list(WAYS)[number :: len(SCENES)] if in_turn else WAYS:
-            key = f"{phantom}, {noise}/{name}"
-            _cell(results, line, key, partial(_spoilt, phantom, noise, name, size, method, seed))
+
+def run(results: Results, line: Callable[[str], None], *, size: int, method: str, seed: int, quick: bool) -> None:
+    """Compute the result of every unspoilt series and of every way of spoiling; existing results are kept."""
+    cells = [(scene, noise, tilts) for scene in PHANTOMS for noise in LOUD for tilts in TILTS]
+    random = Random(SEED)
+    random.shuffle(cells)
+    for number, (scene, noise, tilts) in enumerate(cells[: 6 if quick else UNSPOILT]):
+        width = size if number % 3 == 2 else SMALL
+        key = f"good/{scene}, {noise}, {tilts}, {width}"
+        _cell(results, line, key, partial(_good, scene, noise, tilts, width, method, seed + number))
+    _cell(results, line, "needle", lambda: _result(load(), method, None)[1])
+    random = Random(SEED + 1)
+    for way in list(WAYS)[: 6 if quick else None]:
+        cell = random.choice(PHANTOMS), random.choice(QUIET), random.choice(TILTS)
+        name = ", ".join((*cell, str(size)))
+        _cell(results, line, f"reference/{name}", partial(_good, *cell, size, method, seed + 100))
+        _cell(results, line, f"spoilt/{way}/{name}", partial(_spoilt, way, *cell, size, method, seed + 100))
 
 
 def _cell(results: Results, line: Callable[[str], None], key: str, compute: Callable[[], Cell]) -> None:
@@ -62,25 +71,38 @@ def _cell(results: Results, line: Callable[[str], None], key: str, compute: Call
     line(f"{key}: {found['grade']}; {', '.join(found['subjects'])}")
 
 
-def _scene(phantom: str, noise: str, size: int, seed: int) -> Scene:
-    return make_scene(size, phantom=phantom, noise=noise, tilts=TILTS, seed=seed)
+def _good(scene: str, noise: str, tilts: str, size: int, method: str, seed: int) -> Cell:
+    made = independent_series(scene, noise, tilts, size=size, seed=seed)
+    volume, cell = _result(made.series, method, None)
+    return cell | {"psnr": _psnr(volume, made.truth)}
 
 
-def _good(phantom: str, noise: str, size: int, method: str, seed: int) -> Cell:
-    scene = _scene(phantom, noise, size, seed)
-    _, result, verdict = _result(scene.noisy, method, seed)
-    return _graded(verdict) | {"psnr": _psnr(result, scene.truth)}
-
-
-def _spoilt(phantom: str, noise: str, name: str, size: int, method: str, seed: int) -> Cell:
-    scene, other = _scene(phantom, noise, size, seed), _scene(phantom, noise, size, seed + _OTHER)
-    spoilt = spoil(scene, name, other=other, seed=seed + 5)
-    truth = scene.truth if spoilt.truth is None else spoilt.truth
+def _spoilt(way: str, scene: str, noise: str, tilts: str, size: int, method: str, seed: int) -> Cell:
+    made, other = (independent_series(scene, noise, tilts, size=size, seed=each) for each in (seed, seed + _OTHER))
+    if np.allclose(made.truth, other.truth):  # the scene has no random details
+        following = PHANTOMS[(PHANTOMS.index(scene) + 1) % len(PHANTOMS)]
+        other = independent_series(following, noise, tilts, size=size, seed=seed + _OTHER)
+    spoilt = spoil_independent(made, noise, way, other=other, seed=seed)
     try:
-        _, result, verdict = _result(spoilt.series, method, seed, spoilt.thickness)
+        volume, cell = _result(spoilt.series, method, spoilt.thickness)
     except ValueError as error:  # an error message is as good as a verdict
         return {"grade": "refused", "subjects": [], "reasons": [str(error)], "psnr": None}
-    return _graded(verdict) | {"psnr": _psnr(result, truth)}
+    return cell | {"psnr": _psnr(volume, made.truth if spoilt.truth is None else spoilt.truth)}
+
+
+def spoil_independent(made: IndependentSeries, noise: str, way: str, *, other: IndependentSeries, seed: int) -> Spoilt:
+    """An independent series with one of the defects in `WAYS`, before or after its noise."""
+    peak, late = float(made.clean.max()), WAYS[way].late
+    images = made.series if late else replace(made.series, images=made.clean.astype(np.float32))
+    truths = (each.truth.astype(np.float32) for each in (made, other))
+    found = WAYS[way].spoil(Source(next(truths), images, next(truths), peak, np.random.default_rng(seed + 5)))
+    spoilt = found if isinstance(found, Spoilt) else Spoilt(found)
+    if late:
+        return spoilt
+    clean = np.maximum(spoilt.series.images.astype(float) / peak, 0)
+    return replace(
+        spoilt, series=replace(spoilt.series, images=NOISES[noise](clean, np.random.default_rng(seed + 2))[0])
+    )
 
 
 def spoil(scene: Scene, name: str, *, other: Scene, seed: int) -> Spoilt:
@@ -103,62 +125,55 @@ def _made(make: Callable[[], Any] | None) -> str:
     return "" if make is None else repr(make())
 
 
-def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = None) -> Result:
+def _result(series: TiltSeries, method: str, thickness: int | None) -> tuple[np.ndarray[Any, Any], Cell]:
     """Screen, reconstruct and grade a series, as the command does."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         require_specimen(series)
         screening = screen(series)
         prepared = screening.passed(series)
-        result = reconstruct(prepared, VolumeGrid.of(prepared, thickness), method=method, seed=seed)
-        return prepared, result, judge(prepared, result, screening=screening)
+        grid = VolumeGrid.of(prepared, thickness)
+        result = reconstruct(prepared, grid, method=method, num_steps=STEPS.get(method), seed=0)
+        return result.volume.attenuation, graded(judge(prepared, result, screening=screening))
 
 
-def _graded(verdict: Verdict[Any]) -> Cell:
-    """Grade and reasons, and the evidence of every check, from which limits can be fitted without another run."""
-    found = {"grade": verdict.grade, "subjects": list(verdict.subjects), "reasons": list(verdict.reasons)}
-    return found | {"evidence": verdict.evidence, "not_tested": verdict.not_tested}
+def graded(verdict: Verdict[Any]) -> Cell:
+    """Grade and reasons, and value, error and tolerance of every check."""
+    evidence = {
+        name: [each[part] for part in ("value", "error", "tolerance")] for name, each in verdict.evidence.items()
+    }
+    return {"grade": verdict.grade, "subjects": list(verdict.subjects), "evidence": evidence} | {
+        "names": [finding.name for finding in verdict.findings]
+    }
 
 
-def _psnr(result: Any, truth: Any) -> float | None:
+def _psnr(volume: Any, truth: Any) -> float | None:
     """PSNR of the volume after matching gain and offset, because defects may change the units; None if shapes differ."""
-    volume = result.volume.attenuation
-    return compare(volume, truth, scaling="affine").psnr if volume.shape == truth.shape else None
+    return compare(volume, truth.astype(np.float32), scaling="affine").psnr if volume.shape == truth.shape else None
 
 
-def outcome(name: str, cell: Cell, unspoilt: float) -> str:
-    """Outcome of one defect: ``right``, ``named``, ``other reason`` or ``missed``."""
-    right = cell["psnr"] is not None and cell["psnr"] >= unspoilt - RIGHT
-    if cell["grade"] == "refused" or set(cell["subjects"][:2]) & set(WAYS[name].reasons):
-        return "named"
-    if right:
-        return "right"
-    return "missed" if cell["grade"] == "good" else "other reason"
+def outcome(way: str, cell: Cell, reference: float) -> tuple[str, float | None]:
+    """``right reason``, ``other reason``, ``harmless`` or ``missed``, and the loss in dB; None without a comparable volume."""
+    loss = None if cell["psnr"] is None else reference - cell["psnr"]
+    if cell["grade"] == "refused" or set(cell["subjects"][:1]) & set(WAYS[way].reasons):
+        return "right reason", loss
+    if cell["grade"] != "good":
+        return "other reason", loss
+    return "harmless" if loss is not None and loss < RIGHT else "missed", loss
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Table header and rows: every defect by scene, with counts in the last rows."""
-    scenes = sorted({key.split("/")[0] for key in cells} - {"good"})
-    rows: list[tuple[str, ...]] = []
-    counts: dict[str, int] = {}
-    for name in WAYS:
-        words = []
-        for scene in scenes:
-            cell, good = cells.get(f"{scene}/{name}"), cells.get(f"good/{scene}")
-            if cell is None or good is None:
-                words.append("")
-                continue
-            kind = outcome(name, cell, good["psnr"])
-            counts[kind] = counts.get(kind, 0) + 1
-            words.append(f"{kind} ({cell['grade']}: {', '.join(cell['subjects'][:2]) or 'no reason'})")
-        rows.append((name, *words))
-    return ("spoilt by", *scenes), rows + _counted(cells, counts, len(scenes))
-
-
-def _counted(cells: dict[str, Cell], counts: dict[str, int], width: int) -> list[tuple[str, ...]]:
-    good = {key: cell for key, cell in cells.items() if key.startswith("good/")}
-    alarms = [key.partition("/")[2] for key, cell in good.items() if cell["grade"] != "good"]
-    kinds: Sequence[str] = ("right", "named", "other reason", "missed")
-    summary = [(f"total {kind}", str(counts.get(kind, 0)), *[""] * (width - 1)) for kind in kinds]
-    words = f"{len(alarms)} of {len(good)}" + (f": {'; '.join(alarms)}" if alarms else "")
-    return [*summary, ("false alarms", words, *[""] * (width - 1))]
+    """Table header and rows: every way and its series, which half it belongs to, its loss, and its outcome."""
+    rows, judging = [], kept(WAYS)
+    for key, cell in cells.items():
+        kind, *names = key.split("/", 2)
+        if kind != "spoilt":
+            continue
+        way, name = names
+        found, loss = outcome(way, cell, cells[f"reference/{name}"]["psnr"])
+        half = "kept" if way in judging else "used"
+        cost = "" if loss is None else f"{loss:.1f}"
+        rows.append(
+            (way, name, half, cost, f"{found} ({cell['grade']}: {', '.join(cell['subjects'][:2]) or 'no reason'})")
+        )
+    return ("spoilt by", "series", "half", "loss (dB)", "outcome"), rows

@@ -5,14 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import noiseflow
+import recon
 from noiseflow.checks import Check
+from recon.report.verdict import effects_chart
+from recon.verdict.coarse import WIDTH
+from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
 
 PAGE = Path(__file__).parent / "api" / "generated" / "checks.md"
 ENGINES = {
-    "fact": "Facts of the files",
+    "fact": "Facts of the files and of the fit",
     "distortion": "Distortions",
-    "predictive": "Other statistics",
+    "predictive": "Statistics without a parameter",
 }
 
 
@@ -20,6 +25,15 @@ def write(*_: Any) -> None:
     """Write the page."""
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text(page(), encoding="utf-8")
+    draw(PAGE.with_suffix(".png"))
+
+
+def draw(path: Path) -> None:
+    """The effects of one series: the needle after too few iterations."""
+    data = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
+    series = recon.read_tilt_series(data, mode="linear")
+    verdict = judge(series, recon.reconstruct(series, method="sirt", num_steps=10))
+    effects_chart(verdict).savefig(path, dpi=110, bbox_inches="tight", facecolor="white")
 
 
 def page() -> str:
@@ -29,10 +43,19 @@ def page() -> str:
         "A verdict is a table. Each row states one assumption of the reconstruction, measures how far the data deviate from "
         "it, and compares the deviation with its standard error and with a tolerance. A row gives a reason if the deviation is "
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
-        "distortions of the images relative to the volume or to the other tilts; then statistics without a parameter. Within "
+        "distortions of the images relative to the other tilts; then statistics without a parameter. Within "
         "each group, the reason that exceeds its tolerance most comes first. The grade is *bad* if one of the reasons exceeds "
         "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. A check "
         "that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of every row.",
+        "![Effects of one series with error bars, in tolerances](checks.png)",
+        "*The shipped needle after 10 iterations of SIRT: each effect with two standard errors. One exceeds its tolerance: the "
+        "volume has not converged. Every report contains this picture for its own series.*",
+        f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "
+        "image is predicted by a linear fit to the other tilts; the rest is regressed on the effects of a shift, a rotation, a "
+        "magnification, another angle, brightness and background. Standard errors allow for correlated noise. Tolerances in "
+        f"coarse pixels are multiplied by the binning, which is 1 for images of {WIDTH} pixels.",
+        "**Replicates** are series that the given geometry explains: the linear fit, with its own residuals in random signs. "
+        "Statistics without a parameter, and other geometries, count by what they exceed those of the replicates.",
     ]
     for engine, title in ENGINES.items():
         rows = [_row(check) for check in CHECKS.values() if check.engine == engine]

@@ -1,93 +1,130 @@
-"""Writes the counts, the tables and the picture of docs/benchmarks/sabotage.md from stored results.
+"""Writes the counts, the table and the picture of docs/benchmarks/sabotage.md from stored results, or fits limits to them.
 
-noiseflow benchmark sabotage --size 48 --method l2 --out docs/benchmarks/results
-noiseflow benchmark sabotage --size 48 --in-turn --out docs/benchmarks/results
+noiseflow benchmark sabotage --size 48 --out docs/benchmarks/results
 python -m benchmarks.pages.sabotage
+python -m benchmarks.pages.sabotage limits
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.sabotage import table
+from benchmarks.sabotage import PHANTOMS, WAYS, kept, outcome, table
+from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure
+from recon.verdict.table import CHECKS
 
 PAGE = FOLDER / "sabotage.md"
-RESULTS = PAGE.parent / "results"
-TABLES = {"sabotage-48-l2-0-full.json": "table", "sabotage-48-joint-0-full.json": "joint table"}
+RESULTS = PAGE.parent / "results" / "sabotage-48-sirt-0-full.json"
+START, END = "<!-- table -->", "<!-- end of table -->"
+COSTLY = 1.0  # dB: smaller losses are those of another noise
+OUTCOMES = {"right reason": "#009E73", "other reason": "#E69F00", "missed": "#D55E00"}  # Okabe and Ito
+Cells = dict[str, Any]
 
 
-OUTCOMES = {"right": "#009E73", "named": "#56B4E9", "other reason": "#E69F00", "missed": "#D55E00"}  # Okabe and Ito
+def costly(cells: Cells, half: str) -> dict[str, int]:
+    """Number of faults of a half that cost more than a decibel, or leave no comparable volume, by outcome."""
+    counts = dict.fromkeys(OUTCOMES, 0)
+    for key, cell in cells.items():
+        kind, *names = key.split("/", 2)
+        if kind == "spoilt" and (names[0] in kept(WAYS)) == (half == "kept"):
+            found, loss = outcome(names[0], cell, cells[f"reference/{names[1]}"]["psnr"])
+            if loss is None or loss > COSTLY:
+                counts[found] += 1
+    return counts
 
 
-def totals(rows: list[tuple[str, ...]]) -> list[int]:
-    """Numbers of spoilt series by outcome, in the order of `OUTCOMES`."""
-    counts = {row[0]: row[1] for row in rows}
-    return [int(counts[f"total {kind}"]) for kind in OUTCOMES]
+def unspoilt(cells: Cells, half: str) -> Cells:
+    """Unspoilt series of the scenes of a half."""
+    scenes = kept(PHANTOMS) if half == "kept" else set(PHANTOMS) - kept(PHANTOMS)
+    return {key: cell for key, cell in cells.items() if key.startswith("good/") and key[5:].split(",")[0] in scenes}
 
 
-def counted(rows: list[tuple[str, ...]]) -> str:
-    """The counts at the end of a table, in a sentence."""
-    counts = {row[0]: row[1] for row in rows}
-    right, named, other, missed = totals(rows)
-    return (
-        f"Of {right + named + other + missed} spoilt series, {right} are reconstructed right and {named} are graded `doubtful` "
-        f"or `bad`, or refused, with the cause among the first two reasons; {other} are graded `doubtful` or `bad` for another "
-        f"reason, and {missed} are missed. False alarms among the good series: {counts['false alarms']}."
-    )
+def counted(cells: Cells, half: str) -> str:
+    """The counts of a half, as a row of a table."""
+    found, good = costly(cells, half), unspoilt(cells, half)
+    number = sum(found.values())
+    alarms = sum(cell["grade"] != "good" for cell in good.values())
+    seen = number - found["missed"]
+    shares = f"{seen} ({seen / number:.0%}) | {found['right reason']} ({found['right reason'] / number:.0%})"
+    return f"| {half} | {number} | {shares} | {alarms} of {len(good)} ({alarms / len(good):.0%}) |"
 
 
 def drawn(content: dict[str, Any]) -> str:
-    """Counts, table and origin of kept results; a way that spoilt one scene alone has that scene in a column of its own."""
-    header, rows = table(content["cells"])
-    ways = [row for row in rows if not row[0].startswith(("total", "false alarms")) and any(row[1:])]
-    if all(sum(map(bool, row[1:])) == 1 for row in ways):
-        scenes = [next(pair for pair in zip(header[1:], row[1:], strict=True) if pair[1]) for row in ways]
-        header, ways = (
-            ("spoilt by", "scene", "outcome"),
-            [(row[0], *pair) for row, pair in zip(ways, scenes, strict=True)],
+    """Counts, false alarms, table and origin of kept results."""
+    cells = content["cells"]
+    head = "| half | faults that cost more than 1 dB | not good | right reason first | false alarms |\n|---|---|---|---|---|"
+    alarms = [
+        f"- {key[5:]}: {', '.join(cell['names'])}"
+        for key, cell in cells.items()
+        if key.startswith("good/") and cell["names"]
+    ]
+    header, rows = table(cells)
+    lines = "\n".join(f"| {' | '.join(line)} |" for line in (header, ("---",) * len(header), *rows))
+    counts = "\n".join([head, *(counted(cells, half) for half in ("kept", "used"))])
+    return "\n\n".join([counts, "False alarms:", "\n".join(alarms) or "none", lines, measured_on([content])])
+
+
+def limits(cells: Cells) -> list[str]:
+    """The largest significant effect of each check in used unspoilt series, and how many ways it alone catches."""
+    good, rows = unspoilt(cells, "used").values(), []
+    fired = [
+        cell["names"] for key, cell in cells.items() if key.startswith("spoilt/") and len(cell.get("names", ())) == 1
+    ]
+    for name, check in CHECKS.items():
+        effects = [cell["evidence"][name] for cell in good if name in cell["evidence"]]
+        sizes = [abs(value - check.null) / tolerance for value, error, tolerance in effects
+                 if tolerance and abs(value - check.null) >= min(check.score, SIGNIFICANT) * (error or 0)]  # fmt: skip
+        rows.append(
+            f"{name:32s} {max(sizes, default=0):6.2f} tolerances; alone {sum(name in names for names in fired)}"
         )
-    lines = [header, ("---",) * len(header), *ways]
-    parts = [counted(rows), "\n".join(f"| {' | '.join(line)} |" for line in lines), measured_on([content])]
-    return "\n\n".join(parts)
+    return rows
 
 
-def draw(found: dict[str, list[int]]) -> None:
-    """One bar for each method of reconstruction, divided by outcome."""
+def draw(cells: Cells) -> None:
+    """One bar for each half, divided by outcome."""
     figure, axes = new_figure(1, width=9, height=1.9)
-    axis, hatches = axes[0, 0], ("", "//", "..", "xx")
-    for row, numbers in enumerate(found.values()):
-        start = 0.0
-        for number, (kind, colour), hatch in zip(numbers, OUTCOMES.items(), hatches, strict=True):
-            share = 100 * number / sum(numbers)
-            axis.barh(row, share, left=start, color=colour, hatch=hatch, edgecolor="white", label=None if row else kind)
+    axis, hatches = axes[0, 0], ("", "..", "xx")
+    for row, half in enumerate(("kept", "used")):
+        numbers, start = costly(cells, half), 0.0
+        for (kind, number), hatch in zip(numbers.items(), hatches, strict=True):
+            share = 100 * number / sum(numbers.values())
+            axis.barh(
+                row,
+                share,
+                left=start,
+                color=OUTCOMES[kind],
+                hatch=hatch,
+                edgecolor="white",
+                label=None if row else kind,
+            )
             axis.text(start + share / 2, row, str(number), ha="center", va="center", fontsize=9)
             start += share
-    axis.set(yticks=range(len(found)), yticklabels=list(found), xlabel="share of spoilt series (%)", xlim=(0, 100))
+    axis.set(yticks=(0, 1), yticklabels=("kept ways", "used ways"), xlim=(0, 100))
+    axis.set_xlabel("share of faults that cost more than 1 dB (%)")
     axis.invert_yaxis()
-    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncol=4, frameon=False, fontsize=9)
+    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncol=3, frameon=False, fontsize=9)
     with atomic_path(PAGE.with_suffix(".png")) as partial:
         figure.savefig(partial, format="png", dpi=110, facecolor="white")
 
 
-def main() -> None:
-    """Write the page and its picture."""
+def main(arguments: list[str]) -> None:
+    """Write the page and its picture, or print what limits would be."""
+    content = json.loads(RESULTS.read_text(encoding="utf-8"))
+    if arguments == ["limits"]:
+        print("\n".join(limits(content["cells"])))
+        return
     page = PAGE.read_text(encoding="utf-8")
-    found: dict[str, list[int]] = {}
-    for file, name in TABLES.items():
-        start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-        before, rest = page.split(start)
-        content = json.loads((RESULTS / file).read_text(encoding="utf-8"))
-        rows = table(content["cells"])[1]
-        found[f"{'joint fit' if name == 'joint table' else 'least squares'}, {sum(totals(rows))}"] = totals(rows)
-        page = before + "\n\n".join([start, drawn(content), end]) + rest.split(end)[1]
-    PAGE.write_text(page, encoding="utf-8")
-    draw(found)
+    PAGE.write_text(
+        page.split(START)[0] + "\n\n".join([START, drawn(content), END]) + page.split(END)[1], encoding="utf-8"
+    )
+    draw(content["cells"])
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

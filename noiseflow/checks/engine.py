@@ -79,9 +79,10 @@ class Check(Generic[Case]):
             effect,
             self.unit,
             tolerance,
-            min(cost, _BAD - 0.1) if self.local else cost,
+            cost,
             self.sentence.format(**effect._asdict()),
             self.advice,
+            self.local,
         )
 
 
@@ -90,7 +91,7 @@ class Finding:
     """The outcome of a check.
 
     Attributes:
-        name, reason, engine, unit, advice: those of the check.
+        name, reason, engine, unit, advice, local: those of the check.
         effect: what was measured.
         tolerance: in the unit of the effect.
         cost: size in tolerances, 0 if it is not significant; from 1 on, the check fires.
@@ -106,11 +107,12 @@ class Finding:
     cost: float
     sentence: str
     advice: str
+    local: bool = False
 
     @property
     def bad(self) -> bool:
         """Whether it spoils the whole result."""
-        return self.cost >= _BAD
+        return self.cost >= _BAD and not self.local
 
     def as_dict(self) -> dict[str, Any]:
         """For programs, and for limits that are fitted later."""

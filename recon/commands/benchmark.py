@@ -25,10 +25,7 @@ def benchmark(
     quick: Annotated[
         bool, typer.Option("--quick", help="Use a small scene and few settings; takes less than three minutes.")
     ] = False,
-    method: Annotated[str | None, typer.Option(help="Method of sabotage; joint by default, l2 with --quick.")] = None,
-    in_turn: Annotated[
-        bool, typer.Option("--in-turn", help="Sabotage one scene in each way instead of three, in a third of the time.")
-    ] = False,
+    method: Annotated[str | None, typer.Option(help="Method of sabotage; sirt by default.")] = None,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
     again: Annotated[str, typer.Option(help="Recompute stored results whose name contains this text.")] = "",
@@ -57,14 +54,12 @@ def benchmark(
         raise ValueError(f"{out} is a file; name a folder with --out")
     _check_scene(size, noise, phantom)
     _check_method(method, names)
-    if in_turn and (names != ["sabotage"] or quick):
-        raise ValueError("--in-turn is only for the benchmark sabotage without --quick")
     out.mkdir(parents=True, exist_ok=True)
     effort = QUICK if quick else replace(Effort(), repeats=repeats, budget=budget)
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method, in_turn)
+    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method)
     check_figures(names, options)
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})

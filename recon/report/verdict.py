@@ -41,8 +41,7 @@ def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeri
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
-    effects = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
-    report.figure(_effects(effects), caption=_EFFECTS)
+    report.figure(effects_chart(verdict), caption=_EFFECTS)
     residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)
     angles = residuals.tilt_angles
@@ -60,8 +59,9 @@ def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeri
     report.charts(charts, caption=caption)
 
 
-def _effects(effects: list[tuple[str, dict[str, Any]]]) -> Any:
-    """All effects with two standard errors, in their tolerances."""
+def effects_chart(verdict: Verdict[Any]) -> Any:
+    """All effects of a verdict with two standard errors, in their tolerances."""
+    effects = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
     figure, axis = new_chart("Effects and their tolerances", x="size of the effect, tolerances", y="")
     figure.set_size_inches(7, 0.16 * len(effects) + 0.8)
     places = np.arange(len(effects))[::-1]

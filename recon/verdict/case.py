@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import Effect, NotTested
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
+from noiseflow.statistics import robust_deviation
 from recon.series.alignment import Alignment
 from recon.series.contrast import explained, invert_contrast
 from recon.series.first_guess import contrast_slab
@@ -20,7 +22,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.expected import Result, expected_images
-from recon.verdict.gap_fit import Unexplained, unexplained
+from recon.verdict.gap_fit import Unexplained, shared, unexplained
 from recon.verdict.geometry import Geometry
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharp_integrals
@@ -34,6 +36,10 @@ FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 _VISIBLE = 8.0
 
+# robust deviations: isolated larger errors are spikes, which move no image
+_OUTLYING = 4.0
+# of the images: correct and inverted phantoms differ by at least 0.12
+OTHER_MODE = 0.05
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -75,14 +81,24 @@ class Case:
         return Residuals.of(self.series, self.expected)
 
     @cached_property
-    def distortions(self) -> dict[str, Distortion]:
-        """Distortions of the images relative to the volume."""
-        return distortions(self.residuals)
+    def left_out(self) -> Residuals:
+        """Coarse line integrals of the volume, and what each tilt differs from them by more than the other tilts predict.
 
-    @property
-    def edge(self) -> float:
-        """Pixels from the centre of the images to their edge."""
-        return float(self.residuals.images.shape[2]) / 2
+        The volume is subtracted before, so that what the method has not fitted yet is predicted by the others, not blamed on
+        the images.
+        """
+        coarse, (own, _) = self.coarse, self.own
+        errors = self.geometry.single.errors(self.misfit, coarse.used)
+        most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
+        errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
+        height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
+        images = (own + errors, own, errors, coarse.used)
+        return Residuals(*(each[order] for each in images), coarse.tilt_angles[order], height)
+
+    @cached_property
+    def distortions(self) -> dict[str, Distortion]:
+        """Distortions of each image relative to what the others predict."""
+        return distortions(self.left_out, pixel=self.coarse.binning)
 
     @cached_property
     def integrals(self) -> Array:
@@ -103,10 +119,13 @@ class Case:
     @cached_property
     def geometry(self) -> Geometry:
         """Predictions of held-out gaps of tilts."""
+        return Geometry(self.coarse)
+
+    @property
+    def misfit(self) -> Array:
+        """(tilt, y, u) coarse line integrals of the images minus those of the volume; zero where masked."""
         own, used = self.own
-        residual = (self.coarse.images - own) * used
-        sign = np.random.default_rng(0).choice([-1.0, 1.0], size=(*own.shape[:2], 1))
-        return Geometry(self.coarse, own + sign * residual)
+        return np.asarray((self.coarse.images - own) * used)
 
     @cached_property
     def own(self) -> tuple[Array, Array]:
@@ -128,21 +147,51 @@ class Case:
         """Unexplained structure of held-out gaps."""
         return unexplained(self.coarse.centred_on_all, self.geometry.errors)
 
+    def share(self, images: Array) -> float:
+        """Structure common to neighbouring rows of coarse images, relative to that of the series."""
+        flat = self.coarse.centred_on_all
+        return shared(images) / max(shared(flat), float(np.mean(flat**2)) / np.sqrt(flat.size), 1e-30)
+
+    @property
+    def noise(self) -> float:
+        """Power of what a linear fit leaves, relative to the structure."""
+        flat = self.coarse.centred_on_all
+        return float(np.mean(self.geometry.left**2)) / max(
+            shared(flat), float(np.mean(flat**2)) / np.sqrt(flat.size), 1e-30
+        )
+
     @cached_property
-    def own_gap(self) -> Unexplained:
-        """The same for the projections of the volume, which are consistent with each other."""
-        own, used = self.own
-        return unexplained((own - own[used].mean()) * used, self.geometry.fit.errors(own, used))
+    def gaps_of_replicates(self) -> Array:
+        """(replicate,) `share` of the errors of held-out gaps."""
+        fit, used = self.geometry.fit, self.coarse.used
+        return np.array([self.share(fit.errors(images, used)) for images in self.geometry.replicates])
 
 
 def inconsistent(case: Case) -> Effect:
-    """Unexplained share of the structure of held-out gaps, less that which noise may leave."""
-    return Effect(case.gap.share - 2 * case.gap.error)
+    """Unexplained share of the structure of held-out gaps beyond that of replicates."""
+    return beyond(case.gap.share, case.gaps_of_replicates)
 
 
 def tolerable(case: Case) -> float:
-    """The same for a correct volume: three times that of its own projections, and a share for what it cannot represent."""
-    return 3 * max(case.own_gap.share, 0.0) + 0.06
+    """As much as replicates leave, because they are smoother than the images, and a share for what no fit can represent."""
+    return max(float(case.gaps_of_replicates.mean()), 0.0) + 0.02
+
+
+def beyond(value: float, replicates: Array, what: str = "") -> Effect:
+    """A statistic above its mean over replicates, with the standard error of their difference."""
+    error = float(np.std(replicates, ddof=1)) * float(np.sqrt(1 + 1 / len(replicates)))
+    return Effect(max(0.0, value - float(np.mean(replicates))), error, what)
+
+
+def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Array], Array] | None = None) -> Effect:
+    """A statistic of the coarse images beyond that of replicates; `errors` predicts each of them from the others."""
+
+    def measured(images: Array) -> Effect:
+        coarse = replace(case.coarse, images=images)
+        return statistic(coarse) if errors is None else statistic(coarse, errors(images))
+
+    found = measured(case.coarse.images)
+    return beyond(found.value, np.array([measured(images).value for images in case.geometry.replicates]), found.what)
 
 
 def invisible(case: Case) -> Effect:
@@ -152,7 +201,8 @@ def invisible(case: Case) -> Effect:
 
 def beyond_the_sides(case: Case) -> Effect:
     """Signal at the sides relative to the mean, if held-out gaps are not explained well either."""
-    unexplained_too = inconsistent(case).value > 0.5 * tolerable(case)
+    found = inconsistent(case)
+    unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
     return Effect(case.other_geometries.edge if unexplained_too else 0.0)
 
 
@@ -160,10 +210,7 @@ def inverted(case: Case) -> Effect:
     """Share of the images that a coarse non-negative volume explains with inverted contrast, minus that as given."""
     small = coarse(case.series, height=16, width=32)
     as_given, swapped = explained(small), explained(invert_contrast(small))
-    other = "--mode transmission" if case.series.mode == "linear" else "--mode linear"
-    return Effect(
-        max(0.0, swapped - as_given), what=f"{max(as_given, 0):.0%} of the images, and {swapped:.0%}, give {other}"
-    )
+    return Effect(max(0.0, swapped - as_given), what=f"{max(as_given, 0):.0%} of the images, and {swapped:.0%}")
 
 
 def cut_off(case: Case) -> Effect:
@@ -186,24 +233,23 @@ def changing_size(case: Case) -> Effect:
     return Effect(found.change if found.found else 0.0, found.error, found.order)
 
 
-def too_smooth(case: Case) -> Effect:
-    """Coefficient of the fine structure that the projections lack, if noise is no reason to smooth it."""
-    if case.residuals.noise > case.residuals.contrast:
-        raise NotTested("the noise is stronger than the contrast")
-    return case.distortions["sharpness"].offset
+def unconverged(case: Case) -> Effect:
+    """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
+    if inverted(case).value > OTHER_MODE:
+        raise NotTested("no volume explains inverted contrast")
+    return Effect(max(0.0, case.share(case.misfit) - max(case.gap.share, 0.0)))
+
+
+def tolerable_convergence(case: Case) -> float:
+    """14 % of the contrast, and a fifth of the noise power, of which a volume without negative values makes a background."""
+    return 0.02 + 0.2 * case.noise
 
 
 def left_in_residuals(case: Case) -> Effect:
-    """Share of the structure of the images that is left in the residuals."""
-    return Effect(*case.residuals.unexplained())
-
-
-def tolerable_residual(case: Case) -> float:
-    """The same beyond chance, and beyond the contrast that a regulariser takes where noise is stronger than the contrast."""
-    noisy = case.residuals.noise > case.residuals.contrast
-    missing = max(0.0, case.residuals.missing) if noisy else 0.0
-    # three standard errors: noisy correct series of 24³ leave 0.069 ± 0.005
-    return 0.06 + 3 * left_in_residuals(case).error + (missing / (1 + missing)) ** 2
+    """Share of the structure of the images that no volume explains, beyond that of replicates."""
+    fit = case.geometry.fit
+    replicates = [case.share((images - fit.fitted(images)) * case.coarse.used) for images in case.geometry.replicates]
+    return beyond(case.share(case.misfit - fit.fitted(case.misfit)), np.array(replicates))
 
 
 def excluded(case: Case) -> Effect:
@@ -220,10 +266,6 @@ def beam_drift(case: Case) -> Effect:
     return Effect(case.screening.drift)
 
 
-def at_edge(pixels: float) -> Any:
-    """A tolerance for smooth shifts, rotations and magnifications: pixels in images of up to 48 pixels.
-
-    It is proportional to the width of larger images, because tilts sample their edge more coarsely, up to the limit of visible
-    blur.
-    """
-    return lambda case: max(pixels, min(0.5, pixels * case.edge / 24))
+def coarse_pixels(share: float) -> Callable[[Case], float]:
+    """A tolerance in coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image."""
+    return lambda case: share * case.coarse.binning

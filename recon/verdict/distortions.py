@@ -31,6 +31,8 @@ NAMES = (
 _TWIN = 0.02
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
+# pixels: detectors correlate neighbours
+_TILE = 4
 # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
 _DEGREE = 5
 
@@ -40,45 +42,49 @@ class Distortion:
     """One type of distortion over all tilts, in pixels (at the image edge), or as a share of the contrast.
 
     Attributes:
-        spread: rms over the inner tilts, without the mean and the expected random part.
         drift: rms of its smooth part over the tilts.
         jitter: standard deviation around its smooth part without the expected random part; robust to outliers.
         offset: mean over all tilts.
         values: (tilt,) measured values.
     """
 
-    spread: Effect
     drift: Effect
     jitter: Effect
     offset: Effect
     values: Array
 
 
-def distortions(residuals: Residuals) -> dict[str, Distortion]:
+def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distortion]:
     """Regress each residual on the effects of small distortions of its image, with robust standard errors.
 
-    The standard errors are White's (doi:10.2307/1912934), which do not require Gaussian or homoscedastic noise. Fitted volumes
-    absorb a part of each distortion, so the result is a lower bound. Tilts at the ends of the range are measured but not
-    included, because there a regularised volume has neighbours on one side only, and its projection lags behind the image.
+    The standard errors are those of clusters, which are tiles of the image (doi:10.1080/07350015.2011.623093); they require
+    neither Gaussian nor homoscedastic nor uncorrelated noise. Fitted volumes absorb a part of each distortion, so the result is
+    a lower bound; residuals of left-out tilts have none of it. Tilts at the ends of the range are measured
+    but not included, because there a volume has neighbours on one side only, and its projection lags behind the image.
+
+    Args:
+        residuals: images and what is left of them.
+        pixel: size of their pixels, detector pixels.
     """
     found = [_of_tilt(*pair) for pair in _fields(residuals)]
     estimates, errors = zip(*found, strict=True)
-    units = _units(residuals)
+    units = _units(residuals, pixel)
     return {
         name: _over_tilts(np.array(estimates)[:, number] * unit, np.array(errors)[:, number] * unit, residuals)
         for number, (name, unit) in enumerate(zip(NAMES, units, strict=True))
     }
 
 
-def _units(residuals: Residuals) -> tuple[float, ...]:
+def _units(residuals: Residuals, pixel: float) -> tuple[float, ...]:
     """Factors from coefficients to pixels at the image edge, or to shares of the contrast."""
-    edge = residuals.images.shape[2] / 2
-    return 1.0, 1.0, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30), 1.0, 1.0
+    edge = pixel * residuals.images.shape[2] / 2
+    return pixel, pixel, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30), 1.0, 1.0
 
 
-def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
-    """Yield the columns and the target of the regression for each tilt."""
-    width = residuals.images.shape[2]
+def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield the columns and the target of the regression, and the number of each pixel's tile, for each tilt."""
+    height, width = residuals.images.shape[1:]
+    tiles = np.add.outer(np.arange(height) // _TILE * width, np.arange(width) // _TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
     by_angle = _slope_over_tilts(residuals)
@@ -90,7 +96,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array]]:
         brightness = image - image.mean()
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
         parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent]
-        yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64)
+        yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
 
 
 def _slope_over_tilts(residuals: Residuals) -> Array:
@@ -101,14 +107,15 @@ def _slope_over_tilts(residuals: Residuals) -> Array:
     return np.asarray(np.gradient(residuals.projections[first], np.deg2rad(angles), axis=0)[back])
 
 
-def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
+def _of_tilt(columns: Array, residual: Array, tiles: Array) -> tuple[Array, Array]:
     """Coefficients and their standard errors; undetermined coefficients have infinite errors."""
     scale = np.sqrt((columns**2).sum(0)) + 1e-30
     scaled = columns / scale
     inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))
     found = inverse @ (scaled.T @ residual)
     left = scaled * (residual - scaled @ found)[:, None]
-    variance: Array = np.diag(inverse @ (left.T @ left) @ inverse)
+    sums = np.stack([np.bincount(tiles, each) for each in left.T], 1)
+    variance: Array = np.diag(inverse @ (sums.T @ sums) @ inverse)
     return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
 
 
@@ -133,9 +140,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distort
     smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
     left, random = robust_deviation(values - basis @ curve, 0.0), errors**2
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(random)))))
-    size = float(np.sqrt(max(0.0, np.mean(away**2 - random))))
     return Distortion(
-        Effect(size, size / scatter),
         Effect(smooth, smooth / trend),
         Effect(rough, rough / scatter),
         Effect(mean, float(1 / np.sqrt(weights.sum()))),

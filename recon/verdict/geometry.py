@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,10 @@ from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
-_SINGLE = 0.3  # smoothness for single held-out tilts; with less, noise would hide inconsistent tilts
+# the standard error of their standard deviation is a quarter
+_REPLICATES = 8
+# share of the degrees of freedom, if a fit has nearly as many parameters as data
+_LEAST_FREE = 0.1
 _TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
 # pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
 _LIKE_A_TURN = 0.211
@@ -35,22 +38,43 @@ class Geometry:
 
     Attributes:
         coarse: the series.
-        replicate: (tilt, y, u) the volume's own projections with the residuals in random signs: a series of the given geometry.
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
+        left: (tilt, y, u) residuals of that fit to all tilts.
+        replicates: series (tilt, y, u) of the given geometry, drawn from this fit.
     """
 
-    def __init__(self, coarse: Coarse, replicate: Array) -> None:
-        self.coarse, self.replicate = coarse, replicate
+    def __init__(self, coarse: Coarse) -> None:
+        self.coarse = coarse
         self.smoothness = min(_SMOOTHNESS, key=lambda each: float(np.mean(self._errors(self._fit(each)) ** 2)))
         self.fit = self._fit(self.smoothness)
         self.errors = self._errors(self.fit)
+        flat = coarse.centred_on_all
+        self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    def single_errors(self) -> Array:
-        """(tilt, y, u) errors of the smoothest fit when single angles are held out and predicted by their neighbours."""
+    @cached_property
+    def single(self) -> GapFit:
+        """The fit that holds out single angles, which their neighbours predict."""
         directions = self.coarse.directions
         each = directions.span / len(np.unique(np.round(directions.angles, 3)))
-        return self._errors(self._fit(_SINGLE, gap=each))
+        return self._fit(self.smoothness, gap=each)
+
+    def single_errors(self, images: Array) -> Array:
+        """(tilt, y, u) errors of single angles of any images."""
+        return self.single.errors(images, self.coarse.used)
+
+    @cached_property
+    def replicates(self) -> list[Array]:
+        """The fit with its residuals in random signs, the same along rows, in which most detectors correlate their noise.
+
+        Residuals are smaller than the noise by the degrees of freedom of the fit.
+        """
+        count, height, width = self.left.shape
+        free = 1 - float((self.fit.half**2).sum()) / (count * width)
+        noise = self.left / np.sqrt(max(free, _LEAST_FREE))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
+        fitted = self.fit.fitted(self.coarse.centred_on_all)
+        return [(fitted + sign * noise) * self.coarse.used for sign in signs]
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
@@ -135,18 +159,18 @@ class Geometry:
         for part in (first, ~first):
             fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
             errors[part] = fit.errors(self.coarse.images[part], used)
-            expected[part] = fit.errors(self.replicate[part], used)
+            expected[part] = fit.errors(self.replicates[0][part], used)
         return self._beyond_expected(errors, expected, name)
 
     def _with(self, what: str, **changes: Any) -> Effect:
         fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(self.replicate, self.coarse.used), what)
+        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
         any volume smoother, which predicts some objects better."""
         gain = self._gain(errors, self.errors, what)
-        chance = self._gain(expected, self.fit.errors(self.replicate, self.coarse.used), what)
+        chance = self._gain(expected, self.fit.errors(self.replicates[0], self.coarse.used), what)
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:

@@ -126,13 +126,17 @@ def streaks(residuals: Residuals) -> Effect:
 
 
 def borders(residuals: Residuals) -> Effect:
-    """Share of images with borders of a constant value, unlike the adjacent pixels, as left by an alignment."""
+    """Share of images with borders of a constant value, unlike the adjacent pixels, as left by an alignment.
+
+    Empty borders without noise are no fault: there the volume predicts that value.
+    """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
-    sides = seen.transpose(0, 2, 1), seen.transpose(0, 2, 1)[:, ::-1]  # (tilt, lines from the side, pixels along it)
-    return Effect(float((np.mean([_filled(side, span) for side in sides], axis=0) > 0).mean()))
+    stacks = seen.transpose(0, 2, 1), residuals.projections.transpose(0, 2, 1)  # (tilt, lines from the side, along it)
+    filled = [_filled(*(stack[:, ::step] for stack in stacks), span) for step in (1, -1)]
+    return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 
 
-def _filled(lines: Array, span: float) -> Array:
+def _filled(lines: Array, expected: Array, span: float) -> Array:
     """(tilt,) number of leading lines with a constant value that differs clearly from the next line, and that counts in an image
     mostly without electrons would not have by chance."""
     flat = (lines.max(2) == lines.min(2)) & (lines[:, :, 0] == lines[:, :1, 0])
@@ -140,7 +144,8 @@ def _filled(lines: Array, span: float) -> Array:
     flat &= (alike ** lines.shape[2] < _CHANCE)[:, None]
     count = np.argmin(flat, axis=1)
     after = lines[np.arange(len(lines)), count].mean(1)
-    return np.where(np.abs(after - lines[:, 0, 0]) > _STEP * span, count, 0)
+    unlike = np.abs(expected[:, 0].mean(1) - lines[:, 0, 0])
+    return np.where(np.minimum(np.abs(after - lines[:, 0, 0]), 2 * unlike) > _STEP * span, count, 0)
 
 
 def seam(residuals: Residuals) -> Effect:

@@ -59,12 +59,6 @@ class Residuals:
         """Standard deviation of the residual."""
         return float(self.residual[self.used].std())
 
-    @property
-    def missing(self) -> float:
-        """Share of the contrast that the projections lack: the coefficient of the residual on them."""
-        centred = (self.projections - self.projections.mean((1, 2), keepdims=True)) * self.used
-        return float((self.residual * centred).sum() / max(float((centred**2).sum()), 1e-30))
-
     def blocks(self, size: int) -> Array:
         """(tilt, y, u) means of blocks of residuals."""
         return np.stack([block_mean(each, size, size) for each in self.residual])

@@ -38,8 +38,8 @@ def test_a_stretch_across_the_axis_is_no_shift_along_it(first_row: float) -> Non
     """Slices far from the middle of the images are judged about their own middle."""
     found = distortions(seen(np.linspace(-1, 1, TILTS), first_row=first_row))
     assert found["magnification"].drift.value > 0.2
-    assert found["shift along y"].spread.value < 0.1
-    assert found["shift across"].spread.value < 0.1
+    assert found["shift along y"].jitter.value < 0.1
+    assert found["shift across"].jitter.value < 0.1
 
 
 def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
@@ -48,7 +48,7 @@ def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
     ends[[0, -1]] = -6, 6
     found, calm = (distortions(seen(change))["magnification"] for change in (ends, 0 * ends))
     assert abs(found.values[0]) > 20 * abs(calm.values).max()
-    assert found.spread == calm.spread
+    assert found.jitter == calm.jitter
     assert found.drift == calm.drift
 
 
@@ -69,4 +69,15 @@ def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int,
     row = CHECKS["axis off the middle"]
     found = distortions(residuals)["shift across"].offset
     assert found.value == pytest.approx(0.3, abs=0.03)
-    assert (found.value > row.tolerance(SimpleNamespace(edge=width / 2))) == told
+    assert (found.value > row.tolerance(SimpleNamespace(coarse=SimpleNamespace(binning=width // 32)))) == told
+
+
+def test_errors_of_correlated_noise_are_those_of_repetitions() -> None:
+    generator = np.random.default_rng(0)
+    images = gaussian_filter(generator.normal(size=(TILTS, ROWS, WIDTH)), (4, 3, 3))
+    noise = gaussian_filter(generator.normal(size=images.shape), (0, 0.8, 0.8))
+    used, height = np.ones(images.shape, bool), np.arange(ROWS)
+    found = distortions(Residuals(images + noise, images, noise, used, np.linspace(-60, 60, TILTS), height), pixel=2.0)
+    assert abs(found["shift across"].offset.value) < 3 * found["shift across"].offset.error
+    scatter = found["shift across"].values.std() / np.sqrt(TILTS - 2)
+    assert found["shift across"].offset.error == pytest.approx(scatter, rel=0.3)

@@ -11,6 +11,7 @@ import pytest
 from scipy import ndimage
 
 from benchmarks.defects import WAYS, Spoilt
+from benchmarks.needle import load
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import make_scene
 from noiseflow.checks import Finding, Verdict
@@ -21,6 +22,7 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict.gap_fit import GapFit, unexplained
 from recon.verdict.judge import judge
 from recon.verdict.residuals import Residuals
+from tests.independent_scenes import independent_series
 
 TILTS = "-60:60:3"
 
@@ -224,7 +226,6 @@ def test_the_true_reason_stands_among_the_first_two(name: str) -> None:
 @pytest.mark.usefixtures("one_thread")
 def test_what_sirt_leaves_is_no_background_that_moves() -> None:
     verdict = judged(make_scene(48, phantom="filaments", noise="8-bit", tilts=TILTS).noisy, method="sirt")
-    assert "residuals" in verdict.subjects
     assert "beam" not in verdict.subjects, verdict.reasons
 
 
@@ -256,7 +257,23 @@ def test_contrast_that_a_regulariser_takes_is_excused_by_strong_noise_alone(nois
     drawn = np.random.default_rng(4).normal(0, noise * clean.std(), clean.shape).astype(np.float32)
     series = replace(made.clean, images=clean + drawn)
     verdict = judge(series, Told(Volume(made.truth.astype(np.float32)), weak))
-    assert ("residuals" in verdict.subjects) == named
+    assert ("convergence" in verdict.subjects) == named
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(("steps", "subjects"), [(10, ("convergence",)), (40, ())])
+def test_too_few_steps_come_before_geometry(steps: int, subjects: tuple[str, ...]) -> None:
+    series = load()
+    result = reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=steps)
+    assert judge(series, result).subjects == subjects
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("noise", ["Poisson 2", "scan noise", "detector blur"])
+def test_unspoilt_independent_series_are_good(noise: str) -> None:
+    series = independent_series("off_axis", noise, "±60°/2°").series
+    verdict = judge(series, reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20))
+    assert verdict.grade == "good", verdict.reasons
 
 
 @pytest.mark.usefixtures("one_thread")
