@@ -19,13 +19,14 @@ from benchmarks import rarer_defects  # noqa: F401  (registers its ways, after t
 from benchmarks.defects import WAYS, Source, Spoilt
 from benchmarks.needle import load
 from benchmarks.scenes import Cell, Results, Scene
-from noiseflow.checks import Verdict
+from noiseflow.checks import Effect, Verdict, grade, ranked
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import compare
 from recon.series.screening import require_specimen, screen
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, draw_noise, stored_type
 from recon.verdict.judge import judge
+from recon.verdict.table import CHECKS
 from tests.independent_scenes import NOISES, RANGES, SCENES, IndependentSeries, independent_series
 
 RIGHT = 0.3  # dB below the series without defects
@@ -145,6 +146,23 @@ def graded(verdict: Verdict[Any]) -> Cell:
     return {"grade": verdict.grade, "subjects": list(verdict.subjects), "evidence": evidence} | {
         "names": [finding.name for finding in verdict.findings]
     }
+
+
+def regraded(cell: Cell) -> Cell:
+    """The cell as the present table of checks grades its evidence; tolerances that depend on the series are those stored."""
+    if "evidence" not in cell:
+        return cell
+    findings = [
+        CHECKS[name].of(
+            Effect(value or 0.0, np.inf if error is None else error),
+            tolerance if callable(CHECKS[name].tolerance) else CHECKS[name].tolerance,
+        )
+        for name, (value, error, tolerance) in cell["evidence"].items()
+        if name in CHECKS
+    ]
+    first = ranked(sorted(findings, key=lambda finding: list(CHECKS).index(finding.name)))
+    names, subjects = [finding.name for finding in first], [finding.reason for finding in first]
+    return cell | {"grade": grade(first), "names": names, "subjects": subjects}
 
 
 def _psnr(volume: Any, truth: Any) -> float | None:

@@ -67,8 +67,10 @@ class Check(Generic[Case]):
 
     def finding(self, case: Case) -> Finding:
         """Measure a case."""
-        effect = self.measure(case)
-        tolerance = self.tolerance(case) if callable(self.tolerance) else self.tolerance
+        return self.of(self.measure(case), self.tolerance(case) if callable(self.tolerance) else self.tolerance)
+
+    def of(self, effect: Effect, tolerance: float) -> Finding:
+        """The finding from what was measured."""
         size = abs(effect.value - self.null)
         cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
         cost = cost if size >= self.score * effect.error else 0.0

@@ -230,13 +230,6 @@ DISTORTIONS: tuple[Row, ...] = (
         lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure", 0.75,
         "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
         "exclude the blurred tilts, or blur all tilts equally", local=True),
-    # typical deviations, up to 4.1 in correct series
-    Row("single tilts", "tilts", "distortion", lambda case: cases.of_tilts(tilts.single, case, case.geometry.single_errors), "",
-        6.0, "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
-        "check its angle, or exclude it", local=True),
-    Row("tilts unlike the others", "tilts", "distortion", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
-        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
-        "check these images and their angles, or exclude them"),
     # line integral at the sides relative to the mean
     Row("field of view", "field", "distortion", cases.beyond_the_sides, "of the mean signal", 0.4,
         "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
@@ -251,6 +244,13 @@ DISTORTIONS: tuple[Row, ...] = (
 )
 
 PREDICTIVE: tuple[Row, ...] = (
+    # typical deviations, up to 4.1 in correct series
+    Row("single tilts", "tilts", "predictive", lambda case: cases.of_tilts(tilts.single, case, case.geometry.single_errors), "",
+        6.0, "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
+        "check its angle, or exclude it", local=True),
+    Row("tilts unlike the others", "tilts", "predictive", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+        "check these images and their angles, or exclude them"),
     # correct series have 0.42
     Row("break of the series", "specimen", "predictive", lambda case: tilts.broken(case.coarse), "of the structure", 0.5,
         "the images {what} do not match at the border: the specimen changed",
