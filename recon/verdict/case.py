@@ -92,8 +92,8 @@ class Case:
         most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
         errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
         height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
-        images = (own + errors, own, errors, coarse.used)
-        return Residuals(*(each[order] for each in images), coarse.tilt_angles[order], height)
+        images, own, errors, used = (each[order] for each in (own + errors, own, errors, coarse.used))
+        return Residuals(images, own, errors, used, coarse.tilt_angles[order], height)
 
     @cached_property
     def distortions(self) -> dict[str, Distortion]:
@@ -149,16 +149,18 @@ class Case:
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""
+        return shared(images) / self.structure
+
+    @cached_property
+    def structure(self) -> float:
+        """Structure common to neighbouring rows of the coarse series, at least that of noise by chance."""
         flat = self.coarse.centred_on_all
-        return shared(images) / max(shared(flat), float(np.mean(flat**2)) / np.sqrt(flat.size), 1e-30)
+        return max(shared(flat), float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
 
     @property
     def noise(self) -> float:
         """Power of what a linear fit leaves, relative to the structure."""
-        flat = self.coarse.centred_on_all
-        return float(np.mean(self.geometry.left**2)) / max(
-            shared(flat), float(np.mean(flat**2)) / np.sqrt(flat.size), 1e-30
-        )
+        return float(np.mean(self.geometry.left**2)) / self.structure
 
     @cached_property
     def gaps_of_replicates(self) -> Array:

@@ -14,7 +14,7 @@ from recon.verdict import fits, pixels, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
 from recon.verdict.response import bent_response
 
-# coarse pixels, of which the field of view has about thirty; 60 independent correct series have at most half of each
+# coarse pixels, of which the field of view has about thirty; in correct series at most 0.8 of each is significant
 SHIFT, SMOOTH_SHIFT, OFF_MIDDLE = 0.25, 0.1, 0.06
 # the same at the edge of the images
 EDGE, SMOOTH_EDGE, ROTATION, ANGLE = 0.5, 0.2, 0.04, 0.6
