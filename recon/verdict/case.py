@@ -239,7 +239,9 @@ def unconverged(case: Case) -> Effect:
     """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
     if inverted(case).value > OTHER_MODE:
         raise NotTested("no volume explains inverted contrast")
-    return Effect(max(0.0, case.share(case.misfit) - max(case.gap.share, 0.0)))
+    used, misfit = case.coarse.used, case.misfit
+    left = (misfit - misfit[used].mean()) * used  # an offset is no structure
+    return Effect(max(0.0, case.share(left) - max(case.gap.share, 0.0)))
 
 
 def tolerable_convergence(case: Case) -> float:

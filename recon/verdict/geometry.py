@@ -27,6 +27,8 @@ _TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
 # pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
 _LIKE_A_TURN = 0.211
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
+# coarse pixels: half a pixel is resolved, and larger ones gain more
+_OFFSETS = (-3.0, -1.0, 1.0, 3.0)
 # share of used neighbours of an interpolated pixel
 _SEEN = 0.99
 # degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
@@ -139,6 +141,14 @@ class Geometry:
         angles = self.coarse.tilt_angles
         scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
         return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
+
+    def middle(self) -> Effect:
+        """The best other position of the tilt axis across the images."""
+        coarse = self.coarse
+        return _best(
+            self._with(f"{size * coarse.binning:+g} pixels", detector_offset=coarse.detector_offset + size)
+            for size in _OFFSETS
+        )
 
     def thicker(self) -> Effect:
         """A volume with a depth equal to the width, if it is thinner."""

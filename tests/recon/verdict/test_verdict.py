@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
@@ -19,9 +18,11 @@ from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.verdict.case import Case
 from recon.verdict.gap_fit import GapFit, unexplained
 from recon.verdict.judge import judge
 from recon.verdict.residuals import Residuals
+from recon.verdict.table import CHECKS
 from tests.independent_scenes import independent_series
 
 TILTS = "-60:60:3"
@@ -239,13 +240,15 @@ def test_projections_moved_by_a_pixel_are_seen() -> None:
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_an_axis_off_the_middle_counts_from_an_eighth_of_a_pixel_on() -> None:
+def test_an_axis_off_the_middle_explains_the_images_worse() -> None:
     series, told = oracle()
-    grades = {}
-    for off in (0.08, 0.3):
-        moved = ndimage.shift(told.projections, (0, 0, off), order=1, mode="nearest")
-        grades[off] = judge(series, replace(told, projections=moved)).subjects
-    assert grades == {0.08: (), 0.3: ("alignment",)}
+    gains = []
+    for off in (0, 3):
+        moved, shown = (np.roll(images, off, axis=2) for images in (series.images, told.projections))
+        case = Case(replace(series, images=moved), replace(told, projections=shown))
+        gains.append(CHECKS["axis off the middle"].finding(case))
+    assert [finding.cost >= 1 for finding in gains] == [False, True]
+    assert gains[1].effect.what == "+3 pixels"
 
 
 @pytest.mark.usefixtures("one_thread")
