@@ -19,6 +19,8 @@ from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
+# smoothness for single held-out tilts; with less, noise would hide inconsistent tilts
+_SINGLE = 0.3
 # the standard error of their standard deviation is a quarter
 _REPLICATES = 8
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
@@ -57,13 +59,21 @@ class Geometry:
     @cached_property
     def single(self) -> GapFit:
         """The fit that holds out single angles, which their neighbours predict."""
+        return self._fit(self.smoothness, gap=self._step)
+
+    @cached_property
+    def _smooth(self) -> GapFit:
+        return self._fit(_SINGLE, gap=self._step)
+
+    @property
+    def _step(self) -> float:
+        """Degrees from one angle to the next."""
         directions = self.coarse.directions
-        each = directions.span / len(np.unique(np.round(directions.angles, 3)))
-        return self._fit(self.smoothness, gap=each)
+        return directions.span / len(np.unique(np.round(directions.angles, 3)))
 
     def single_errors(self, images: Array) -> Array:
-        """(tilt, y, u) errors of single angles of any images."""
-        return self.single.errors(images, self.coarse.used)
+        """(tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
+        return self._smooth.errors(images, self.coarse.used)
 
     @cached_property
     def replicates(self) -> list[Array]:
@@ -75,6 +85,7 @@ class Geometry:
         free = 1 - float((self.fit.half**2).sum()) / (count * width)
         noise = self.left / np.sqrt(max(free, _LEAST_FREE))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
+        signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
         return [(fitted + sign * noise) * self.coarse.used for sign in signs]
 
