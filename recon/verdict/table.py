@@ -245,16 +245,16 @@ DISTORTIONS: tuple[Row, ...] = (
 
 PREDICTIVE: tuple[Row, ...] = (
     # typical deviations, up to 4.1 in correct series
-    Row("single tilts", "tilts", "predictive", lambda case: cases.of_tilts(tilts.single, case, case.geometry.single_errors), "",
+    Row("single tilts", "tilts", "distortion", lambda case: cases.of_tilts(tilts.single, case, case.geometry.single_errors), "",
         6.0, "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
         "check its angle, or exclude it", local=True),
+    # correct series have 0.42
+    Row("break of the series", "specimen", "distortion", lambda case: tilts.broken(case.coarse), "of the structure", 0.5,
+        "the images {what} do not match at the border: the specimen changed",
+        "reconstruct both parts separately, or check whether one of them was flipped", local=True),
     Row("tilts unlike the others", "tilts", "predictive", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
         "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
         "check these images and their angles, or exclude them"),
-    # correct series have 0.42
-    Row("break of the series", "specimen", "predictive", lambda case: tilts.broken(case.coarse), "of the structure", 0.5,
-        "the images {what} do not match at the border: the specimen changed",
-        "reconstruct both parts separately, or check whether one of them was flipped", local=True),
     # relative to the change between surrounding tilts, 0.9 in correct series
     Row("changes between tilts", "angles", "predictive", lambda case: cases.of_tilts(tilts.jumps, case), "", 3.0,
         "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong order "
