@@ -150,6 +150,10 @@ FACTS: tuple[Row, ...] = (
     Row("convergence", "convergence", "fact", cases.unconverged, "of the structure", cases.tolerable_convergence,
         "the volume leaves {value:.0%} more of the structure of its images than a linear fit of images that it has not seen",
         "use more iterations (--steps), or a smaller --weight"),
+    # a fact, because distortions of foreign images mean nothing
+    Row("tilts unlike the others", "tilts", "fact", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+        "check these images and their angles, or exclude them"),
 )
 
 DISTORTIONS: tuple[Row, ...] = (
@@ -241,9 +245,6 @@ DISTORTIONS: tuple[Row, ...] = (
         lambda case: 0.03 * (1 + case.noise),
         "all residuals contain the same smooth structure, {value:.1%} of that of the images, at every tilt",
         "correct the images with flats and darks, or for uneven illumination", score=15.0, local=True),
-)
-
-PREDICTIVE: tuple[Row, ...] = (
     # typical deviations beyond replicates; correct series have up to 4.5, and one standard error
     Row("single tilts", "tilts", "distortion", lambda case: cases.of_tilts(tilts.single, case, case.geometry.single_errors), "",
         5.0, "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
@@ -252,9 +253,14 @@ PREDICTIVE: tuple[Row, ...] = (
     Row("break of the series", "specimen", "distortion", lambda case: tilts.broken(case.coarse), "of the structure", 0.5,
         "the images {what} do not match at the border: the specimen changed",
         "reconstruct both parts separately, or check whether one of them was flipped", local=True),
-    Row("tilts unlike the others", "tilts", "predictive", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
-        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
-        "check these images and their angles, or exclude them"),
+    # shifted objects have at most 0.6
+    Row("moving background", "beam", "distortion",
+        lambda case: pixels.moving_background(case.residuals) if _left(case) else Effect(0.0), "of the residuals", 0.65,
+        "{value:.0%} of the structure common to the residuals is smooth and differs between tilts: the background moves",
+        "subtract the background of each image first", local=True),
+)
+
+PREDICTIVE: tuple[Row, ...] = (
     # relative to the change between surrounding tilts, 0.9 in correct series
     Row("changes between tilts", "angles", "predictive", lambda case: cases.of_tilts(tilts.jumps, case), "", 3.0,
         "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong order "
@@ -267,11 +273,6 @@ PREDICTIVE: tuple[Row, ...] = (
         lambda case: fits.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "", 0.5,
         "held-out pixels prefer a weight of the regulariser {what}",
         "compare with --method l2, and align the series", local=True),
-    # shifted objects have at most 0.6
-    Row("moving background", "beam", "predictive",
-        lambda case: pixels.moving_background(case.residuals) if _left(case) else Effect(0.0), "of the residuals", 0.65,
-        "{value:.0%} of the structure common to the residuals is smooth and differs between tilts: the background moves",
-        "subtract the background of each image first", local=True),
     Row("structure of the residuals", "residuals", "predictive", cases.left_in_residuals, "of the structure",
         RESIDUAL, "no volume explains {value:.1%} of the structure of the images",
         "look for the moving part in the residuals of the report"),

@@ -66,7 +66,7 @@ def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int,
         np.linspace(-60, 60, TILTS),
         np.arange(ROWS),
     )
-    row = CHECKS["axis off the middle"]
+    row = CHECKS["drift across the axis"]
     found = distortions(residuals)["shift across"].offset
     assert found.value == pytest.approx(0.3, abs=0.03)
     assert (found.value > row.tolerance(SimpleNamespace(coarse=SimpleNamespace(binning=width // 32)))) == told
