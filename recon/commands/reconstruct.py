@@ -24,10 +24,7 @@ from recon.commands.running import (
     require_blocks,
     warnings_as_lines,
 )
-from recon.fields._names import DEFAULT as FIELD
-from recon.fields._names import field_names
-from recon.fields.regularisers._names import DEFAULT, regulariser_names
-from recon.methods._names import method_names
+from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 
 @option_groups(
@@ -116,13 +113,15 @@ def reconstruct(
     ] = None,
     regulariser: Annotated[
         str | None,
-        typer.Option(help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {DEFAULT} by default."),
+        typer.Option(
+            help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default."
+        ),
     ] = None,
     field: Annotated[
         str | None,
         typer.Option(
             help=f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
-            f"{FIELD} by default."
+            f"{FIELDS.first} by default."
         ),
     ] = None,
     uncertainty: Annotated[

@@ -15,14 +15,14 @@ from torch import nn
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
-from noiseflow.plugins import provided
 from noiseflow.progress import Progress
 from recon.fields._registry import field_kinds
-from recon.fields.regularisers._registry import find_regulariser
+from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
-from recon.methods._names import GROUP, method_names
+from recon.names import METHODS
+from recon.names import method_names as method_names
 from recon.projection.defocused_projector import KERNELS
 from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
@@ -175,9 +175,7 @@ def find_method(name: str) -> Method:
     Raises:
         ValueError: the name is unknown.
     """
-    if name not in method_names():
-        raise ValueError(f"--method {name}: choose one of {', '.join(method_names())}")
-    found = provided(name, "recon.methods", GROUP, "METHOD")
+    found = METHODS.find(name)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; it must be a recon.methods.Method")
     return found

@@ -26,9 +26,10 @@ class Holdout:
         groups: (tilt,) number of the group of each tilt.
 
     Example:
+        >>> import numpy as np
         >>> from recon.series.holdout import Holdout
-        >>> Holdout.gaps(np.arange(-60, 61, 10.0)).groups
-        array([0, 0, 0, 1, 1, 2, 3, 4, 5, 5, 6, 7, 9])
+        >>> Holdout.gaps(np.arange(-20.0, 21, 5)).groups
+        array([0, 0, 1, 1, 2, 2, 3, 3, 3])
     """
 
     groups: NDArray[np.int64]

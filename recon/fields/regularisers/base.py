@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor
 
+from recon.names import REGULARISERS
+from recon.names import regulariser_names as regulariser_names
 from recon.projection.tiles import Tiles
 
 
@@ -37,3 +39,18 @@ class Regulariser(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
+
+
+def find_regulariser(name: str) -> Regulariser:
+    """Create the regulariser with a given name, with its default settings.
+
+    Raises:
+        ValueError: the name is unknown.
+        TypeError: the entry point with that name does not create a regulariser.
+    """
+    made = REGULARISERS.find(name)()
+    if not isinstance(made, Regulariser):
+        raise TypeError(
+            f"regulariser {name} is a {type(made).__name__}; derive it from recon.fields.regularisers.Regulariser"
+        )
+    return made
