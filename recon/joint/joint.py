@@ -21,7 +21,7 @@ from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import Readings, first_noise, learns, noise_candidates
+from recon.joint.candidates import PixelValues, first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
@@ -293,7 +293,7 @@ class JointReconstructor:
     ) -> PlannedRun:
         """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
-        readings = Readings.of(tilt_series.images)
+        readings = PixelValues.of(tilt_series.images)
         found, saturated = readings.digitisation, readings.saturated
         simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
 
