@@ -67,7 +67,7 @@ def write_camera_report(
             [f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:MOST_LISTED]
         ]
         page.table(("y", "x", *names), rows, caption=caption)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")

@@ -229,7 +229,7 @@ def write_report(
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")
@@ -305,7 +305,7 @@ def _add_detector(page: Report, findings: Findings) -> None:
 
 
 def _add_models(page: Report, findings: Findings) -> None:
-    page.heading("Noise models")
+    page.heading("Noise models", folded=True)
     caption = (
         "NLL: negative log-likelihood of held-out pixels, nats per pixel; lower is better. JSD (nats), "
         "1 − BC (Bhattacharyya coefficient) and BD (Bhattacharyya distance, nats) in units of 10⁻⁴; floor: expected value for "
@@ -330,7 +330,7 @@ def _add_models(page: Report, findings: Findings) -> None:
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
-    page.heading("Registration and residual")
+    page.heading("Registration and residual", folded=True)
     if findings.burst is not None:
         page.text(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs[:most], 1):

@@ -106,8 +106,11 @@ def reconstruct(
         typer.Option(help="A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
     ] = None,
     mode: Annotated[
-        str, typer.Option(help="Image formation: transmission (bright field) or linear (HAADF, EDX).")
-    ] = "transmission",
+        str,
+        typer.Option(
+            help="Image formation: transmission (bright field), linear (HAADF, EDX), or auto, by the background."
+        ),
+    ] = "auto",
     thickness: Annotated[
         int | None, typer.Option(help="Depth of the volume in voxels; the image width by default.")
     ] = None,
@@ -315,6 +318,7 @@ def reconstruct(
         fixed = load_noise_model(noise_model)
         read = partial(
             load_tilt_series,
+            output=output,
             mode=mode,
             invert_tilt=invert_tilt,
             invert_contrast=invert_contrast,

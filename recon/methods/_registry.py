@@ -15,6 +15,7 @@ from torch import nn
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.kept_memory import kept_memory
+from noiseflow.keywords import takes_fields_of
 from noiseflow.plugins import provided
 from noiseflow.progress import Progress
 from recon.fields._registry import field_kinds
@@ -183,6 +184,7 @@ def find_method(name: str) -> Method:
     return found
 
 
+@takes_fields_of(Settings)
 def settings_of(method: str, **settings: Any) -> Settings:
     """Check the settings of a method before data are read.
 
@@ -223,6 +225,7 @@ def require_setting(method: str, name: str) -> None:
         raise ValueError(f"--{name}: method {method} does not support it; use --method {', '.join(able)}")
 
 
+@takes_fields_of(Settings)
 @kept_memory()
 def reconstruct(
     tilt_series: TiltSeries,
@@ -244,12 +247,13 @@ def reconstruct(
         scratch: with `slices_at_once`, a new ``.npy`` or MRC file for the volume, which the result memory-maps.
         client: with `slices_at_once`, a ``dask.distributed.Client`` whose workers reconstruct the blocks; they need access to
             the folder of `scratch`.
-        **settings: the attributes of `Settings`.
+        **settings: the attributes of `Settings`, such as ``num_steps``.
 
     Returns:
         The volume, projections in the order of the tilts, and the response by increasing angle.
 
     Raises:
+        TypeError: a setting is unknown.
         ValueError: the method is unknown, a setting is invalid or not supported, or the grid does not match the images.
 
     Example:
