@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow import FitResult
-    from noiseflow.fitting.weight import WeightChoice
+    from noiseflow.fitting.result import WeightChoice
     from recon.fields.fields import Field
     from recon.joint.signal_model import TomographySignal
     from recon.uncertainty.result import Uncertainty

@@ -6,34 +6,18 @@ import copy
 import inspect
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import wraps
 from typing import Any, ParamSpec
 
 import numpy as np
 from torch import Tensor, nn
 
-from noiseflow.described import described
-from noiseflow.fitting.result import FitResult
+from noiseflow.fitting.result import FitResult, WeightChoice
 
 _Given = ParamSpec("_Given")
 # Users state the scale of their penalty by guess: this ladder reaches a thousandth and a thousand times of it
 _FACTOR, _MOST = 4.0, 10
 HELD_OUT = "held-out"
-
-
-@described()
-@dataclass(frozen=True)
-class WeightChoice:
-    """A weight and the evidence for it.
-
-    Attributes:
-        weight: the chosen weight.
-        tried: weight → held-out negative log-likelihood, nats per pixel, in the order tried.
-    """
-
-    weight: float
-    tried: dict[float, float]
 
 
 def choose_weight(

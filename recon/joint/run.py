@@ -14,8 +14,9 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
-from noiseflow.fitting.weight import WeightChoice, choose_weight
+from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew

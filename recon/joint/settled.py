@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from noiseflow import FitResult
-from noiseflow.fitting.weight import WeightChoice
+from noiseflow.fitting.result import WeightChoice
 from recon.joint.coarse_start import Start
 from recon.joint.plan import Facts, FitStage
 from recon.joint.run import Runner
