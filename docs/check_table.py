@@ -29,7 +29,8 @@ def page() -> str:
     parts = [
         "# How a verdict is made",
         "A verdict is a table. Each row states one assumption of the reconstruction or calibration, measures how far the data "
-        "deviate from it, and compares the deviation with its standard error and with a tolerance. A row gives a reason if the deviation is "
+        "deviate from it, and compares the deviation with its standard error and with a tolerance. A row gives a reason "
+        "if the deviation is "
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
         "distortions of the images relative to the volume or to the other tilts; then statistics without a parameter. Within "
         "each group, the reason that exceeds its tolerance most comes first. The grade is *bad* if one of the reasons exceeds "
