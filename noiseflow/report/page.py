@@ -26,7 +26,7 @@ from noiseflow.runs.ownership import signature
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SCRIPTS = ("core.js", "volume.js", "tilts.js", "start.js")
+_SCRIPTS = ("core.js", "volume.js", "tilts.js", "downloads.js", "start.js")
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
@@ -41,10 +41,16 @@ class Report:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
+        self._folded = False
 
-    def heading(self, text: str) -> None:
-        """Start a section."""
-        self._parts.append(f"<h2>{_escape(text)}</h2>")
+    def heading(self, text: str, *, folded: bool = False) -> None:
+        """Start a section; a folded one shows only its heading until the reader opens it."""
+        heading, self._parts = f"<h2>{_escape(text)}</h2>", [self._content()]
+        self._folded = folded
+        self._parts.append(f"<details><summary>{heading}</summary>" if folded else heading)
+
+    def _content(self) -> str:
+        return "".join(self._parts) + ("</details>" if self._folded else "")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
@@ -110,7 +116,8 @@ class Report:
         if not content:
             raise ValueError(f"{path} is not a noiseflow report and has no content to include")
         content = content.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
-        self._parts.append(f'<section class="part"><h2>{title}</h2>{content}</section>')
+        self._parts = [f'{self._content()}<section class="part"><h2>{title}</h2>{content}</section>']
+        self._folded = False
 
     def save(self, path: str | Path) -> Path:
         """Write the page and return its path."""
@@ -123,7 +130,7 @@ class Report:
             '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
             f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'
             f'<p class="note">{lead}</p></header><nav class="contents" aria-label="Contents"></nav>'
-            f"<main>{''.join(self._parts)}</main></div>"
+            f"<main>{self._content()}</main></div>"
             f"<script>'use strict';\n{''.join(map(_asset, _SCRIPTS))}</script></body></html>\n"
         )
         with atomic_path(path) as partial:

@@ -67,8 +67,9 @@ class PixelValues:
         model = as_noise_model(noise_model)
         if not math.isfinite(model.low):
             return self.lowest + _DARK * model.step
-        at_limit = model.one_pixel(torch.full((1,), model.low, device=model.device))
-        return model.low - _BELOW * float(at_limit.stddev)
+        with torch.no_grad():
+            at_limit = model.one_pixel(torch.full((1,), model.low, device=model.device))
+            return model.low - _BELOW * float(at_limit.stddev)
 
 
 def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool = False) -> list[nn.Module]:

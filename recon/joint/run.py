@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
+from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
-from recon.joint.weight import WeightChoice, choose_weight
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
@@ -176,7 +177,7 @@ class Runner:
                 model.load_state_dict(start)
             self.models["chosen"] = noise_model
             result = self._fit_signal(stage, task, stage.name if number == 1 else f"{stage.name} {number}")
-            tried.append(_TriedModel(noise_model, _last_nll(result)))
+            tried.append(_TriedModel(noise_model, result.last_nll))
             fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
         chosen = _simplest([*tried[1:], tried[0]], task).model
         self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
@@ -194,7 +195,7 @@ class Runner:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
-            nll = _last_nll(self._fit_signal(stage, task, f"{stage.name} {weight:.4g}"))
+            nll = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").last_nll
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
@@ -257,12 +258,6 @@ def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     judged = [replace(each, excess=each.excess - best) for each in tried]
     found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
     return tried[judged.index(found)]
-
-
-def _last_nll(result: FitResult) -> float:
-    """Held-out NLL after the last step, nats per pixel; infinite if it is NaN."""
-    nll = list(result.history.values())[-1]
-    return nll if math.isfinite(nll) else math.inf
 
 
 @torch.no_grad()
