@@ -34,7 +34,7 @@ LARGEST_MISALIGNMENT = 0.1
 
 UNKNOWN_RESPONSE = (
     "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
-    "from 0.85 to 1.15; add dark frames or --exposure-ratio to measure it."
+    "from 0.8 to 1.2; add dark frames or --exposure-ratio to measure it."
 )
 
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
@@ -254,7 +254,7 @@ def describe_verdict(findings: Findings) -> list[str]:
             "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
         ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.findings)]
+    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in findings.verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:

@@ -33,7 +33,7 @@ _TABULATED = 0.05  # nats per pixel
 
 
 @dataclass(frozen=True)
-class _Tried:
+class _TriedModel:
     """A candidate and its held-out negative log-likelihood relative to the best, nats per pixel."""
 
     model: nn.Module
@@ -139,7 +139,7 @@ class Runner:
         """
         if self.candidates is None:
             raise ValueError("a plan that chooses a noise model needs candidates")
-        signal, tried = task.signal(), list[_Tried]()
+        signal, tried = task.signal(), list[_TriedModel]()
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
         if self.least_signal is not None:
             signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
@@ -150,10 +150,10 @@ class Runner:
             return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
 
         lowest = nll(richest)
-        tried.append(_Tried(richest, 0.0))
+        tried.append(_TriedModel(richest, 0.0))
         for place, model in enumerate(simpler):
             excess = nll(model) - lowest
-            tried.insert(place, _Tried(model, excess))
+            tried.insert(place, _TriedModel(model, excess))
             if excess <= _TOLERATED:
                 break
         chosen = _simplest(tried, task)
@@ -171,13 +171,13 @@ class Runner:
         """
         model, richest = task.signal_model, self.models["chosen"]
         start = copy.deepcopy(model.state_dict()) if self._simpler else {}
-        tried, fits = list[_Tried](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
+        tried, fits = list[_TriedModel](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
         for number, noise_model in enumerate([richest, *self._simpler], 1):
             if tried:
                 model.load_state_dict(start)
             self.models["chosen"] = noise_model
             result = self._fit_signal(stage, task, stage.name if number == 1 else f"{stage.name} {number}")
-            tried.append(_Tried(noise_model, result.last_nll))
+            tried.append(_TriedModel(noise_model, result.last_nll))
             fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
         chosen = _simplest([*tried[1:], tried[0]], task).model
         self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
@@ -252,7 +252,7 @@ class Runner:
         return result
 
 
-def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
+def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     """The simplest model that predicts held-out pixels nearly as well as the best."""
     best = min(each.excess for each in tried)
     judged = [replace(each, excess=each.excess - best) for each in tried]
