@@ -16,6 +16,7 @@ from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson
 from .models.conditioned import Conditioned as Conditioned
+from .models.correlated import Correlated as Correlated
 from .models.dead_time import DeadTimeCounter as DeadTimeCounter
 from .models.digitisation import Digitisation as Digitisation
 from .models.digitisation import detect_digitisation as detect_digitisation
