@@ -78,7 +78,7 @@ def test_spatial_structure_is_seen(kind: str) -> None:
         ("rows", "ScanNoise(model) adds"),
         ("columns", 'along="column"'),
         ("pattern", "WithMaps"),
-        ("neighbours", "no model"),
+        ("neighbours", "Correlated"),
     ],
 )
 def test_the_term_that_would_help_is_named(kind: str, remedy: str) -> None:
