@@ -311,6 +311,9 @@ class JointReconstructor:
             )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
+        if not facts.simple_is_final:
+            # a noise model learnt at a weight that the data contradict would describe what that weight smooths away
+            part.weight = _first_weight(whole.field.width)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)

@@ -40,7 +40,9 @@ class Settings:
     """User settings of a reconstruction. The method chooses the values of settings that are None.
 
     Attributes:
-        weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`.
+        weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`; None to choose it by the likelihood
+            of held-out pixels. Three times the chosen weight smooths visibly: a smooth object lost 5 dB. The noise model does not
+            depend on it.
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
         field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
