@@ -101,7 +101,7 @@ def _add_uncertainty(report: Report, tilt_series: TiltSeries, outcome: Reconstru
 
 def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     report.heading("Settings and choices", folded=True)
-    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    report.table(("setting", "value", "evidence"), settings(outcome), prose=True)
 
 
 def _add_methods(
@@ -136,7 +136,7 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
     return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
 
 
-def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
+def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [
