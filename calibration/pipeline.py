@@ -20,7 +20,7 @@ from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
 from calibration.verdict import Case, judge, refusal
-from noiseflow.checks import Finding, Verdict
+from noiseflow.checks import Verdict
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Findings:
     no_detector: str = ""
     burst: BurstReport | None = None
     figures: Figures | None = None
-    verdict: Verdict[Finding] = field(default_factory=lambda: Verdict("bad", ()))
+    verdict: Verdict = field(default_factory=lambda: Verdict("bad", ()))
     correlation: Correlation | None = None
     repairs: Repairs = field(default_factory=Repairs)
     pattern: Image | None = None

@@ -341,7 +341,7 @@ CAMERA_CHECKS: tuple[Row, ...] = (*FLATS, *COMMON)
 """The checks of flats and darks."""
 
 
-def judge(case: Case) -> Verdict[Finding]:
+def judge(case: Case) -> Verdict:
     """Test the assumptions behind the results."""
     guard = Guard()
     found = run(CHECKS if case.camera is None else CAMERA_CHECKS, case, guard)
@@ -349,7 +349,7 @@ def judge(case: Case) -> Verdict[Finding]:
     return verdict_of(found.values(), evidence, good=GOOD, guard=guard)
 
 
-def said(verdict: Verdict[Finding]) -> dict[str, Any]:
+def said(verdict: Verdict) -> dict[str, Any]:
     """The verdict as plain values: ``verdict``, its ``reasons``, the ``evidence`` of every check, and what was ``not_tested``."""
     reasons = [
         {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
@@ -363,7 +363,7 @@ def said(verdict: Verdict[Finding]) -> dict[str, Any]:
     }
 
 
-def refusal(case: Case, why: str) -> Verdict[Finding]:
+def refusal(case: Case, why: str) -> Verdict:
     """The verdict on exposures whose gain cannot be measured, for the reason `why`; compression may explain it."""
     guard, sentence = Guard(), f"the detector was not measured: {why}"
     reason = Finding("detector", "not measurable", "fact", Effect(1.0), "", 0.0, 3.0, sentence, RAW)
