@@ -31,8 +31,8 @@ class TiltSeries:
         tilt_angles: (tilt,) degrees.
         pixel_size: Å, or None if unknown.
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
-        mask: (tilt, y, u), True for pixels to use; None for all. Fits exclude the other pixels; classical methods use their
-            values in `images`, which should be plausible.
+        mask: (tilt, y, u), True for pixels to use; None for all. Methods exclude the other pixels; WBP replaces them by
+            projections of a volume of the used ones.
         beam: (tilt,) incident intensity relative to the median if the beam drifts; the initial value of a fit.
         axes: (tilt,) direction of each tilt axis in the specimen, degrees from y towards −x, if there are two: 0, or a number
             near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
