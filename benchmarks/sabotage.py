@@ -14,13 +14,13 @@ from benchmarks import rarer_defects  # noqa: F401  (registers its ways, after t
 from benchmarks.defects import WAYS, Source, Spoilt
 from benchmarks.needle import load
 from benchmarks.scenes import Cell, Results, Scene, make_scene
+from noiseflow.checks import Verdict
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import compare
 from recon.series.screening import require_specimen, screen
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, draw_noise, stored_type
 from recon.verdict.judge import judge
-from recon.verdict.verdict import Verdict
 
 SCENES = (("shells", "clipped"), ("particles", "low-dose"), ("filaments", "8-bit"))
 STANDARD = tuple(
@@ -31,7 +31,7 @@ STANDARD = tuple(
 TILTS = "-60:60:3"
 RIGHT = 0.3  # dB below the series without defects
 _OTHER = 9  # added to the seed to get another object of the same type
-Result = tuple[TiltSeries, Any, Verdict]
+Result = tuple[TiltSeries, Any, Verdict[Any]]
 
 
 def run(
@@ -114,7 +114,7 @@ def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = 
         return prepared, result, judge(prepared, result, screening=screening)
 
 
-def _graded(verdict: Verdict) -> Cell:
+def _graded(verdict: Verdict[Any]) -> Cell:
     """Grade and reasons, and the evidence of every check, from which limits can be fitted without another run."""
     found = {"grade": verdict.grade, "subjects": list(verdict.subjects), "reasons": list(verdict.reasons)}
     return found | {"evidence": verdict.evidence, "not_tested": verdict.not_tested}

@@ -15,14 +15,13 @@ from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.verdict import (
     BIAS,
-    Grade,
     Reason,
-    Verdict,
     bent_response,
     frames_correlated,
     verdict_of,
     with_pattern,
 )
+from noiseflow.checks import Grade, Verdict
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 
@@ -70,7 +69,7 @@ class Camera:
     """
 
     figures: CameraFigures
-    verdict: Verdict
+    verdict: Verdict[Reason]
     maps: dict[str, Image]
     model: nn.Module
 
@@ -89,7 +88,7 @@ def calibrate_camera(
     return Camera(figures, judge_camera(figures), maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
-def judge_camera(figures: CameraFigures) -> Verdict:
+def judge_camera(figures: CameraFigures) -> Verdict[Reason]:
     """Test the assumptions behind the figures."""
     found: list[Reason] = []
 
@@ -324,7 +323,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
     found["outliers"] = figures.outliers
     found["defects"] = int(camera.maps["defects"].sum())
-    return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.reasons], "camera": found}
+    return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.findings], "camera": found}
 
 
 def _before_filter(figures: CameraFigures) -> CameraFigures:

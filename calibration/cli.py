@@ -196,7 +196,7 @@ def summary(findings: Findings) -> dict[str, Any]:
 
     found: dict[str, Any] = {
         "verdict": findings.verdict.grade,
-        "reasons": [vars(reason) for reason in findings.verdict.reasons],
+        "reasons": [vars(reason) for reason in findings.verdict.findings],
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},

@@ -19,7 +19,8 @@ from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
-from calibration.verdict import Reason, Verdict, compression, judge_calibration, verdict_of
+from calibration.verdict import Reason, compression, judge_calibration, verdict_of
+from noiseflow.checks import Verdict
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class Findings:
     no_detector: str = ""
     burst: BurstReport | None = None
     figures: Figures | None = None
-    verdict: Verdict = field(default_factory=lambda: Verdict("bad", ()))
+    verdict: Verdict[Reason] = field(default_factory=lambda: Verdict("bad", ()))
     correlation: Correlation | None = None
     repairs: Repairs = field(default_factory=Repairs)
     pattern: Image | None = None
@@ -156,12 +157,12 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    verdict = Verdict("bad", ())
+    verdict: Verdict[Reason] = Verdict("bad", ())
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         judged = judge_calibration(pairs, detector, figures, correlation, repairs)
-        verdict = verdict_of([*judged.reasons, *compressed])
+        verdict = verdict_of([*judged.findings, *compressed])
     except (NotMeasurable, np.linalg.LinAlgError) as error:
         reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
         refused = Reason("not measurable", "bad", f"the detector was not measured: {reason}.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -27,9 +26,9 @@ from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Image, rails
 from calibration.registration.aligned import AlignedPair
+from noiseflow.checks import Grade, Verdict
 from noiseflow.described import described
 
-Grade = Literal["good", "doubtful", "bad"]
 GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
 
 LEAST_MISFIT = 0.8
@@ -69,24 +68,15 @@ class Reason:
     grade: Grade
     text: str
 
-
-@described()
-@dataclass(frozen=True)
-class Verdict:
-    """Reliability of gain, offset and read noise.
-
-    Attributes:
-        grade: ``"good"``; ``"doubtful"``: corrected or uncertain, as the reasons explain; ``"bad"``: do not use.
-        reasons: the failed tests, worst first; empty for a good calibration.
-    """
-
-    grade: Grade
-    reasons: tuple[Reason, ...]
+    @property
+    def reason(self) -> str:
+        """The name, as that of other findings."""
+        return self.name
 
 
 def judge_calibration(
     pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, correlation: Correlation, repairs: Repairs
-) -> Verdict:
+) -> Verdict[Reason]:
     """Test the assumptions behind the results.
 
     Args:
@@ -108,10 +98,11 @@ def judge_calibration(
     return verdict_of(with_pattern(reasons, pattern, correlation, figures.gain.median))
 
 
-def verdict_of(reasons: Sequence[Reason]) -> Verdict:
+def verdict_of(reasons: Sequence[Reason]) -> Verdict[Reason]:
     """Return the verdict for these reasons: its grade is the worst of theirs."""
     ordered = sorted(reasons, key=lambda one: -GRADES.index(one.grade))
-    return Verdict(ordered[0].grade if ordered else "good", tuple(ordered))
+    texts = tuple(one.text for one in ordered)
+    return Verdict(ordered[0].grade if ordered else "good", texts, findings=tuple(ordered))
 
 
 def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:

@@ -26,7 +26,7 @@ def describe_camera_verdict(camera: Camera) -> list[str]:
     if grade == "good":
         return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.reasons)]
+    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.findings)]
 
 
 def write_camera_report(

@@ -254,7 +254,7 @@ def describe_verdict(findings: Findings) -> list[str]:
             "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
         ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.reasons)]
+    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.findings)]
 
 
 def judge(findings: Findings) -> list[str]:

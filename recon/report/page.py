@@ -11,7 +11,7 @@ import torch
 
 from noiseflow import io
 from noiseflow.arrays import strided
-from noiseflow.checks import Guard
+from noiseflow.checks import Finding, Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
@@ -23,7 +23,6 @@ from recon.report.uncertainty import add_error_bars
 from recon.report.verdict import add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.verdict.verdict import Verdict
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
@@ -48,7 +47,7 @@ def reconstruction_report(
     seed: int | None = None,
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
-    verdict: Verdict | None = None,
+    verdict: Verdict[Finding] | None = None,
     guard: Guard | None = None,
 ) -> Report:
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.checks import Finding, Verdict
 from noiseflow.report import COLOURS, Report, add_legend, new_chart
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
-from recon.verdict.expected import expected_images
+from recon.verdict.expected import Result, expected_images
 from recon.verdict.residuals import Residuals
-from recon.verdict.verdict import Result, Verdict
 
 _WORDS = {
     "good": "Good: no check found a fault in this volume.",
@@ -28,7 +28,7 @@ _EFFECTS = (
 )
 
 
-def add_verdict(report: Report, verdict: Verdict, tilt_series: TiltSeries, result: Result) -> None:
+def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeries, result: Result) -> None:
     """Add heading, grade, reasons and charts of a verdict to a report.
 
     Args:

@@ -19,13 +19,12 @@ from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
-from recon.verdict.expected import expected_images
+from recon.verdict.expected import Result, expected_images
 from recon.verdict.gap_fit import Unexplained, unexplained
 from recon.verdict.geometry import Geometry
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
-from recon.verdict.verdict import Result
 
 Array = NDArray[Any]
 # widths: only this number of slices of a taller series is used, because all may not fit into memory

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -10,9 +10,22 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised
-from recon.verdict.verdict import Result
+from recon.series.tilt_series import Volume
 
 _LEVELS = 256  # number of signals at which the mean is computed; interpolated in between
+
+
+class Result(Protocol):
+    """The parts of a reconstruction that are assessed; every method provides them."""
+
+    @property
+    def volume(self) -> Volume: ...
+    @property
+    def projections(self) -> NDArray[np.float32]: ...
+    @property
+    def fit_result(self) -> Any: ...
+    @property
+    def noise_model(self) -> nn.Module | None: ...
 
 
 def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.float32]:

@@ -1,54 +1,47 @@
-"""The verdict on a reconstruction: a grade, its reasons, and the numerical evidence."""
+"""The verdict on a result: a grade, its reasons, and the numerical evidence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-from torch import nn
-
-from noiseflow.checks import Finding, Guard, grade, ranked
-from noiseflow.checks.engine import Grade
-from recon.series.tilt_series import Volume
+from noiseflow.checks.engine import Finding, Grade, grade, ranked
+from noiseflow.checks.guard import Guard
 
 
-class Result(Protocol):
-    """The parts of a reconstruction that are assessed; every method provides them."""
+class Named(Protocol):
+    """A finding behind a reason."""
 
     @property
-    def volume(self) -> Volume: ...
-    @property
-    def projections(self) -> NDArray[np.float32]: ...
-    @property
-    def fit_result(self) -> Any: ...
-    @property
-    def noise_model(self) -> nn.Module | None: ...
+    def reason(self) -> str:
+        """One word or a few, for programs."""
+
+
+Found = TypeVar("Found", bound=Named, covariant=True)
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The assessment of a volume.
+class Verdict(Generic[Found]):
+    """The assessment of a result.
 
     Attributes:
-        grade: ``good``, ``doubtful`` or ``bad``.
-        reasons: sentences, facts first, then by what they cost; for a good volume, what was tested.
+        grade: ``good``; ``doubtful``: corrected or uncertain, as the reasons explain; ``bad``: do not use.
+        reasons: sentences, in the order of the findings; a good reconstruction has one that says what was tested.
         evidence: effect, error, unit, tolerance and cost of every check by name.
-        findings: the findings behind the reasons.
+        findings: the findings behind the reasons, those that matter most first.
         not_tested: reasons of the checks that failed or could not be applied, by name.
     """
 
     grade: Grade
     reasons: tuple[str, ...]
     evidence: dict[str, Any] = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Found, ...] = ()
     not_tested: dict[str, str] = field(default_factory=dict)
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """One word for each reason, in their order."""
+        """The short name of each reason, in their order."""
         return tuple(finding.reason for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,7 +63,7 @@ class Verdict:
         ]
 
 
-def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict:
+def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict[Finding]:
     """The verdict from findings; `good` is the sentence if none fires, and `guard` knows what was not tested."""
     first = ranked(findings)
     reasons = [f"{each.sentence}; {each.advice}" for each in first] or [good]
