@@ -16,6 +16,9 @@ from noiseflow.io import angle_text
 from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable
 
+_COMMANDS = ("tilt.com", "tilta.com", "tiltb.com")
+"""Command files of a series, and of the two of a dual-axis tomogram."""
+_LISTS = ("EXCLUDE", "INCLUDE")
 _FLAT = 0.05
 """Degrees: a rotation about x that moves the edge of a 4096-pixel image by less than two pixels."""
 
@@ -38,8 +41,7 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
 
     Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) are not modelled and are named in a warning.
     """
-    path = stack.with_name("tilt.com")
-    if path.is_file() and stack.is_file():
+    for path in (each for name in _COMMANDS if stack.is_file() and (each := stack.with_name(name)).is_file()):
         entries = _entries(path)
         # older files name the stack in a line of its own, without a keyword
         older = next((name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), "")
@@ -54,8 +56,9 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
 
 def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable:
     count, offset = len(table.angles), _value(entries, "OFFSET", path)
-    lists = ",".join(filter(None, (entries.get("EXCLUDELIST"), entries.get("EXCLUDELIST2"))))
-    excluded = parse_views(lists, count, path)
+    excluded, included = (parse_views(_listed(entries, name), count, path) for name in _LISTS)
+    if included:
+        excluded = sorted({*excluded, *range(count)} - {*included} | {*excluded})
     if excluded or offset:
         views = ", ".join(str(view + 1) for view in excluded[:12]) + (", …" if len(excluded) > 12 else "")
         parts = [f"adds {offset:g}° to the tilt angles"] * bool(offset) + [f"excludes the views {views}"] * bool(
@@ -93,9 +96,14 @@ def _entries(path: Path) -> dict[str, str]:
         words = line.split("#")[0].split(None, 1)
         if words and not words[0].startswith("$"):
             name, value = words[0].upper(), words[1].strip() if len(words) > 1 else ""
-            joined = name.startswith("EXCLUDE") and name in found
+            joined = name.startswith(_LISTS) and name in found
             found[name] = f"{found[name]},{value}" if joined else value
     return found
+
+
+def _listed(entries: dict[str, str], name: str) -> str:
+    """The views of all keywords that begin with a name, such as EXCLUDELIST and EXCLUDELIST2."""
+    return ",".join(value for keyword, value in entries.items() if keyword.startswith(name))
 
 
 def parse_views(text: str, count: int, source: object = "views") -> list[int]:

@@ -20,8 +20,10 @@ _ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
 _NAMES = ("rlnMicrographMovieName", "rlnMicrographName", "wrpMovieName")
 _AXES = ("rlnTomoNominalTiltAxisAngle", "wrpAxisAngle")
 _SIZES = ("rlnTomoTiltSeriesPixelSize", "rlnMicrographPixelSize", "rlnMicrographOriginalPixelSize")
+_DOSES = ("rlnMicrographPreExposure", "wrpDose")
 _ALIGNED = ("rlnTomoZRot", "rlnTomoXShiftAngst", "rlnTomoYShiftAngst")
 
+_MISSING = {"nan", "<na>", "none", "null"}
 _SECTION = re.compile(r"([0-9]{1,9})@")
 Columns = dict[str, list[str]]
 
@@ -51,6 +53,7 @@ def read(path: Path) -> TiltTable:
         transforms=None if size is None else _transforms(table, size, path),
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),
+        acquired=_numbers(table, _DOSES, path),
     )
 
 
@@ -71,9 +74,11 @@ def _transforms(table: Columns, size: float, path: Path) -> NDArray[np.float64] 
 
 
 def _numbers(table: Columns, names: Sequence[str], path: Path) -> NDArray[np.float64] | None:
-    name = next((name for name in names if name in table), None)
-    if name is None:
+    """The first of some columns, if possible one without missing values."""
+    known = [name for name in names if name in table]
+    if not known:
         return None
+    name = next((name for name in known if not _MISSING & {text.lower() for text in table[name]}), known[0])
     try:
         return np.array([number(text) for text in table[name]], dtype=np.float64)
     except ValueError as error:

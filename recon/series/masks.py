@@ -70,4 +70,4 @@ def weights_of_rays(tilt_series: TiltSeries) -> NDArray[np.bool_] | None:
     neighbouring rows.
     """
     mask = tilt_series.mask
-    return None if mask is None else mask | ~mask.any((0, 2))[:, None]
+    return None if mask is None else mask | ~np.asarray(mask.any((0, 2)))[:, None]

@@ -81,7 +81,9 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     numbers = view_numbers(tilt_series.tilt_angles)
     left = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
     if every < 2 or not left.any():
-        raise ValueError(f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number")
+        raise ValueError(
+            f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number"
+        )
     kept, judged = tilt_series.select(np.flatnonzero(~left)), tilt_series.select(np.flatnonzero(left))
     orientation = Orientation.of(kept)  # that of the signal model
     kept, judged = orientation.series(kept), orientation.series(judged)
