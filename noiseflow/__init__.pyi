@@ -14,6 +14,7 @@ from .models.at_level import AtLevel as AtLevel
 from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson
+from .models.correlated import Correlated as Correlated
 from .models.dead_time import DeadTimeCounter as DeadTimeCounter
 from .models.digitisation import Digitisation as Digitisation
 from .models.digitisation import detect_digitisation as detect_digitisation

@@ -114,7 +114,7 @@ def white_regression(columns: Array, values: Array, *, ridge: float = 0.0) -> tu
     left = values - found @ scaled.T
     # the factor corrects for the fitted coefficients, as in any estimate of a variance
     errors = np.sqrt((left**2) @ spread**2 * (rows / max(1, rows - fitted)))
-    return found / scale, np.maximum(errors, 1e-30) / scale
+    return found / scale, np.maximum(errors, 1e-15) / scale
 
 
 def block_means(images: Array, down: int, across: int) -> Array:

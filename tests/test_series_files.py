@@ -11,6 +11,8 @@ import tifffile
 import recon
 from noiseflow import io
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # files that lead to warnings open all the same
+
 CASES = Path(__file__).parents[2] / "shared" / "data" / "cases_series"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 with_cases = pytest.mark.skipif(not CASES.is_dir(), reason="the small series are not here")
@@ -273,6 +275,7 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     (tmp_path / "tilt.com").write_text(command)
     with pytest.warns(UserWarning, match=r"1\.5.*views 2"), pytest.warns(UserWarning, match="about x"):
         series = recon.read_tilt_series(tmp_path / "a_ali.mrc")
+    assert series.x_tilt == 3
     assert series.tilt_angles.tolist() == [-18.5, 11.5, 21.5]
     np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
     with pytest.warns(UserWarning, match="about x"):
@@ -657,3 +660,25 @@ def test_damaged_packed_files_are_named(suffix: str, tmp_path: Path) -> None:
         (tmp_path / f"a.mrc{suffix}").write_bytes(content)
         with pytest.raises(ValueError, match=r"a\.mrc"):
             io.read(tmp_path / f"a.mrc{suffix}")
+
+
+def turned_slab(degrees: float) -> np.ndarray:
+    """A slab whose z rises with y by an angle."""
+    z, y, _ = np.meshgrid(*(np.arange(32) - 15.5 for _ in range(3)), indexing="ij")
+    radians = np.deg2rad(degrees)
+    return np.clip(3.0 - np.abs(z * np.cos(radians) - y * np.sin(radians)), 0, 1) * (np.abs(y) < 11)
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_a_specimen_that_is_turned_about_x_is_written_level(invert: bool, tmp_path: Path, run) -> None:
+    series, _ = recon.clean_tilt_series(turned_slab(10.0), np.arange(-90, 90, 9.0))
+    recon.write_tilt_series(tmp_path / "a.mrc", series)
+    (tmp_path / "a.xtilt").write_text("-10\n" * 20 if invert else "10\n" * 20)
+    if invert:
+        (tmp_path / "a.rawtlt").write_text("".join(f"{-angle}\n" for angle in series.tilt_angles))
+    options = ["--method", "sirt", "--steps", "20", *(["--invert-tilt"] if invert else [])]
+    run("reconstruct", tmp_path / "a.mrc", "-o", tmp_path / "v.mrc", *options)
+    volume = io.read(tmp_path / "v.mrc").data
+    places = np.arange(32) - 15.5
+    heights = [float(np.average(places, weights=volume[:, y].sum(1).clip(0))) for y in (9, 22)]
+    assert abs(heights[1] - heights[0]) < 0.3  # 2.3 voxels as it was

@@ -39,7 +39,7 @@ def read(path: Path) -> TiltTable:
 def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
     """A table with what the ``tilt.com`` of a stack adds, if it lies next to it, and a warning that says so.
 
-    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) are not modelled and are named in a warning.
+    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) become the table's `x_tilt`, which levels the volume.
     """
     for path in (each for name in _COMMANDS if stack.is_file() and (each := stack.with_name(name)).is_file()):
         entries = _entries(path)
@@ -50,7 +50,7 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
             return _applied(table, entries, path)
     turned = stack.with_name(f"{stem}.xtilt")
     if turned.is_file() and not stack.is_dir():
-        _warn_of_x(angle_text.read(turned).angles, turned)
+        return replace(table, x_tilt=x_tilt_of(angle_text.read(turned).angles, turned))
     return table
 
 
@@ -65,21 +65,28 @@ def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable
             excluded
         )
         warnings.warn(f"{path} {' and '.join(parts)}", stacklevel=5)
-    turned = [_value(entries, "XAXISTILT", path)]
+    turned = np.full(1, _value(entries, "XAXISTILT", path))
     if "XTILTFILE" in entries and (file := path.with_name(Path(entries["XTILTFILE"]).name)).is_file():
-        turned = list(angle_text.read(file).angles)
-    _warn_of_x(np.array(turned), path)
-    return replace(table, angles=table.angles + offset, excluded=tuple(sorted({*table.excluded, *excluded})))
+        turned = turned + angle_text.read(file).angles
+    rows = tuple(sorted({*table.excluded, *excluded}))
+    return replace(table, angles=table.angles + offset, excluded=rows, x_tilt=x_tilt_of(turned, path))
 
 
-def _warn_of_x(angles: NDArray[np.float64], path: Path) -> None:
-    if np.abs(angles).max(initial=0.0) > _FLAT:
-        varies = "" if np.ptp(angles) <= _FLAT else ", different for each view: the images do not share one axis"
-        warnings.warn(
-            f"{path} turns the specimen by up to {np.abs(angles).max():g}° about x{varies}; this is not applied, and the volume "
-            "is turned by as much: level it afterwards, for example with rotatevol",
-            stacklevel=5,
-        )
+def x_tilt_of(angles: NDArray[np.float64], path: Path) -> float:
+    """The mean rotation of the specimen about x, degrees; a warning names it, and rotations that differ between views."""
+    found = float(angles.mean()) if angles.size else 0.0
+    varies = angles.size > 0 and float(np.ptp(angles)) > _FLAT
+    if abs(found) <= _FLAT and not varies:
+        return 0.0
+    differ = (
+        f"; its views differ by {np.ptp(angles):.2g}°, which is not modelled: they do not share one axis"
+        if varies
+        else ""
+    )
+    warnings.warn(
+        f"{path} turns the specimen by {found:.3g}° about x; the volume is levelled by as much{differ}", stacklevel=6
+    )
+    return found
 
 
 def _value(entries: dict[str, str], name: str, path: Path) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
+from noiseflow.io.imod import x_tilt_of
 from noiseflow.io.tilt_table import TiltTable, rotations
 
 _ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
@@ -44,6 +45,7 @@ def read(path: Path) -> TiltTable:
     sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
     axes = _numbers(table, _AXES, path)
     size = None if sizes is None else float(sizes[0])
+    turned = _numbers(table, ("rlnTomoXTilt",), path)
     names = next((table[name] for name in _NAMES if name in table), [])
     sections = [int(stated[1]) for name in names if (stated := _SECTION.match(name))]
     return TiltTable(
@@ -53,6 +55,7 @@ def read(path: Path) -> TiltTable:
         transforms=None if size is None else _transforms(table, size, path),
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),
+        x_tilt=0.0 if turned is None else x_tilt_of(turned, path),
         acquired=_numbers(table, _DOSES, path),
     )
 

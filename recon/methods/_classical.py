@@ -26,7 +26,7 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import level_of, view_numbers, without_level
 
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
-_ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
+_ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 _SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
 # iterations of the volume whose projections fill masked pixels: as many as for a first guess of a fit
 _FILLING = 30

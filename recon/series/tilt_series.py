@@ -40,6 +40,8 @@ class TiltSeries:
             near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
             orientation at zero tilt. See `recon.DualAxisProjector`.
         dose: (tilt,) dose before each image, or its time, in any unit; None if unknown. Used for shrinkage only.
+        x_tilt: degrees by which the specimen is turned about x according to its files; commands level their volumes by it, see
+            `Volume.levelled`.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
         views: (tilt,) index of each image among the `num_views` of its file, if some of these were left out; else None.
@@ -67,6 +69,7 @@ class TiltSeries:
     views: NDArray[np.int64] | None = None
     num_views: int | None = None
     dose: NDArray[np.float64] | None = None
+    x_tilt: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -230,6 +233,29 @@ class Volume:
         size = "unknown voxel size" if self.voxel_size is None else f"{self.voxel_size:.4g} Å per voxel"
         return f"Volume({size_of(self.attenuation)}, {size})"
 
+    def levelled(self, x_tilt: float) -> Volume:
+        """The volume of a specimen that is turned about x, turned back about its centre by cubic interpolation.
+
+        Args:
+            x_tilt: degrees; positive if z of a flat specimen rises with y, as IMOD's ``XAXISTILT``.
+
+        Example:
+            >>> import numpy as np, recon
+            >>> recon.Volume(np.ones((8, 8, 8), np.float32)).levelled(5.0).attenuation.shape
+            (8, 8, 8)
+        """
+        from scipy.ndimage import affine_transform
+
+        if not x_tilt:
+            return self
+        cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
+        turn = np.array([[cosine, sine], [-sine, cosine]])  # (z, y) of the given volume from those of the level one
+        middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
+        level = mapped.temporary_map(self.attenuation.shape, np.float32, in_memory=mapped.IN_MEMORY)
+        for x in range(level.shape[2]):
+            level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
+        return Volume(level, self.voxel_size)
+
     def write(self, path: str | Path) -> None:
         """Write to an MRC, TIFF, ``.npy`` or OME-Zarr file with the voxel size. Raises as `noiseflow.io.write`."""
         size = self.voxel_size
@@ -310,6 +336,7 @@ def read_tilt_series(
         views=views if excluded else None,
         num_views=count if excluded else None,
         dose=None if table.acquired is None else table.acquired[views],
+        x_tilt=table.x_tilt,
     )
     empty = np.zeros(len(images), np.bool_) if use is None else ~use.any((1, 2))
     if not empty.any():

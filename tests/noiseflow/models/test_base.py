@@ -29,6 +29,7 @@ MODELS = {
     "maps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)),
     "rounded maps": lambda: noiseflow.Digitised(noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)), 0.1),
     "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
+    "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }
