@@ -130,15 +130,20 @@ def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list
     if places and len(places) == len(table.angles) and 0 <= min(places) <= max(places) < count:
         return [places.get(section, -1) for section in range(count)]
     if len(table.angles) != count:
-        turned = f"; its images must lie along the first axis of {image.data.shape}" * (
-            len(table.angles) in image.data.shape
-        )
         raise ValueError(
-            f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}{turned}; give the angle file "
-            "of these images"
+            f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; "
+            f"{advice_on_count(image.data.shape, len(table.angles))}"
         )
     _compare(table.angles, image.tilt_angles, file, stack)
     return list(range(count))
+
+
+def advice_on_count(shape: Sequence[int], num_angles: int) -> str:
+    """What to do about a stack (tilt, y, x) whose number of images is not that of the angles."""
+    if list(shape[1:]).count(num_angles) == 1:
+        axis = "yx"[list(shape[1:]).index(num_angles)]
+        return f"its axis {axis} has {num_angles} entries: save the stack with the tilts first"
+    return "give the angle file of these images"
 
 
 def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path) -> list[int] | None:

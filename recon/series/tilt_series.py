@@ -81,7 +81,7 @@ class TiltSeries:
         if len(self.images) != len(self.tilt_angles):
             raise ValueError(
                 f"the stack has {len(self.images)} images, but there are {len(self.tilt_angles)} tilt angles; "
-                "give the angle file of this stack"
+                f"{io.advice_on_count(self.images.shape, len(self.tilt_angles))}"
             )
         if len(self.images) < 2:
             raise ValueError("a tilt series needs at least two tilts")
