@@ -82,7 +82,7 @@ def fit_by_condition(
         warnings.warn(
             f"models at neighbouring conditions do not predict those between them (off by {off:.2g} nats per pixel), so that the "
             "noise between the fitted conditions is uncertain; give closer conditions, or pixels with low and high signals",
-            stacklevel=6,
+            stacklevel=5,
         )
     result.noise_model, result.held_out_nll = found, nll
     return result
