@@ -99,7 +99,8 @@ def correlation_kernel(
         reach: largest distance of correlated pixels along each axis.
 
     Returns:
-        (2·reach + 1, 2·reach + 1), unit sum of squares; a single 1 if there is no significant correlation.
+        (2·reach + 1, 2·reach + 1) with unit sum of squares, a single 1 at its centre if there is no significant correlation;
+        (1, 1) if all residuals are equal.
 
     Example:
         >>> import noiseflow, torch
@@ -112,6 +113,8 @@ def correlation_kernel(
     """
     z = _latent(noise_model, floating(signal), floating(observation))
     height, width = z.shape[-2:]
+    if not z.any():
+        return torch.ones(1, 1)
     side = 2 * reach + 1
     spectrum = np.abs(np.fft.rfft2(z, s=(height + reach, width + reach))) ** 2
     products = np.fft.irfft2(spectrum.reshape(-1, *spectrum.shape[-2:]).mean(0), s=(height + reach, width + reach))
@@ -155,4 +158,4 @@ def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDAr
         u[good.cpu().numpy()] = probability_integral_transform(noise_model, signal[good], observation[good], random)
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).numpy()
     z[bad.cpu().numpy()] = 0
-    return np.asarray((z - z.mean()) / z.std())
+    return np.asarray((z - z.mean()) / (z.std() or 1.0))

@@ -11,7 +11,7 @@ import torch
 
 from noiseflow import io
 from noiseflow.arrays import strided
-from noiseflow.checks import Finding, Guard, Verdict
+from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
@@ -48,7 +48,7 @@ def reconstruction_report(
     seed: int | None = None,
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
-    verdict: Verdict[Finding] | None = None,
+    verdict: Verdict | None = None,
     guard: Guard | None = None,
 ) -> Report:
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
@@ -104,9 +104,7 @@ def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
     report.table(("setting", "value", "evidence"), settings(outcome), prose=True)
 
 
-def _add_methods(
-    report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict[Finding] | None
-) -> None:
+def _add_methods(report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None) -> None:
     report.heading("Methods, to paste into a paper", folded=True)
     report.text(methods_paragraph(tilt_series, outcome, verdict))
 

@@ -56,7 +56,7 @@ class CodedDistribution(NoiseDistribution):
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        place = torch.bucketize(value.double(), (self.levels[1:] + self.levels[:-1]) / 2)
+        place = torch.bucketize(value.double().contiguous(), (self.levels[1:] + self.levels[:-1]) / 2)
         return self.base.log_interval_prob(self._bounds[place], self._bounds[place + 1])
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
