@@ -13,7 +13,7 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import Case, judge, said
+from calibration.verdict import CalibrationCase, judge, said
 from noiseflow.checks import Verdict
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
@@ -77,7 +77,7 @@ def calibrate_camera(
 
 def judge_camera(figures: CameraFigures) -> Verdict:
     """Test the assumptions behind the figures."""
-    return judge(Case(figures.correlation, camera=figures))
+    return judge(CalibrationCase(figures.correlation, camera=figures))
 
 
 def maps_of(figures: CameraFigures) -> dict[str, Image]:
