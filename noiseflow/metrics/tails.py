@@ -17,8 +17,10 @@ from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 BEYOND = (3.0, 4.0, 5.0)
 """Distances from the mean, standard deviations of the model."""
 
-# Signals that represent a bin; within one, the mean moves by less than a tenth of the bin.
+# Signals that represent all pixels; within one, the mean moves by less than a tenth of the range.
 _LEVELS = 32
+# Signals that represent one of several bins, which are narrow.
+_LEVELS_OF_A_BIN = 8
 
 
 @described(signal="detector units")
@@ -63,9 +65,9 @@ def tails_of_bins(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
 ) -> tuple[Tails, ...]:
     """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
+    number = _LEVELS if len(bins) == 1 else _LEVELS_OF_A_BIN
     parts = [
-        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(_LEVELS, one.numel()))]
-        for one in bins
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(number, one.numel()))] for one in bins
     ]
     level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))
