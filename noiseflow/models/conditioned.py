@@ -77,6 +77,23 @@ class Conditioned(ModelAround):
             getattr(self, _stored(name))[place] = tensor
 
     @torch.no_grad()
+    def without(self, name: str, place: int) -> Conditioned:
+        """The same models without those at one value of a condition.
+
+        Args:
+            name: the condition.
+            place: index of the value.
+        """
+        axis, values = list(self.values).index(name), dict(self.values)
+        values[name] = values[name][:place] + values[name][place + 1 :]
+        found = Conditioned(self.model, values)
+        for part in self.model.state_dict():
+            grid: Tensor = getattr(self, _stored(part))
+            kept = [i for i in range(grid.shape[axis]) if i != place]
+            getattr(found, _stored(part)).copy_(grid.index_select(axis, torch.tensor(kept, device=grid.device)))
+        return found
+
+    @torch.no_grad()
     def at(self, condition: Mapping[str, float]) -> NoiseModelBase:
         """The noise model at one condition, to sample, evaluate or save like any other.
 

@@ -223,7 +223,9 @@ def require_setting(method: str, name: str) -> None:
     """
     if not find_method(method).takes(name):
         able = [other for other in method_names() if find_method(other).takes(name)]
-        raise ValueError(f"--{name}: method {method} does not support it; use --method {', '.join(able)}")
+        raise ValueError(
+            f"--{name}: method {method} does not support it; use --method {', '.join(able)}, or remove --{name}"
+        )
 
 
 @takes_fields_of(Settings)
