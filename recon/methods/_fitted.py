@@ -17,7 +17,7 @@ from noiseflow.progress import Progress
 from recon.fields._registry import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
-from recon.joint.joint import JointReconstructor
+from recon.joint.joint import OTHERS, JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.run import run_fit
 from recon.joint.settled import Settled
@@ -219,8 +219,9 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
-    if settings.regulariser is not None:
-        choices["regulariser"] = settings.regulariser
+    chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
+    if settings.regulariser is not None or chosen:
+        choices["regulariser"] = settings.regulariser or chosen[0]
     return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
 
 
