@@ -238,5 +238,6 @@ def _describe(noise_model: nn.Module) -> str:
         return _describe(noise_model.model)
     if not isinstance(noise_model, Digitised):
         return type(noise_model).__name__
-    found = Digitisation(noise_model.step, noise_model.low, noise_model.high, noise_model.origin)
+    limits = (noise_model.low, noise_model.high, noise_model.origin)
+    found = Digitisation(noise_model.step, *limits, tuple(noise_model.levels.tolist()))
     return f"{_describe(noise_model.model)}, {found.in_words()}"
