@@ -126,7 +126,8 @@ def page(content: dict[str, Any]) -> str:
         "Changes of the fit were made with the scenes `learn` in view; the scenes `judge` were only measured. Not all of the "
         f"{len(cells(0))} cells have been measured; any number of the first ones covers scenes, noises and tilt ranges evenly. "
         "Cells of commits before 9005e41 lack the choice of the regulariser.\n\n"
-        "The truncated object at 0…177° with outliers is a failure. Presumably what leaves the field of view at steep tilts is taken for "
+        "The truncated object at 0…177° with outliers is a failure. "
+        "Presumably what leaves the field of view at steep tilts is taken for "
         "outliers, so that these tilts lose their weight; this has not been tested. `--method l2` does not have this problem."
         "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
     )
