@@ -15,6 +15,8 @@ from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 # Distance from a level, relative to the smallest gap, up to which a value counts as that level: more than number formats round.
 _ROUNDED = 1e-3
+# Share of the former edges in matched ones: a level that the data lack keeps a thousandth of its width, and is not impossible.
+_KEPT = 1e-3
 
 
 class CodedDistribution(NoiseDistribution):
@@ -113,4 +115,5 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, shares: Tensor, star
     after = torch.searchsorted(below, wanted).clamp(1, grid.numel() - 1)
     slope = (below[after] - below[after - 1]).clamp(min=torch.finfo(torch.float64).tiny)
     share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
-    return grid[after - 1] + share * (grid[after] - grid[after - 1])
+    found = grid[after - 1] + share * (grid[after] - grid[after - 1])
+    return torch.lerp(found, start[1:-1], _KEPT)

@@ -145,3 +145,11 @@ def test_unequal_levels_are_recognised_matched_and_saved(tmp_path: Path) -> None
 def test_levels_that_do_not_increase_are_refused(levels: list[float]) -> None:
     with pytest.raises(ValueError, match="levels"):
         noiseflow.Digitised(noiseflow.Gaussian(), levels=levels)
+
+
+def test_a_level_that_the_fitted_pixels_lack_is_not_impossible() -> None:
+    signal = torch.rand(4000, generator=torch.Generator().manual_seed(0)) * 6 + 2
+    model = noiseflow.Digitised(noiseflow.Gaussian(1.0), levels=[float(k * k) for k in range(6)])
+    observation = model(signal).sample(generator=torch.Generator().manual_seed(1)).clamp(max=9.0)
+    assert model.match_levels(signal, observation)
+    assert torch.isfinite(model(signal[:5]).log_prob(torch.tensor([0.0, 4.0, 9.0, 16.0, 25.0]))).all()
