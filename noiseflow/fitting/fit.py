@@ -22,6 +22,7 @@ from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
+from noiseflow.fitting.steps import MakeOptimiser, adam
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
@@ -62,6 +63,7 @@ def fit(
     checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
     parameter_groups: Sequence[dict[str, Any]] | None = None,
+    optimiser: MakeOptimiser = adam,
     tables: TableKeeper | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
@@ -105,6 +107,8 @@ def fit(
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
         parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
+        optimiser: makes the optimiser of the signal model, `adam` or `noiseflow.fitting.steps.quasi_newton`; the latter needs
+            fewer steps, but only for signal models with ``signal()`` under a noise model that is not trained.
         tables: stores the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
@@ -196,6 +200,7 @@ def fit(
         standardise=standardise and resume is None and not begun,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
+        optimiser=optimiser,
     )
     if resume is not None:
         loop.load_state(resume)
