@@ -191,12 +191,12 @@ def _calibrate_camera(
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain values: ``verdict``, ``reasons``, ``detector``, ``registration``, ``models``, ``burst``."""
+    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
     from calibration.detector.models import foremost
+    from calibration.verdict import said
 
     found: dict[str, Any] = {
-        "verdict": findings.verdict.grade,
-        "reasons": [vars(reason) for reason in findings.verdict.findings],
+        **said(findings.verdict),
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow import FitResult
+    from noiseflow.fitting.result import WeightChoice
     from recon.fields.fields import Field
     from recon.joint.signal_model import TomographySignal
-    from recon.joint.weight import WeightChoice
     from recon.uncertainty.result import Uncertainty
 
 

@@ -187,7 +187,7 @@ reconstruct {good}/tilts.mrc --mask {bad}/nan.npy -o {out}/v.mrc | NaN
 reconstruct {good}/tilts.mrc --reference {good}/clean.mrc -o {out}/v.mrc | clean.mrc
 reconstruct {good}/tilts.mrc --reference {bad}/cut.mrc -o {out}/v.mrc | header claims
 reconstruct {good}/tilts.mrc --method joint-supervised -o {out}/v.mrc | --noise-model
-reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors -o {out}/v.mrc | does not fit a noise model
+reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors -o {out}/v.mrc | method wbp does not support it
 reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name the output
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report

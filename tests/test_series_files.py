@@ -11,6 +11,8 @@ import tifffile
 import recon
 from noiseflow import io
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # files that lead to warnings open all the same
+
 CASES = Path(__file__).parents[2] / "shared" / "data" / "cases_series"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 with_cases = pytest.mark.skipif(not CASES.is_dir(), reason="the small series are not here")

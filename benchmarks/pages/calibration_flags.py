@@ -57,7 +57,7 @@ def measured(name: str, make: Any, seed: int) -> Row:
         return row | {"verdict": "refused", "reasons": [str(error)], "gain": None}
     return row | {
         "verdict": found.verdict.grade,
-        "reasons": [one.name for one in found.verdict.findings],
+        "reasons": [one.reason for one in found.verdict.findings],
         "gain": None if found.figures is None else vars(found.figures.gain),
         "line": None if found.detector is None else found.detector.line.gain,
         "seconds": time.process_time() - started,

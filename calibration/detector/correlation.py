@@ -10,15 +10,13 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import CLEAR
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
-
-CLEAR = 5.0
-"""Standard errors above which a correlation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
 
 PEAK = 25.0
 """Significant power of a spectral line, relative to the mean of its neighbourhood. Noise exceeds it with probability exp(−25).

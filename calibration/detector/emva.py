@@ -69,7 +69,7 @@ class CameraFigures:
         bend: exponent of the response to light; the gain is the local one at the mean signal.
         pattern: places whose noise differs at equal signal.
         outliers: number of values that stood out in one frame only and were replaced.
-        lag: correlation of the noise of successive frames; 0 if not significant.
+        lag: correlation of the noise of successive frames, and its standard error.
     """
 
     gain: Interval
@@ -92,7 +92,7 @@ class CameraFigures:
     bend: Response
     pattern: Pattern
     outliers: int = 0
-    lag: float = 0.0
+    lag: tuple[float, float] = (0.0, 0.0)
 
     @property
     def linear(self) -> list[Level]:

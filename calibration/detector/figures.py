@@ -10,16 +10,16 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.measure import Detector
 from calibration.detector.posterior import Interval
 from calibration.detector.repair import Repairs
+from noiseflow.checks import Effect
 from noiseflow.described import described
 
-LARGEST_MISFIT = 1.3
-"""Largest χ² per degree of freedom of the histograms for a Poisson-Gaussian detector."""
+MODEL_MISFIT = 0.3
+"""Largest excess of χ² per degree of freedom of the histograms of a Poisson-Gaussian detector."""
 
-LARGEST_DISAGREEMENT = 0.02
-"""Largest relative difference between the gain of the posterior and that of the photon-transfer line, unless it is within three
-standard errors of the line: the target accuracy of the gain."""
+SHAPE_BIAS = 0.02
+"""Largest relative difference between the gain of the posterior and that of the photon-transfer line: the target accuracy."""
 
-LARGEST_UNEVENNESS = 0.05
+UNEVEN = 0.05
 """Largest relative deviation of the pixels' variances that one gain and read noise describe. The mixture then has tails heavier
 by its square, 0.25 %, which biases the offset but hardly the gain."""
 
@@ -90,15 +90,17 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
 
 def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
-    return detector.misfit <= LARGEST_MISFIT and not disagrees(detector) and detector.uneven <= LARGEST_UNEVENNESS
+    value, error, _ = disagreement(detector)
+    agrees = abs(value) <= max(SHAPE_BIAS, 3 * error)
+    return detector.misfit <= 1 + MODEL_MISFIT and agrees and detector.uneven <= UNEVEN
 
 
-def disagrees(detector: Detector) -> bool:
-    """Whether the posterior's gain differs from photon transfer; never if single-electron peaks determine the gain."""
+def disagreement(detector: Detector) -> Effect:
+    """Difference of the posterior's gain from photon transfer, of the gain; none if single-electron peaks determine it."""
     if detector.electrons:
-        return False
+        return Effect(0.0)
     line, gain = detector.line, detector.posterior.gain.median
-    return bool(abs(gain - line.gain) > max(LARGEST_DISAGREEMENT * gain, 3 * line.gain_error))
+    return Effect(1 - line.gain / gain, line.gain_error / gain)
 
 
 def correctable(correlation: Correlation, repairs: Repairs) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
+from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -66,16 +67,18 @@ class PhotonTransfer:
     gain_error: float = 0.0
     chi_squared: float = 1.0
 
-    @property
-    def bent(self) -> bool:
-        """Whether at least two points deviate from the line significantly and by over 2 % of the largest variance."""
-        free = self.clipped < 1e-3
-        if free.sum() < 5:
-            return False
-        departure = self.variance[free] - (self.gain * self.signal[free] + self.intercept)
-        significant = np.abs(departure) > 4 * self.variance_error[free] * max(1.0, self.chi_squared**0.25)
-        large = np.abs(departure) > 0.02 * self.variance[free].max()
-        return bool(np.sum(significant & large) >= 2)
+
+def departure(line: PhotonTransfer) -> Effect:
+    """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
+    free = line.clipped < 1e-3
+    if free.sum() < 5:
+        return Effect(0.0)
+    largest = float(line.variance[free].max())
+    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept))[free] / largest
+    second = int(np.argsort(departures)[-2])
+    # χ² counts a bend as scatter; its fourth root is between the errors with and without that
+    error = line.variance_error[free][second] / largest * max(1.0, line.chi_squared**0.25)
+    return Effect(float(departures[second]), float(error))
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:

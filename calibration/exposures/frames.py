@@ -226,8 +226,8 @@ def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[
 
 
 def read_pairs(
-    short: Sequence[str | Path],
-    long: Sequence[str | Path],
+    short: str | Path | Sequence[str | Path],
+    long: str | Path | Sequence[str | Path],
     *,
     exposure_ratio: float | None = None,
     channel: str | None = None,
@@ -235,13 +235,14 @@ def read_pairs(
     """Read exposure pairs in the order given.
 
     Args:
-        short: files of the short exposures.
-        long: files of the long exposures: one per short exposure, or one for all.
+        short: file or files of the short exposures.
+        long: file or files of the long exposures: one per short exposure, or one for all.
         exposure_ratio: exposure ratio of every pair; None if unknown.
         channel: see `frames_of`.
 
     Raises:
         FileNotFoundError: a file does not exist.
+        TypeError: arrays are given.
         ValueError: the lists do not match, a file cannot be read, or `ExposurePair` rejects a pair.
 
     Example:
@@ -251,6 +252,7 @@ def read_pairs(
         >>> pairs[0].short.shape
         (400, 400)
     """
+    short, long = _files(short), _files(long)
     if len(long) not in (1, len(short)) or not short:
         raise ValueError(
             f"{len(short)} short and {len(long)} long exposures were given; "
@@ -272,6 +274,14 @@ def read_pairs(
         )
         for one, other in zip(short, longs, strict=True)
     ]
+
+
+def _files(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    """One file or several as a list."""
+    files = [given] if isinstance(given, str | Path) else list(given)
+    if not all(isinstance(one, str | Path) for one in files):
+        raise TypeError("read_pairs takes the names of files; for arrays, use [ExposurePair(short, long)]")
+    return files
 
 
 def read_burst(

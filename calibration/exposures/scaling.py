@@ -15,6 +15,9 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
+CLEAR = 5.0
+"""Standard errors above which a deviation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
+
 CUT = 4.0
 """Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
 outliers then increase the standard deviation by 7 %."""

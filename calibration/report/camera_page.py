@@ -26,7 +26,7 @@ def describe_camera_verdict(camera: Camera) -> list[str]:
     if grade == "good":
         return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.findings)]
+    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in camera.verdict.reasons)]
 
 
 def write_camera_report(
@@ -67,7 +67,7 @@ def write_camera_report(
             [f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:MOST_LISTED]
         ]
         page.table(("y", "x", *names), rows, caption=caption)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")

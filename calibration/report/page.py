@@ -34,7 +34,7 @@ LARGEST_MISALIGNMENT = 0.1
 
 UNKNOWN_RESPONSE = (
     "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
-    "from 0.85 to 1.15; add dark frames or --exposure-ratio to measure it."
+    "from 0.8 to 1.2; add dark frames or --exposure-ratio to measure it."
 )
 
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
@@ -229,7 +229,7 @@ def write_report(
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")
@@ -254,7 +254,7 @@ def describe_verdict(findings: Findings) -> list[str]:
             "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
         ]
     head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.findings)]
+    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in findings.verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:
@@ -305,7 +305,7 @@ def _add_detector(page: Report, findings: Findings) -> None:
 
 
 def _add_models(page: Report, findings: Findings) -> None:
-    page.heading("Noise models")
+    page.heading("Noise models", folded=True)
     caption = (
         "NLL: negative log-likelihood of held-out pixels, nats per pixel; lower is better. JSD (nats), "
         "1 − BC (Bhattacharyya coefficient) and BD (Bhattacharyya distance, nats) in units of 10⁻⁴; floor: expected value for "
@@ -330,7 +330,7 @@ def _add_models(page: Report, findings: Findings) -> None:
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
-    page.heading("Registration and residual")
+    page.heading("Registration and residual", folded=True)
     if findings.burst is not None:
         page.text(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs[:most], 1):

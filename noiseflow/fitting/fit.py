@@ -16,13 +16,14 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.beginning import SHARE, begin
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
+from noiseflow.fitting.stages import fit_in_stages
 from noiseflow.fitting.steps import MakeOptimiser, adam
+from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
@@ -37,6 +38,7 @@ _log = logging.getLogger("noiseflow")
 _PART = 2**20  # pixels predicted at once
 
 
+@choosing_weight
 @torch.enable_grad()
 def fit(
     noise_model: nn.Module,
@@ -44,7 +46,7 @@ def fit(
     observation: Tensor | NDArray[Any],
     *,
     mask: Tensor | NDArray[np.bool_] | None = None,
-    weights: Tensor | NDArray[Any] | None = None,
+    weights: Tensor | NDArray[Any] | str | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
@@ -71,9 +73,9 @@ def fit(
     The loss is the mean negative log-likelihood of the training pixels, plus the ``penalty()`` of the signal model if it has one.
     Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
 
-    A joint fit begins with a quarter of its steps by least squares, then fits the noise model to the residuals, and then both:
-    from a rough signal, a noise model would take the errors of the signal for outliers. It does not if `warm_up` or
-    ``standardise=False`` says that the signal is a good one.
+    A joint fit takes half of its steps by least squares, and then three times fits the noise model to the residuals and the
+    signal under that noise: from a rough signal, a noise model would take the errors of the signal for outliers. Both are fitted
+    together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -84,7 +86,9 @@ def fit(
             noise model depends on neighbouring pixels.
         mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
         weights: how much each pixel counts, shaped like `observation`, at least 0; all count alike by default. Pixels of weight 0
-            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`).
+            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`). Or
+            ``"held-out"``: choose the weight of the signal model's ``penalty()`` by the likelihood of the held-out pixels, with
+            about six fits; ``result.weight_choice`` holds it.
         skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
             in `Digitised`. The result holds the wrapped model; a log message reports it.
@@ -145,8 +149,8 @@ def fit(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
-    if isinstance(signal_model, KnownSignal):
-        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
+    if isinstance(signal, Tensor):
+        known, seen = signal.detach().reshape(-1)[use], observation.detach().reshape(-1)[use]
         check_precision(known, seen)
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
@@ -163,6 +167,7 @@ def fit(
     settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
+    options: dict[str, Any]
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     direct = train_noise and resume is None and pixels.train.ndim == 1
@@ -173,13 +178,8 @@ def fit(
         and model.fits_directly
         and not model.needs_image
     ):
+        options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
         with few_threads(_CELLS):
-            options: dict[str, Any] = {
-                "num_steps": num_steps,
-                "weight": counted,
-                "standardise": standardise,
-                "progress": progress,
-            }
             return fit_directly(model, signal_model.flat, pixels, result, **options)
     if weights is not None:
         raise ValueError(
@@ -188,35 +188,55 @@ def fit(
         )
     settings = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     learns_signal = any(parameter.requires_grad for parameter in signal_model.parameters())
-    begun = 0
+    if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
+        raise ValueError(
+            "a quasi-Newton method needs the gradient of all pixels of one objective: a signal model with signal(), and "
+            "train_noise=False; leave out optimiser to fit by Adam"
+        )
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
-        begun = round(SHARE * num_steps)
-        if resume is None and begun:
-            options = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
-            begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
+        shared: dict[str, Any] = {
+            "mask": use.view(observation.shape),
+            "held_out": _judged(pixels),
+            "digitise": False,
+            "tabulate": tabulate,
+        }
+        shared |= {"batch_size": batch_size, "checkpoint_interval": checkpoint_interval}
+        shared |= {
+            "parameter_groups": parameter_groups,
+            "optimiser": optimiser,
+            "checkpoint": checkpoint,
+            "resume": resume,
+        }
+        options = {"num_steps": num_steps, "generator": pixels.generator, "progress": progress}
+        found = fit_in_stages(fit, model, signal_model, observation, **options, **shared)
+        return replace(found, noise_model=result.noise_model, digitisation=digitisation)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
         learning_rate,
-        standardise=standardise and resume is None and not begun,
+        standardise=standardise and resume is None,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
         optimiser=optimiser,
     )
     if resume is not None:
         loop.load_state(resume)
-    settings = replace(settings, num_steps=num_steps - begun)
     if learns_signal:
         warn_if_spinning()
-        loop.run(settings, progress, checkpoint)
-        result.num_steps += begun
-        return result
+        return loop.run(settings, progress, checkpoint)
     with few_threads(batch_size):
         return loop.run(settings, progress, checkpoint)
 
 
+def _judged(pixels: FitPixels) -> Tensor:
+    """The held-out pixels as a mask shaped like the observation."""
+    judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
+    judged.view(-1)[pixels.judge] = True
+    return judged
+
+
 def _starts_cold(noise_model: NoiseModelBase, signal_model: nn.Module) -> bool:
-    """Whether a joint fit begins with least squares: not for Gaussian noise, which is least squares, and not for repeated
-    exposures, which start from their mean."""
+    """Whether a joint fit runs in stages from least squares on: not for Gaussian noise, which is least squares, and not for
+    repeated exposures, which start from their mean."""
     return noise_model.learns and not isinstance(noise_model, Gaussian) and not isinstance(signal_model, StaticScene)
 
 

@@ -74,7 +74,7 @@ class QuasiNewton(torch.optim.Optimizer):
         search, parameters = self.state[self._parameters()[0][0]], self._parameters()
         scales = search["scales"] if search else [scale for _, scale in parameters]
         gradient = torch.zeros(sum(each.numel() for each, _ in parameters)).to(parameters[0][0])
-        parts = gradient.split([each.numel() for each, _ in parameters])
+        parts = torch.split(gradient, [each.numel() for each, _ in parameters])
         for (parameter, _), part, scale in zip(parameters, parts, scales, strict=True):
             if parameter.grad is not None:
                 torch.mul(parameter.grad.reshape(-1), scale, out=part)
@@ -84,7 +84,7 @@ class QuasiNewton(torch.optim.Optimizer):
         """Move to a point of the line, a multiple of its direction away from its start."""
         change, search["length"] = length - search["length"], length
         parameters = [parameter for parameter, _ in self._parameters()]
-        parts = search["direction"].split([each.numel() for each in parameters])
+        parts = torch.split(search["direction"], [each.numel() for each in parameters])
         for parameter, part, scale in zip(parameters, parts, search["scales"], strict=True):
             parameter.add_(part.view_as(parameter), alpha=change * scale)
 
@@ -135,11 +135,14 @@ def _newton(gradient: Tensor, steps: list[Tensor], changes: list[Tensor], per_gr
 
 def _adjusted(search: dict[str, Any], slope: float) -> float | None:
     """A better point on the line than the current one with this slope; None if it is good enough."""
-    length, first = search["length"], search["slope"]
+    length: float = search["length"]
+    first: float = search["slope"]
     too_far, too_near = slope > -_UPHILL * first, slope < _STILL_DOWNHILL * first
     if search["tries"] >= _MOST_ON_A_LINE or not (too_far or (too_near and search["far"] is None)):
         return None
     search["tries"] += 1
+    near: float
+    slope_near: float
     near, slope_near = search["near"]
     # where the slope would be zero if it changed linearly
     zero = near + (length - near) * slope_near / (slope_near - slope) if slope > slope_near else float("inf")

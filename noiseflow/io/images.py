@@ -130,7 +130,7 @@ def write(
         )
     if suffix == ".zarr":
         with atomic_folder(path) as folder:
-            ome_zarr.write(folder, data, voxel_size)
+            ome_zarr.write(folder, data, voxel_size, name=path.name.split(".")[0])
         return
     with atomic_path(path) as target:
         if suffix in MRC_SUFFIXES:

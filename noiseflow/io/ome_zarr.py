@@ -23,8 +23,8 @@ _SMALLEST_EDGE = 64
 _CHUNK = 128
 
 
-def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
-    """Write an image or volume with a pyramid of coarser levels, each binned by 2, down to 64 pixels along the longest edge."""
+def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, name: str) -> None:
+    """Write a named image or volume with a pyramid of coarser levels, each binned by 2, down to 64 pixels at the longest edge."""
     import zarr
 
     axes = "zyx"[-data.ndim :]
@@ -35,21 +35,21 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> None:
     shape, factors = data.shape, np.ones(data.ndim)
     level: Any = None
     while True:
-        name, finer = str(len(datasets)), level
+        own, finer = str(len(datasets)), level
         chunks = tuple(min(_CHUNK, edge) for edge in shape)
-        level = group.create_array(name, shape=shape, dtype=data.dtype, chunks=chunks, dimension_names=list(axes))
+        level = group.create_array(own, shape=shape, dtype=data.dtype, chunks=chunks, dimension_names=list(axes))
         for part in _parts(shape, chunks):
             level[part] = data[part] if finer is None else _halved(finer[_twice(part, finer.shape)])
         transforms = [
             {"type": "scale", "scale": list(scale * factors)},
             {"type": "translation", "translation": list(scale * (factors - 1) / 2)},
         ]
-        datasets.append({"path": name, "coordinateTransformations": transforms})
+        datasets.append({"path": own, "coordinateTransformations": transforms})
         if max(shape) <= _SMALLEST_EDGE:
             break
         factors = factors * [2 if edge > 1 else 1 for edge in shape]
         shape = tuple(max(1, edge // 2) for edge in shape)
-    multiscale: dict[str, Any] = {"name": path.stem.split(".")[0], "type": "mean", "datasets": datasets}
+    multiscale: dict[str, Any] = {"name": name, "type": "mean", "datasets": datasets}
     multiscale["axes"] = [{"name": axis, "type": "space", **unit} for axis in axes]
     group.attrs["ome"] = {"version": "0.5", "multiscales": [multiscale]}
     group.attrs["_creator"] = {"name": MARK, "version": library_version()}

@@ -43,7 +43,13 @@ def read(path: Path, *, mapped: bool = False, member: str | None = None) -> Imag
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
         series, several = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
-        if "S" in series.axes:
+        if series.axes == "SYX":
+            warnings.warn(
+                f"{path} holds {series.shape[0]} planes tagged as colours, as some programs tag "
+                "stacks of three and four; they are read as frames",
+                stacklevel=2,
+            )
+        elif "S" in series.axes:
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
         data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
         if getattr(series.pages[0], "photometric", None) == 0:

@@ -23,7 +23,7 @@ from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.metrics.evaluated_pixels import judged_pixels
-from noiseflow.metrics.tails import Tails, tails
+from noiseflow.metrics.tails import Tails, tails_of_bins
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -143,7 +143,7 @@ def evaluate(
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
         num_outside=_num_outside(noise_model, signal),
-        tails=tuple(tails(noise_model, signal[g], observation[g]) for g in groups),
+        tails=tails_of_bins(noise_model, signal, observation, groups),
     )
 
 

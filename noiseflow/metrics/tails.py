@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +41,6 @@ class Tails:
     p_value: tuple[float, ...]
 
 
-@torch.no_grad()
 def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
     """Compare the tails of (N,) observations with those of a noise model.
 
@@ -53,9 +53,19 @@ def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
         >>> found.observed[1] > 20 * found.expected[1]
         True
     """
-    order = torch.argsort(signal)
-    groups = torch.tensor_split(order, min(_LEVELS, signal.numel()))
-    level = torch.stack([signal[group].double().mean() for group in groups])[:, None]
+    return tails_of_bins(noise_model, signal, observation, [torch.arange(signal.numel(), device=signal.device)])[0]
+
+
+@torch.no_grad()
+def tails_of_bins(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
+) -> tuple[Tails, ...]:
+    """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
+    parts = [
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(_LEVELS, one.numel()))]
+        for one in bins
+    ]
+    level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))
     mean, spread = given.mean.double(), given.variance.double().sqrt()
     reach = spread * torch.tensor(BEYOND, dtype=torch.float64, device=spread.device)
@@ -64,17 +74,21 @@ def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
         given.log_interval_prob(low, high).double().exp()
         for low, high in ((-infinity, mean - reach), (mean + reach, infinity))
     )
-    weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64) / signal.numel()
-    expected = (weight @ torch.as_tensor(outside).cpu()).clamp(0, 1).numpy()
-    # within a group, residuals are taken from their own signal, so that only the scale is that of the group
-    moved = [
-        (observation[g].double() - signal[g].double() - (mean - level)[i]) / spread[i] for i, g in enumerate(groups)
-    ]
-    distance = torch.cat(moved).abs().cpu().numpy()
-    counts = np.array([(distance > k).sum() for k in BEYOND])
-    p_values = [
-        float(stats.binomtest(int(c), distance.size, float(p)).pvalue) for c, p in zip(counts, expected, strict=True)
-    ]
-    return Tails(
-        float(signal.double().mean()), tuple(counts / distance.size), tuple(map(float, expected)), tuple(p_values)
-    )
+    found, start = [], 0
+    for one in parts:
+        rows = slice(start, start + len(one))
+        start += len(one)
+        numbers = torch.tensor([part.numel() for part in one], dtype=torch.float64)
+        expected = (numbers @ torch.as_tensor(outside)[rows].cpu() / numbers.sum()).clamp(0, 1).numpy()
+        # within a part, residuals are taken from their own signal, so that only the scale is that of the part
+        off, scale = (mean - level)[rows], spread[rows]
+        moved = [
+            (observation[p].double() - signal[p].double() - o) / s for p, o, s in zip(one, off, scale, strict=True)
+        ]
+        distance = torch.cat(moved).abs().cpu().numpy()
+        counts = np.array([(distance > k).sum() for k in BEYOND])
+        tests = [stats.binomtest(int(c), distance.size, float(q)) for c, q in zip(counts, expected, strict=True)]
+        middle = float(torch.cat([signal[part] for part in one]).double().mean())
+        shares, p_values = tuple(counts / distance.size), tuple(float(test.pvalue) for test in tests)
+        found.append(Tails(middle, shares, tuple(map(float, expected)), p_values))
+    return tuple(found)

@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _NODES, _CELLS = 64, 4096
 # Width of a cell and the first one, in units of the grid, about a standard deviation: 13 of them below the mean, and 38 above
 # it, where the tail is exponential.
@@ -241,7 +240,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         charge = self._charge(value)
         if not charge.numel():
             return charge
-        dark = -0.5 * (charge / self.read_noise) ** 2 - torch.log(self.read_noise) - _LOG_SQRT_2PI - self.rate
+        dark = -0.5 * (charge / self.read_noise) ** 2 - torch.log(self.read_noise) - LOG_SQRT_2PI - self.rate
         return _added(dark, self._at(charge)[0]) - torch.log(self.gain)
 
     def cdf(self, value: Tensor) -> Tensor:

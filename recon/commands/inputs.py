@@ -17,14 +17,19 @@ from recon.commands.options import parse_mode
 from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
 from recon.series.channels import prepare_channels
 from recon.series.contrast import invert_contrast as inverted
+from recon.series.contrast import likely_mode
 from recon.series.prepare import Prepared as Prepared
 from recon.series.prepare import prepare as prepare_series
 from recon.series.tilt_series import TiltSeries, read_tilt_series
+
+AUTO = "auto"
+_BACKGROUND = {"transmission": "bright", "linear": "dark"}
 
 
 def load_tilt_series(
     path: Path,
     *,
+    output: Output,
     angles: Path | None,
     mode: str,
     invert_tilt: bool,
@@ -36,15 +41,16 @@ def load_tilt_series(
     pixel_size: float | None = None,
     exclude_views: str = "",
 ) -> TiltSeries:
-    """Read a tilt series according to the options of the command.
+    """Read a tilt series according to the options of the command; the mode ``auto`` is decided by the images.
 
     Raises:
         FileNotFoundError, ValueError: as `read_tilt_series`, or the mask does not match.
     """
+    automatic = mode.lower() == AUTO
     series = read_tilt_series(
         path,
         angles=angles,
-        mode=parse_mode(mode),
+        mode="transmission" if automatic else parse_mode(mode),
         mask=None if mask is None else _read_mask(mask),
         mask_nan=mask_nan,
         mapped=mapped,
@@ -56,6 +62,11 @@ def load_tilt_series(
         series = replace(series, tilt_angles=-series.tilt_angles)
     if invert_contrast:
         series = inverted(series)
+    if automatic:
+        found = likely_mode(series)
+        series = replace(series, mode=found or series.mode)
+        reason = "as the images do not decide" if found is None else f"as its background is {_BACKGROUND[found]}"
+        output.line(f"{path.name}: mode {series.mode}, {reason}; --mode sets it")
     return series
 
 

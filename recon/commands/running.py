@@ -169,21 +169,6 @@ def chosen_slices(
     return found
 
 
-def require_blocks(method: str, option: str) -> None:
-    """Check that a method reconstructs in blocks, as an option requires.
-
-    Raises:
-        ValueError: it does not.
-    """
-    from recon.methods import find_method, method_names
-
-    if find_method(method).blockwise is None:
-        able = [name for name in method_names() if find_method(name).blockwise is not None]
-        raise ValueError(
-            f"{option}: method {method} does not reconstruct in blocks; use --method {', '.join(able)}, or remove {option}"
-        )
-
-
 def _slices_for(
     tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None, field: str | None
 ) -> int | None:

@@ -10,11 +10,11 @@ from functools import partial
 from torch import nn
 
 from noiseflow.progress import Progress
-from recon.fields._names import AUTO
 from recon.fields._registry import field_kinds
 from recon.fields.fields import Field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
+from recon.names import AUTO
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 

@@ -20,9 +20,8 @@ from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
-from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import Readings, first_noise, learns, noise_candidates
+from recon.joint.candidates import PixelValues, first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
@@ -31,6 +30,7 @@ from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
+from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
@@ -258,7 +258,7 @@ class JointReconstructor:
         formation = response.to(self.device)
         kept: dict[str, Any] = {
             "weight": weight,
-            "regulariser": find_regulariser(DEFAULT) if self.regulariser is None else self.regulariser,
+            "regulariser": find_regulariser(REGULARISERS.first) if self.regulariser is None else self.regulariser,
             "learning_rate": rate,
             "occupancy": occupancy,
         }
@@ -294,7 +294,7 @@ class JointReconstructor:
     ) -> PlannedRun:
         """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
-        readings = Readings.of(tilt_series.images)
+        readings = PixelValues.of(tilt_series.images)
         found, saturated = readings.digitisation, readings.saturated
         simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
 

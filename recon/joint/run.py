@@ -14,13 +14,14 @@ from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
+from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
-from recon.joint.weight import WeightChoice, choose_weight
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
@@ -31,7 +32,7 @@ _TABULATED = 0.05  # nats per pixel
 
 
 @dataclass(frozen=True)
-class _Tried:
+class _TriedModel:
     """A candidate and its held-out negative log-likelihood relative to the best, nats per pixel."""
 
     model: nn.Module
@@ -133,7 +134,7 @@ class Runner:
         """
         if self.candidates is None:
             raise ValueError("a plan that chooses a noise model needs candidates")
-        signal, tried = task.signal(), list[_Tried]()
+        signal, tried = task.signal(), list[_TriedModel]()
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
         if self.least_signal is not None:
             signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
@@ -144,10 +145,10 @@ class Runner:
             return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
 
         lowest = nll(richest)
-        tried.append(_Tried(richest, 0.0))
+        tried.append(_TriedModel(richest, 0.0))
         for place, model in enumerate(simpler):
             excess = nll(model) - lowest
-            tried.insert(place, _Tried(model, excess))
+            tried.insert(place, _TriedModel(model, excess))
             if excess <= _TOLERATED:
                 break
         chosen = _simplest(tried, task)
@@ -165,13 +166,13 @@ class Runner:
         """
         model, richest = task.signal_model, self.models["chosen"]
         start = copy.deepcopy(model.state_dict()) if self._simpler else {}
-        tried, fits = list[_Tried](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
+        tried, fits = list[_TriedModel](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
         for number, noise_model in enumerate([richest, *self._simpler], 1):
             if tried:
                 model.load_state_dict(start)
             self.models["chosen"] = noise_model
             result = self._fit_signal(stage, task, stage.name if number == 1 else f"{stage.name} {number}")
-            tried.append(_Tried(noise_model, _last_nll(result)))
+            tried.append(_TriedModel(noise_model, result.last_nll))
             fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
         chosen = _simplest([*tried[1:], tried[0]], task).model
         self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
@@ -189,7 +190,7 @@ class Runner:
                 nearest = min(states, key=lambda tried: abs(math.log(tried / weight)))
                 model.load_state_dict(states[nearest][1])
             model.weight = weight
-            nll = _last_nll(self._fit_signal(stage, task, f"{stage.name} {weight:.4g}"))
+            nll = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").last_nll
             states[weight] = nll, copy.deepcopy(model.state_dict())
             return nll
 
@@ -245,18 +246,12 @@ class Runner:
         return result
 
 
-def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
+def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     """The simplest model that predicts held-out pixels nearly as well as the best."""
     best = min(each.excess for each in tried)
     judged = [replace(each, excess=each.excess - best) for each in tried]
     found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
     return tried[judged.index(found)]
-
-
-def _last_nll(result: FitResult) -> float:
-    """Held-out NLL after the last step, nats per pixel; infinite if it is NaN."""
-    nll = list(result.history.values())[-1]
-    return nll if math.isfinite(nll) else math.inf
 
 
 @torch.no_grad()

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from noiseflow import FitResult
+from noiseflow.fitting.result import WeightChoice
 from recon.joint.coarse_start import Start
 from recon.joint.plan import Facts, FitStage
 from recon.joint.run import Runner
 from recon.joint.signal_model import TomographySignal
-from recon.joint.weight import WeightChoice
 
 
 @dataclass(frozen=True)

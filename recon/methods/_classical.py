@@ -20,11 +20,12 @@ from recon.projection.wbp import WINDOWS, wbp
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, Blockwise, Images
 from recon.series.first_guess import contrast_slab, estimate_response
+from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import every_nth_view, level_of, view_numbers, without_level
+from recon.series.views import level_of, view_numbers, without_level
 
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
-_ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
+_ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 _SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
 
 
@@ -168,7 +169,7 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     """
     tilt_series, _ = without_level(tilt_series)
     rows = contrast_slab(tilt_series, _SLAB)
-    out = every_nth_view(tilt_series.tilt_angles, _LEAVE_OUT)
+    out = Holdout.views(tilt_series.tilt_angles, _LEAVE_OUT).groups == 1
     slab = replace(grid, height=rows.stop - rows.start)
     rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
     left = part_of(tilt_series, out, rows)

@@ -14,9 +14,8 @@ from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.at_level import at_level
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
-from recon.fields._names import AUTO
 from recon.fields._registry import field_kinds
-from recon.fields.regularisers._registry import find_regulariser
+from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
@@ -25,6 +24,7 @@ from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
+from recon.names import AUTO
 from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction

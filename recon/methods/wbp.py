@@ -37,6 +37,6 @@ METHOD = Method(
     "wbp",
     "Weighted back-projection; window and cutoff are chosen by held-out tilts.",
     _run,
-    refuses=("steps", "denoiser", "second axis"),
+    refuses=("steps", "denoiser", "second-axis"),
     blockwise=_blockwise,
 )

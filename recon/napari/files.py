@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     """Read an image, tilt series or volume as a layer, with its voxel size in Å; error bars next to it become hidden layers.
 
     Tilt angles in or next to the file are stored in the metadata of the layer as ``tilt_angles``, degrees. The tilt axis of the
-    stack has no length; its step is one pixel, so that one slider moves through the stack and its volume.
+    stack has no length; it counts images.
 
     Raises:
         FileNotFoundError, ValueError: as `noiseflow.io.read`.
@@ -34,19 +34,30 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     source = path if isinstance(path, str) else path[0]
     image = _read(source)
     metadata: dict[str, Any] = {"source": source}
-    scale = [1.0] * image.data.ndim if image.voxel_size is None else list(image.voxel_size[-image.data.ndim :])
+    axes = axes_of(image.voxel_size, image.data.ndim)
     if image.data.ndim == 3:
         try:
             metadata["tilt_angles"] = io.tilt_angles_of(source, image)
         except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
-            scale[0] = scale[-1]
+            axes = {"scale": (1.0, *axes["scale"][1:]), "units": ("pixel", *axes["units"][1:])}
+            axes["axis_labels"] = ("tilt", "y", "x")
     if image.voxel_size is not None:
         metadata["voxel_size"] = image.voxel_size
-    own = (image.data, {"name": Path(source).stem, "scale": scale, "metadata": metadata}, "image")
+    own = (image.data, {"name": Path(source).stem, "metadata": metadata, **axes}, "image")
     beside = [path for path in error_bar_paths(source).values() if path.exists()]
     return [own, *(error_bar_layer(_read(path).data, path.stem, own[1]) for path in beside)]
+
+
+def axes_of(voxel_size: Sequence[float] | None, dimensions: int = 3) -> dict[str, Any]:
+    """Scale, units and names of the axes of a layer: Å where the size of a voxel (z, y, x) is known, otherwise pixels."""
+    unit, size = ("pixel", (1.0, 1.0, 1.0)) if voxel_size is None else ("angstrom", voxel_size)
+    return {
+        "scale": tuple(size[-dimensions:]),
+        "units": (unit,) * dimensions,
+        "axis_labels": ("z", "y", "x")[-dimensions:],
+    }
 
 
 def _read(path: str | Path) -> io.ImageFile:
@@ -58,7 +69,8 @@ def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerD
     """A hidden layer of standard deviations or biases at the position of its volume, with a diverging colour map."""
     reach = max(float(np.abs(section).max()) for section in values) or 1.0
     look = {"name": name, "visible": False, "colormap": "PiYG", "contrast_limits": (-reach, reach)}
-    return values, {**look, "scale": volume["scale"], "metadata": dict(volume["metadata"])}, "image"
+    axes = {name: volume[name] for name in ("scale", "units", "axis_labels")}
+    return values, {**look, **axes, "metadata": dict(volume["metadata"])}, "image"
 
 
 def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:

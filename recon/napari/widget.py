@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow import io
-from recon.fields._names import DEFAULT, field_names
-from recon.napari.files import LayerData, error_bar_layer
+from recon.names import FIELDS, field_names
+from recon.napari.files import LayerData, axes_of, error_bar_layer
 
 if TYPE_CHECKING:
     from noiseflow.progress import Progress
@@ -29,9 +29,9 @@ def reconstruct_layers(
     metadata: dict[str, Any],
     *,
     angles: Path | None = None,
-    mode: str = "linear",
+    mode: str = "transmission",
     method: str = "auto",
-    field: str = DEFAULT,
+    field: str = FIELDS.first,
     thickness: int = 0,
     num_steps: int = _STEPS,
     invert_tilt: bool = False,
@@ -44,7 +44,7 @@ def reconstruct_layers(
         images: (tilt, y, x), tilt axis along y.
         metadata: metadata of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used if present.
         angles: angle file, instead of the angles of the layer.
-        mode: ``linear`` or ``transmission``.
+        mode: ``transmission`` (bright field) or ``linear`` (HAADF, EDX).
         method: one of `recon.methods.method_names`.
         field: one of `recon.fields.field_names`; the default for methods with a field of their own.
         thickness: voxels along the beam; 0 for the image width.
@@ -72,11 +72,11 @@ def reconstruct_layers(
     series = prepare(series).tilt_series
     grid = VolumeGrid.of(series, thickness or None)
     options: dict[str, Any] = {"num_steps": num_steps or None, "uncertainty": uncertainty, "progress": progress}
-    options["field"] = None if field == DEFAULT else field
+    options["field"] = None if field == FIELDS.first else field
     outcome = reconstruct(series, grid, method=method, **options)
-    scale = [pixel_size or 1.0] * 3
-    result = {"voxel_size": tuple(scale)} if pixel_size else {}
-    look = {"name": f"volume ({outcome.method})", "scale": scale, "metadata": result}
+    voxel_size = None if pixel_size is None else (pixel_size,) * 3
+    result = {} if voxel_size is None else {"voxel_size": voxel_size}
+    look = {"name": f"volume ({outcome.method})", "metadata": result, **axes_of(voxel_size)}
     bars = outcome.uncertainty
     beside = {} if bars is None else {"standard deviation": bars.std, "bias": bars.bias}
     return [
@@ -97,9 +97,9 @@ def reconstruct_widget() -> Any:
         viewer: Viewer,
         tilts: Image,
         angles: Path | None = None,
-        mode: str = "linear",
+        mode: str = "transmission",
         method: str = "auto",
-        field: str = DEFAULT,
+        field: str = FIELDS.first,
         thickness: int = 0,
         num_steps: int = _STEPS,
         invert_tilt: bool = False,
@@ -120,7 +120,7 @@ def reconstruct_widget() -> Any:
         start,
         call_button=_BUTTON,
         angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "required if the layer has no angles"},
-        mode={"choices": ["linear", "transmission"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
+        mode={"choices": ["transmission", "linear"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
         method={"choices": [name for name in method_names() if name != "joint-supervised"]},
         field={"choices": field_names(), "tooltip": "what a fitted volume is made of"},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},

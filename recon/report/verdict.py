@@ -1,4 +1,4 @@
-"""The verdict at the top of a report: grade, reasons and charts."""
+"""The verdict at the top of a report: grade, reasons and effects; and the differences that it is made of."""
 
 from __future__ import annotations
 
@@ -22,27 +22,38 @@ _WORDS = {
 
 # tolerances: larger effects are drawn here
 _MOST = 4.0
+_SHOWN = 12
 _EFFECTS = (
-    "Each check with two standard errors. Right of the dashed line an effect exceeds its tolerance; it gives a reason if it is "
-    "also significant."
+    "The {shown} largest of {all} effects, with two standard errors. Right of the dashed line an effect exceeds its tolerance; "
+    "it gives a reason if it is also significant."
 )
 
 
-def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeries, result: Result) -> None:
-    """Add heading, grade, reasons and charts of a verdict to a report.
+def add_verdict(report: Report, verdict: Verdict[Finding]) -> None:
+    """Add heading, grade, reasons and effects of a verdict to a report.
 
     Args:
         report: the page.
         verdict: the verdict.
-        tilt_series: the data.
-        result: the reconstruction, whose projections are compared with the data.
     """
     report.heading("Verdict")
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
     effects = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
-    report.figure(_effects(effects), caption=_EFFECTS)
+    shown = sorted(effects, key=lambda pair: -_size(pair[1]))[:_SHOWN]
+    report.charts([_effects(shown)], caption=_EFFECTS.format(shown=len(shown), all=len(effects)))
+
+
+def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
+    """Add a folded section with the differences of each image from the projection of the volume.
+
+    Args:
+        report: the page.
+        tilt_series: the data.
+        result: the reconstruction, whose projections are compared with the data.
+    """
+    report.heading("Differences of each image", folded=True)
     residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)
     angles = residuals.tilt_angles
@@ -60,14 +71,19 @@ def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeri
     report.charts(charts, caption=caption)
 
 
+def _size(effect: dict[str, Any]) -> float:
+    """The size of an effect in tolerances."""
+    return float(abs(effect["value"]) / effect["tolerance"])
+
+
 def _effects(effects: list[tuple[str, dict[str, Any]]]) -> Any:
-    """All effects with two standard errors, in their tolerances."""
-    figure, axis = new_chart("Effects and their tolerances", x="size of the effect, tolerances", y="")
-    figure.set_size_inches(7, 0.16 * len(effects) + 0.8)
-    places = np.arange(len(effects))[::-1]
-    sizes, errors = (
-        np.array([abs(each[part]) / each["tolerance"] for _, each in effects]) for part in ("value", "error")
+    """Effects with two standard errors, in their tolerances."""
+    figure, axis = new_chart(
+        "Effects and their tolerances", x="size of the effect, tolerances", y="", width=5.6, height=3.2
     )
+    places = np.arange(len(effects))[::-1]
+    sizes = np.array([_size(each) for _, each in effects])
+    errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
     fired = np.array([each["cost"] >= 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
         axis.errorbar(
@@ -75,6 +91,7 @@ def _effects(effects: list[tuple[str, dict[str, Any]]]) -> Any:
             places[which],
             xerr=np.minimum(2 * errors, _MOST)[which],
             fmt="o",
+            markersize=4,
             color=colour,
         )
     axis.axvline(1, color=COLOURS["warm"], linewidth=1, linestyle="--")

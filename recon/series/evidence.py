@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.defocused_projector import gaussian_matrix
+from recon.series.holdout import Holdout
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
-from recon.series.views import Directions, view_numbers
+from recon.series.views import Directions
 
-_GAP = 15.0  # degrees; closer neighbours predict each other for any axis
-_FEWEST_GAPS = 5  # three between the outer two, the smallest number with a spread
 _FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
 _DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
 _MORE_COMPACT = 1.2  # volumes of one object with equally good axes differ by up to 1.1
@@ -35,7 +34,7 @@ class Evidence:
         unchanged: (tilt,) the same for images interpolated across the gap without a volume.
         unconserved: (tilt,) share of the profile along the axis (row sums over u) that differs from the mean profile.
         occupied: share of voxels that the volume fills.
-        gaps: (tilt,) index of the gap of each tilt.
+        holdout: the gaps.
     """
 
     axis: float
@@ -43,12 +42,12 @@ class Evidence:
     unchanged: NDArray[np.float64]
     unconserved: NDArray[np.float64]
     occupied: float
-    gaps: NDArray[np.int64]
+    holdout: Holdout
 
     @property
     def residual(self) -> float:
         """Unexplained share of the variance in gaps between other tilts."""
-        return float(self.unexplained[self._between].mean())
+        return float(self.unexplained[self.holdout.between].mean())
 
     @property
     def images_hardly_change(self) -> bool:
@@ -70,16 +69,12 @@ class Evidence:
             return False
         return self.lead_over(other) >= _DETERMINED
 
-    @property
-    def _between(self) -> NDArray[np.bool_]:
-        return np.asarray((self.gaps > 0) & (self.gaps < self.gaps.max()))
-
     def as_dict(self) -> dict[str, Any]:
         """For programs."""
         return {
             "tilt_axis_degrees": self.axis,
             "unexplained_in_gaps": self.residual,
-            "unconserved_along_axis": float(self.unconserved[self._between].mean()),
+            "unconserved_along_axis": float(self.unconserved[self.holdout.between].mean()),
             "occupied": self.occupied,
         }
 
@@ -91,28 +86,25 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
     which smooth the noise least and fit it best, would be preferred. The outer gaps are held out like the others, but are not
     counted, because they are extrapolated.
     """
-    directions = Directions.of(np.asarray(matcher.projector.tilt_angles))
-    gaps, view = _gaps(directions.angles), _View.of(matcher, found)
+    angles = np.asarray(matcher.projector.tilt_angles)
+    directions, holdout = Directions.of(angles), Holdout.gaps(angles)
+    view = _View.of(matcher, found)
     mirrored = torch.from_numpy(directions.mirrored).to(view.images.device)[:, None, None]
     facing = torch.where(mirrored, view.images.flip(2), view.images)
-    unexplained, unchanged = np.zeros((2, len(gaps)))
-    for fold in range(_FOLDS):
-        out = gaps % _FOLDS == fold
+    unexplained, unchanged = np.zeros((2, len(angles)))
+    for out in holdout.folds(_FOLDS):
         across = torch.tensordot(torch.from_numpy(_interpolation(directions.angles, out)).to(facing), facing, 1)
         unexplained[out] = view.errors(view.predicted_without(out))[out]
         unchanged[out] = view.errors(torch.where(mirrored, across.flip(2), across))[out]
     conserved = _unconserved(view.images, view.seen)
-    return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, gaps)
+    return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, holdout)
 
 
 def unexplained_in_halves(matcher: Matcher, found: Match) -> float:
     """Unexplained share of the variance when volumes of every second view predict the others; refines directions locally."""
     view, angles = _View.of(matcher, found), np.asarray(matcher.projector.tilt_angles)
-    rank = view_numbers(angles) % 2
-    return float(
-        sum(view.errors(view.predicted_without(rank == half, _CONVERGED))[rank == half].sum() for half in (0, 1))
-        / len(rank)
-    )
+    halves = Holdout.halves(angles).folds(2)
+    return float(sum(view.errors(view.predicted_without(out, _CONVERGED))[out].sum() for out in halves) / len(angles))
 
 
 @dataclass(frozen=True)
@@ -154,13 +146,6 @@ class _View:
         return ((down @ (difference * self.inside) @ across).square() * self.inside).sum((1, 2))
 
 
-def _gaps(angles: NDArray[np.float64]) -> NDArray[np.int64]:
-    extent = float(np.ptp(angles))
-    count = max(_FEWEST_GAPS, int(extent // _GAP))
-    numbers: NDArray[np.int64] = (count * (angles - angles.min()) / extent).astype(np.int64)
-    return np.minimum(numbers, count - 1)
-
-
 def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(tilt, tilt) weights for linear interpolation in angle from the kept tilts on both sides of each tilt."""
     order = np.flatnonzero(~out)[np.argsort(angles[~out], kind="stable")]
@@ -183,7 +168,6 @@ def _unconserved(images: Tensor, seen: Tensor) -> NDArray[np.float64]:
 
 def _standard_errors(difference: NDArray[np.float64], evidence: Evidence) -> float:
     """The mean over gaps between other tilts, divided by its standard error."""
-    numbers = range(1, int(evidence.gaps.max()))
-    means = [difference[evidence.gaps == gap].mean() for gap in numbers if (evidence.gaps == gap).any()]
+    means = [difference[gap].mean() for gap in evidence.holdout.tilts() if evidence.holdout.between[gap[0]]]
     error = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else np.inf
     return float(np.mean(means)) / max(error, 1e-12)

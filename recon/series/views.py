@@ -93,17 +93,6 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(numbers[back], dtype=np.int64)
 
 
-def every_nth_view(tilt_angles: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
-    """(tilt,) True for one view in `count`, evenly spaced from the middle view to both sides, each with all its duplicates.
-
-    Args:
-        tilt_angles: (tilt,) degrees, in any order.
-        count: at least two.
-    """
-    numbers = view_numbers(tilt_angles)
-    return np.asarray(np.abs(numbers - numbers.max() / 2).astype(np.int64) % count == count // 2)
-
-
 def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
     """(tilt,) index of the first tilt with equal angle, image and mask; exact copies contain no new information.
 

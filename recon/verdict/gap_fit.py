@@ -11,12 +11,10 @@ from scipy import linalg, sparse
 
 from noiseflow.statistics import neighbour_products
 from recon.projection.projector import joseph
-from recon.series.views import Directions
+from recon.series.holdout import GAP, Holdout
 
 Array = NDArray[Any]
-GAP = 12.0  # degrees: closer tilts predict each other
 _RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses
-_FEWEST_GAPS = 4
 # steps of conjugate gradients; the rows of a border of a fifth then differ from the exact fit by less than a thousandth
 _COMPLETIONS = 20
 
@@ -53,7 +51,7 @@ class GapFit:
         matrix = np.zeros((len(angles) * detector_width, depth * width + 1), np.float32)
         matrix[rays, voxels] = weights
         matrix[:, -1] = np.sqrt(np.mean(matrix[:, :-1].sum(1) ** 2))
-        self.detector_width, self.gaps = detector_width, contiguous_gaps(angles, gap)
+        self.detector_width, self.gaps = detector_width, Holdout.gaps(angles, gap).tilts()
         normal = matrix.T @ matrix
         prior = _roughness(depth, width)
         scale = smoothness * float(np.trace(normal[:-1, :-1])) / float(prior.data[prior.row == prior.col].sum())
@@ -109,16 +107,6 @@ class GapFit:
             power, before = (residual**2).sum(0), power
             step = residual + power / np.maximum(before, 1e-30) * step
         return np.asarray(found)
-
-
-def contiguous_gaps(angles: Array, degrees: float) -> list[Array]:
-    """Tilts grouped into contiguous ranges of `degrees` of direction, at least four; duplicates stay together, also those 180°
-    apart."""
-    values, back = np.unique(np.round(Directions.of(angles).angles, 3), return_inverse=True)
-    span = float(values[-1] - values[0])
-    count = int(max(_FEWEST_GAPS, round(span / degrees)))
-    group = np.minimum(((values - values[0]) / max(span, 1e-9) * count).astype(int), count - 1)
-    return [np.flatnonzero(group[back] == number) for number in np.unique(group)]
 
 
 def shared(images: Array) -> float:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import Effect
+from recon.series.holdout import GAP
 from recon.verdict.coarse import Coarse
-from recon.verdict.gap_fit import GAP, GapFit
+from recon.verdict.gap_fit import GapFit
 from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]

@@ -13,7 +13,7 @@ from . import simulators as sim
 
 
 def reasons(found):
-    return {one.name for one in found.verdict.findings}
+    return {one.reason for one in found.verdict.findings}
 
 
 def calibration_burst(frames):

@@ -43,7 +43,10 @@ def test_reader_gives_pixels_angles_and_scale(needle):
     assert not rest
     assert kind == "image"
     assert len(attributes["metadata"]["tilt_angles"]) == len(pixels)
-    assert attributes["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][2]] * 3)
+    pixel = attributes["metadata"]["voxel_size"][2]
+    assert attributes["scale"] == pytest.approx((1.0, pixel, pixel))
+    assert attributes["units"] == ("pixel", "angstrom", "angstrom")
+    assert attributes["axis_labels"] == ("tilt", "y", "x")
 
 
 def test_reader_declines_what_is_not_its_own():
@@ -56,7 +59,8 @@ def test_written_volume_comes_back_with_its_voxel_size(tmp_path):
     assert write_image(path, volume, {"metadata": {"voxel_size": (7.0, 7.0, 7.0)}}) == [path]
     ((pixels, attributes, _),) = get_reader(path)(path)
     np.testing.assert_array_equal(pixels, volume)
-    assert attributes["scale"] == pytest.approx([7.0, 7.0, 7.0])
+    assert attributes["scale"] == pytest.approx((7.0, 7.0, 7.0))
+    assert attributes["units"] == ("angstrom",) * 3
 
 
 def test_layer_is_reconstructed_with_progress(needle):
@@ -65,20 +69,22 @@ def test_layer_is_reconstructed_with_progress(needle):
     volume, result, _ = reconstruct_layer(
         pixels,
         attributes["metadata"],
+        mode="linear",
         method="tv",
         thickness=16,
         num_steps=8,
         progress=lambda task, done, total, note: steps.append((done, total)),
     )
     assert volume.shape == (16, 6, 64)
-    assert result["scale"] == pytest.approx([attributes["metadata"]["voxel_size"][-1]] * 3)
+    assert result["scale"] == pytest.approx((attributes["metadata"]["voxel_size"][-1],) * 3)
+    assert result["axis_labels"] == ("z", "y", "x")
     assert steps[-1][0] == steps[-1][1]
     assert [done for done, _ in steps] == sorted(done for done, _ in steps)
 
 
 def test_error_bars_come_as_hidden_layers_from_the_widget_and_from_files(needle, tmp_path):
     ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
-    options = {"method": "tv", "thickness": 16, "num_steps": 4, "uncertainty": 2}
+    options = {"mode": "linear", "method": "tv", "thickness": 16, "num_steps": 4, "uncertainty": 2}
     volume, *bars = reconstruct_layers(pixels, attributes["metadata"], **options)
     assert [look["name"] for _, look, _ in bars] == ["standard deviation", "bias"]
     assert all(values.shape == volume[0].shape and not look["visible"] for values, look, _ in bars)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from recon.fields.fields import EMPTY, Field
 from recon.fields.upsampling import upsample
-from recon.projection.saved_gradient import SavedGradient
+from recon.projection.gradients import SavedGradient
 from recon.projection.tiles import Tiles
 
 # Half width of the bend of `positive`, units. Softplus bends over several units: the slope of vacuum is a thousandth of that of

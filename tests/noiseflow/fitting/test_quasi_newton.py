@@ -8,7 +8,9 @@ import pytest
 import torch
 from torch import nn
 
+import noiseflow
 from noiseflow.fitting.quasi_newton import QuasiNewton
+from noiseflow.fitting.signal_models import KnownSignal
 from noiseflow.fitting.steps import quasi_newton, take_step
 
 
@@ -87,3 +89,8 @@ def test_a_parameter_without_a_gradient_stays():
     for _ in range(10):
         take_step(optimiser, loss)
     assert torch.equal(idle.detach(), torch.ones(3, dtype=torch.float64))
+
+
+def test_a_trained_noise_model_is_refused():
+    with pytest.raises(ValueError, match="train_noise"):
+        noiseflow.fit(noiseflow.Gaussian(), KnownSignal(torch.ones(500)), torch.rand(500), optimiser=quasi_newton)

@@ -61,6 +61,12 @@ def test_a_large_stack_stays_out_of_memory(tmp_path, monkeypatch, name, write):
     np.testing.assert_array_equal(io.read(tmp_path / name).data, STACK)
 
 
+def test_ome_zarr_carries_its_name(tmp_path):
+    zarr = pytest.importorskip("zarr")
+    io.write(tmp_path / "needle.ome.zarr", STACK)
+    assert zarr.open(tmp_path / "needle.ome.zarr", mode="r").attrs["ome"]["multiscales"][0]["name"] == "needle"
+
+
 def test_ome_zarr_is_written_piece_by_piece(tmp_path, monkeypatch):
     pytest.importorskip("zarr")
     monkeypatch.setattr(ome_zarr, "_CHUNK", 32)

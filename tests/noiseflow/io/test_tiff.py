@@ -56,6 +56,14 @@ def test_colour_is_refused_by_name(tmp_path: Path, dtype: str) -> None:
     assert "damaged" not in str(caught.value)
 
 
+@pytest.mark.parametrize("number", [3, 4])
+def test_frames_that_their_program_tagged_as_colours_are_read(tmp_path: Path, number: int) -> None:
+    frames = np.arange(number * 20, dtype="u2").reshape(number, 4, 5)
+    tifffile.imwrite(tmp_path / "a.tif", frames, photometric="rgb", planarconfig="separate")
+    with pytest.warns(UserWarning, match="frames"):
+        np.testing.assert_array_equal(io.read(tmp_path / "a.tif").data, frames)
+
+
 @pytest.mark.parametrize("compression", [None, "zlib"])
 def test_claims_beyond_the_file_are_refused(tmp_path: Path, compression: str | None) -> None:
     path = tmp_path / "a.tif"
