@@ -169,6 +169,11 @@ def fit(
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     options: dict[str, Any]
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
+    if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
+        raise ValueError(
+            "a quasi-Newton method needs the gradient of all pixels of one objective: a signal model with signal(), and "
+            "train_noise=False; leave out optimiser to fit by Adam"
+        )
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     direct = train_noise and resume is None and pixels.train.ndim == 1
     if (
@@ -188,11 +193,6 @@ def fit(
         )
     settings = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     learns_signal = any(parameter.requires_grad for parameter in signal_model.parameters())
-    if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
-        raise ValueError(
-            "a quasi-Newton method needs the gradient of all pixels of one objective: a signal model with signal(), and "
-            "train_noise=False; leave out optimiser to fit by Adam"
-        )
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
         shared: dict[str, Any] = {
             "mask": use.view(observation.shape),
