@@ -30,6 +30,22 @@ SCENES = {
 """Name → phantom, noise, weight."""
 
 
+_HEAD = f"""# Optimisers of the volume
+
+The volume is fitted by L-BFGS on the sum of grids (`noiseflow.fitting.quasi_newton`), one gradient per step, with a smooth
+positive map and no learning rate. Adam, which fits networks and Gaussians, is shown with its decay over the given number of
+evaluations.
+
+Volume PSNR (dB), {SIZE}³ voxels, 40 tilts, true noise, fixed weight; one fit each, a quarter of it by least squares. Two
+fits of a scene differ by 0.1 dB.
+
+```sh
+python -m benchmarks.pages.optimisers
+```"""
+_LIMITS = """The objective is not convex, and long fits at the weight of short ones follow noise (*shells, outliers*). The
+likelihood of held-out pixels, which also chooses the weight, stops them."""
+
+
 class AdamGrids(MultiresolutionField):
     """The sum of grids, fitted by Adam."""
 
@@ -66,24 +82,7 @@ def page(cells: dict[str, dict[str, Any]], place: str) -> str:
         for name in FITS:
             found = [cells[f"{scene}/{name}/{count}"] for count in EVALUATIONS]
             rows.append([scene, name, *(f"{each['psnr']:.2f}" for each in found), f"{found[-1]['seconds']:.1f}"])
-    return (
-        "\n\n".join(
-            [
-                "# Optimisers of the volume",
-                "The volume is fitted by L-BFGS on the sum of grids (`noiseflow.fitting.quasi_newton`), one gradient per step, with a "
-                "smooth positive map and no learning rate. Adam, which fits networks and Gaussians, is shown with its decay over the "
-                "given number of evaluations.",
-                f"Volume PSNR (dB), {SIZE}³ voxels, 40 tilts, true noise, fixed weight; one fit each. A quarter of the evaluations "
-                "begins from the coarse reconstruction. Two fits of a scene differ by 0.1 dB.",
-                "```sh\npython -m benchmarks.pages.optimisers\n```",
-                table(header, rows),
-                "The objective is not convex, and long fits with the weight of short ones follow noise (*shells, outliers*): the "
-                "held-out likelihood, which also chooses the weight, stops them.",
-                place,
-            ]
-        )
-        + "\n"
-    )
+    return "\n\n".join([_HEAD, table(header, rows), _LIMITS, place]) + "\n"
 
 
 def main() -> None:
