@@ -25,7 +25,8 @@ from recon.series.masks import binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _COARSE = 24
-_ROUNDS = 2
+# Steps between two measurements of the noise width, which is too large at a rough start.
+_ROUND = 20
 _LEAST_BINNING = 4
 _HIGHEST_RATE, _RATE = 0.24, 0.36
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
@@ -94,14 +95,14 @@ def coarse_start(
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1)
     with num_threads(1):  # operations on 24³ voxels
-        for _ in range(_ROUNDS):  # the first is regularised for the noise and misfit of the start
+        for _ in range(max(1, num_steps // _ROUND)):
             fit(
                 Gaussian(),
                 signal_model,
                 images,
                 mask=use,
                 digitise=False,
-                num_steps=num_steps // _ROUNDS,
+                num_steps=min(num_steps, _ROUND),
                 train_noise=False,
                 generator=generator,
                 parameter_groups=field.parameter_groups(),
