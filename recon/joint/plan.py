@@ -77,7 +77,7 @@ class Schedule:
     quiet: int = 80
 
     def for_adam(self) -> Schedule:
-        """The schedule with three times as many steps of signals (`docs/benchmarks/optimisers.md`)."""
+        """The schedule with three times as many steps of signals (`benchmarks/pages/optimisers.py`)."""
         names = ("settle", "adapt", "trial", "quiet_trial", "whole", "quiet")
         return replace(self, **{name: 3 * getattr(self, name) for name in names})
 
