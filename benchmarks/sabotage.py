@@ -31,7 +31,7 @@ STANDARD = tuple(
 TILTS = "-60:60:3"
 RIGHT = 0.3  # dB below the series without defects
 _OTHER = 9  # added to the seed to get another object of the same type
-Result = tuple[TiltSeries, Any, Verdict[Any]]
+Result = tuple[TiltSeries, Any, Verdict]
 
 
 def run(
@@ -114,7 +114,7 @@ def _result(series: TiltSeries, method: str, seed: int, thickness: int | None = 
         return prepared, result, judge(prepared, result, screening=screening)
 
 
-def _graded(verdict: Verdict[Any]) -> Cell:
+def _graded(verdict: Verdict) -> Cell:
     """Grade and reasons, and the evidence of every check, from which limits can be fitted without another run."""
     found = {"grade": verdict.grade, "subjects": list(verdict.subjects), "reasons": list(verdict.reasons)}
     return found | {"evidence": verdict.evidence, "not_tested": verdict.not_tested}

@@ -13,8 +13,8 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import Case, judge, said
-from noiseflow.checks import Finding, Verdict
+from calibration.verdict import CalibrationCase, judge, said
+from noiseflow.checks import Verdict
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 
@@ -56,7 +56,7 @@ class Camera:
     """
 
     figures: CameraFigures
-    verdict: Verdict[Finding]
+    verdict: Verdict
     maps: dict[str, Image]
     model: nn.Module
 
@@ -75,9 +75,9 @@ def calibrate_camera(
     return Camera(figures, judge_camera(figures), maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
-def judge_camera(figures: CameraFigures) -> Verdict[Finding]:
+def judge_camera(figures: CameraFigures) -> Verdict:
     """Test the assumptions behind the figures."""
-    return judge(Case(figures.correlation, camera=figures))
+    return judge(CalibrationCase(figures.correlation, camera=figures))
 
 
 def maps_of(figures: CameraFigures) -> dict[str, Image]:

@@ -160,7 +160,8 @@ def _calibrate_camera(
     import noiseflow
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
     from calibration.exposures.frames import read_burst, read_levels
-    from calibration.report.camera_page import describe_camera_verdict, write_camera_report
+    from calibration.report.camera_page import write_camera_report
+    from calibration.report.page import describe_verdict
 
     if not flat:
         raise ValueError(
@@ -183,7 +184,7 @@ def _calibrate_camera(
     )
     maps = write_maps(camera, output)
     out.table(("figure", "value"), rows_of(camera))
-    out.line("\n" + "\n".join(describe_camera_verdict(camera)))
+    out.line("\n" + "\n".join(describe_verdict(camera.verdict)))
     out.line(
         f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else "")
     )

@@ -19,8 +19,8 @@ from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
-from calibration.verdict import Case, judge, refusal
-from noiseflow.checks import Finding, Verdict
+from calibration.verdict import CalibrationCase, judge, refusal
+from noiseflow.checks import Verdict
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Findings:
     no_detector: str = ""
     burst: BurstReport | None = None
     figures: Figures | None = None
-    verdict: Verdict[Finding] = field(default_factory=lambda: Verdict("bad", ()))
+    verdict: Verdict = field(default_factory=lambda: Verdict("bad", ()))
     correlation: Correlation | None = None
     repairs: Repairs = field(default_factory=Repairs)
     pattern: Image | None = None
@@ -156,7 +156,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = Case(correlation, raw[0], raw[1], pairs, repairs)
+    case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)

@@ -34,7 +34,7 @@ GOOD = "all assumptions passed their tests"
 
 
 @dataclass(frozen=True)
-class Case:
+class CalibrationCase:
     """A calibration to assess, from exposures of a scene or from flats and darks.
 
     Attributes:
@@ -96,7 +96,7 @@ class Case:
         return known and (self.camera is not None or correctable(self.correlation, self.repairs))
 
 
-def _shown(case: Case, *, filtered: bool) -> Effect:
+def _shown(case: CalibrationCase, *, filtered: bool) -> Effect:
     """Change of the gain by correlated pixels."""
     found = case.correlation
     if not found.found or case.electrons or case.filtered != filtered:
@@ -107,7 +107,7 @@ def _shown(case: Case, *, filtered: bool) -> Effect:
     return Effect(found.factor - 1 if found.local else value, found.factor_error if filtered else 0.0, what)
 
 
-def _period(case: Case, *, linear: bool) -> Effect:
+def _period(case: CalibrationCase, *, linear: bool) -> Effect:
     found = case.correlation
     known = found.step != 1 and case.filtered
     if not found.period or case.classes or case.electrons or known != linear:
@@ -115,7 +115,7 @@ def _period(case: Case, *, linear: bool) -> Effect:
     return Effect(found.period, what=f" by {1 / found.step:.2g} with linear interpolation" if linear else "")
 
 
-def _misfit(case: Case, *, corrected: bool) -> Effect:
+def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
     """Largest share of the residual variance that follows the scene; corrected if a kernel leaves no share and no correlation."""
     repairs = case.repairs
     if not repairs.scene:
@@ -134,22 +134,22 @@ CAUSES = {
 }
 
 
-def _lag(case: Case) -> Effect:
+def _lag(case: CalibrationCase) -> Effect:
     lag, error = case.camera.lag if case.camera is not None else correlation_in_time(case.pairs)
     return Effect(2 * lag, 2 * error, f"{lag:+.3f}")  # the variance of differences changes by twice the correlation
 
 
-def _field(case: Case) -> Effect:
+def _field(case: CalibrationCase) -> Effect:
     return Effect(0.0) if case.pattern.factors else Effect(case.pattern.relative, case.pattern.error)
 
 
-def _classes(case: Case) -> Effect:
+def _classes(case: CalibrationCase) -> Effect:
     gains = ", ".join(f"{case.gain * one:.4g}" for one in case.pattern.factors)
     what = f"{case.pattern.name}, with gains of {gains} counts/e⁻"
     return Effect(case.pattern.relative, case.pattern.error, what) if case.pattern.factors else Effect(0.0)
 
 
-def _response(case: Case) -> Effect:
+def _response(case: CalibrationCase) -> Effect:
     if not case.response.known:
         raise NotTested("the exposures do not determine the response")
     return Effect(case.response.exponent - 1, case.response.error, f"{case.response.exponent:.3f}")
@@ -164,12 +164,12 @@ def _compressed(frame: Image | None) -> Effect:
     return Effect(1.0, what=kind) if wavelet_compressed(frame) else Effect(0.0)
 
 
-def _joined(case: Case, *, few: bool) -> Effect:
+def _joined(case: CalibrationCase, *, few: bool) -> Effect:
     share = case.repairs.joined
     return Effect(share if (share <= MOST_JOINED) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
 
 
-def _ratio(case: Case) -> Effect:
+def _ratio(case: CalibrationCase) -> Effect:
     ratios = [pair.scaling.slope * pair.exposure_ratio for pair in case.pairs if pair.exposure_ratio is not None]
     worst = max((abs(float(np.log(one))) if one > 0 else np.inf for one in ratios), default=0.0)
     return Effect(worst, what="" if not worst else f"{1 / case.pairs[0].scaling.slope:.3g}")
@@ -194,27 +194,27 @@ def full_share(pair: AlignedPair, *, bins: int = 32) -> float:
     return float(counts[valley:].sum() / values.size) if second else 0.0
 
 
-def _of(name: str, *, null: float = 0.0) -> Callable[[Case], Effect]:
+def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
     """An attribute of the detector."""
     return lambda case: Effect(getattr(case.detector, name, null))
 
 
-def _levels(case: Case) -> Effect:
+def _levels(case: CalibrationCase) -> Effect:
     assert case.camera is not None
     used, given = len(case.camera.linear), len(case.camera.levels)
     what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
     return Effect(max(3 - used, 0), what=what)
 
 
-def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[Case], Effect]:
-    def of_case(case: Case) -> Effect:
+def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationCase], Effect]:
+    def of_case(case: CalibrationCase) -> Effect:
         assert case.camera is not None
         return Effect(float(measure(case.camera)))
 
     return of_case
 
 
-Row = Check[Case]
+Row = Check[CalibrationCase]
 # fmt: off
 COMMON: tuple[Row, ...] = (
     Row("filter", "correlated pixels", "distortion", lambda case: _shown(case, filtered=True), "of the gain", BIAS,
@@ -341,7 +341,7 @@ CAMERA_CHECKS: tuple[Row, ...] = (*FLATS, *COMMON)
 """The checks of flats and darks."""
 
 
-def judge(case: Case) -> Verdict[Finding]:
+def judge(case: CalibrationCase) -> Verdict:
     """Test the assumptions behind the results."""
     guard = Guard()
     found = run(CHECKS if case.camera is None else CAMERA_CHECKS, case, guard)
@@ -349,7 +349,7 @@ def judge(case: Case) -> Verdict[Finding]:
     return verdict_of(found.values(), evidence, good=GOOD, guard=guard)
 
 
-def said(verdict: Verdict[Finding]) -> dict[str, Any]:
+def said(verdict: Verdict) -> dict[str, Any]:
     """The verdict as plain values: ``verdict``, its ``reasons``, the ``evidence`` of every check, and what was ``not_tested``."""
     reasons = [
         {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
@@ -363,7 +363,7 @@ def said(verdict: Verdict[Finding]) -> dict[str, Any]:
     }
 
 
-def refusal(case: Case, why: str) -> Verdict[Finding]:
+def refusal(case: CalibrationCase, why: str) -> Verdict:
     """The verdict on exposures whose gain cannot be measured, for the reason `why`; compression may explain it."""
     guard, sentence = Guard(), f"the detector was not measured: {why}"
     reason = Finding("detector", "not measurable", "fact", Effect(1.0), "", 0.0, 3.0, sentence, RAW)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,7 +115,7 @@ def white_regression(columns: Array, values: Array, *, ridge: float = 0.0) -> tu
     left = values - found @ scaled.T
     # the factor corrects for the fitted coefficients, as in any estimate of a variance
     errors = np.sqrt((left**2) @ spread**2 * (rows / max(1, rows - fitted)))
-    return found / scale, np.maximum(errors, 1e-30) / scale
+    return found / scale, np.maximum(errors, 1e-15) / scale
 
 
 def block_means(images: Array, down: int, across: int) -> Array:
@@ -130,3 +131,11 @@ def block_means(images: Array, down: int, across: int) -> Array:
     height, width = rows // down, columns // across
     whole = images[..., : height * down, : width * across]
     return np.asarray(whole.reshape(*stack, height, down, width, across).mean((-3, -1)))
+
+
+def own_random(seed: int) -> np.random.Generator:
+    """A random stream that shares no numbers with ``np.random.default_rng(seed)``, which may have drawn the data.
+
+    A split of pixels drawn with the numbers of their signals would hold out the darkest pixels.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(b"noiseflow"),)))

@@ -83,6 +83,15 @@ class Reconstruction:
             orientation=orientation,
         )
 
+    def levelled(self, x_tilt: float) -> Reconstruction:
+        """The result with a level volume and level error bars, see `recon.Volume.levelled`; projections do not change."""
+        if not x_tilt:
+            return self
+        bars, choices = self.uncertainty, self.choices | {"levelled about x (°)": f"{x_tilt:.3g}"}
+        if bars is not None:
+            bars = replace(bars, std=bars.std.levelled(x_tilt), bias=bars.bias.levelled(x_tilt))
+        return replace(self, volume=self.volume.levelled(x_tilt), uncertainty=bars, choices=choices)
+
     @property
     def field(self) -> Field | None:
         """The volume as a field, which has values at any point; None for methods without one, and for volumes in blocks."""

@@ -26,6 +26,7 @@ from calibration.report.figures import (
     residual_figure,
     snr_figure,
 )
+from noiseflow.checks import Verdict
 from noiseflow.io import output_folder
 from noiseflow.report import Report, provenance
 
@@ -246,20 +247,18 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
     return facts
 
 
-def describe_verdict(findings: Findings) -> list[str]:
+def describe_verdict(verdict: Verdict) -> list[str]:
     """Return the grade and its reasons, one string each."""
-    grade = findings.verdict.grade
-    if grade == "good":
-        return [
-            "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
-        ]
-    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in findings.verdict.reasons)]
+    if verdict.grade == "good":
+        return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
+    bad = verdict.grade == "bad"
+    head = "bad. Do not use the figures:" if bad else "doubtful. Use the figures with these reservations:"
+    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:
     """Describe the reliability of the detector's parameters, the noise model and the registration."""
-    found = describe_verdict(findings)
+    found = describe_verdict(findings.verdict)
     if findings.scores:
         found.append(verdict(findings.scores))
     if findings.burst is None and findings.pairs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.fitting.conditions import fit_by_condition
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
@@ -26,6 +27,7 @@ from noiseflow.fitting.steps import MakeOptimiser, adam
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
+from noiseflow.models.conditioned import Conditioned, flat_conditions
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
@@ -45,6 +47,7 @@ def fit(
     signal: Tensor | NDArray[Any] | nn.Module,
     observation: Tensor | NDArray[Any],
     *,
+    condition: Mapping[str, Any] | None = None,
     mask: Tensor | NDArray[np.bool_] | None = None,
     weights: Tensor | NDArray[Any] | str | None = None,
     skip_non_finite: bool = False,
@@ -84,6 +87,8 @@ def fit(
             define ``parameter_groups()``, parameter groups with learning rates for Adam.
         observation: noisy images, a tensor or array of any shape and real type, detector units; images (..., y, x) if the
             noise model depends on neighbouring pixels.
+        condition: what the noise depends on beyond the signal, such as ``{"gain": …}``: numbers, or arrays that broadcast with
+            the observation, by name. The result holds a `Conditioned` model. Only for known signals and models of single pixels.
         mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
         weights: how much each pixel counts, shaped like `observation`, at least 0; all count alike by default. Pixels of weight 0
             are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`). Or
@@ -154,8 +159,19 @@ def fit(
         check_precision(known, seen)
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
+    model = model.model if isinstance(model, Conditioned) else model
+    options: dict[str, Any]
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
+    if condition is not None:
+        if model.needs_image or not isinstance(signal, Tensor) or np.ndim(held_out):
+            raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
+        given = {name: each[use] for name, each in flat_conditions(condition, observation).items()}
+        options = {"digitise": False, "held_out": held_out, "num_steps": num_steps, "batch_size": batch_size}
+        options |= {"learning_rate": learning_rate, "generator": generator, "progress": progress}
+        counted = None if counted is None else counted[use]
+        whole = FitResult(model, digitisation)
+        return fit_by_condition(fit, model, known, seen, given, counted, whole, options)
     if model.needs_image and observation.ndim < 2:
         raise ValueError(
             f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
@@ -167,7 +183,6 @@ def fit(
     settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
-    options: dict[str, Any]
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
     if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
         raise ValueError(
@@ -185,7 +200,11 @@ def fit(
     ):
         options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
         with few_threads(_CELLS):
-            return fit_directly(model, signal_model.flat, pixels, result, **options)
+            fit_directly(model, signal_model.flat, pixels, result, **options)
+            if model.match_levels(signal_model.flat[use], pixels.observation[use]):
+                options |= {"standardise": False, "num_steps": result.num_steps + num_steps}
+                fit_directly(model, signal_model.flat, pixels, result, **options)
+            return result
     if weights is not None:
         raise ValueError(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "

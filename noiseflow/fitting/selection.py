@@ -97,9 +97,9 @@ def default_candidates() -> dict[str, nn.Module]:
         "ExcessNoise": excess_noise.ExcessNoise(),
         "SharedMixture8": mixture.Mixture(8, shared_shape=True),
         "RadialFlow": flow.RadialFlow(),
+        "Mixture4": mixture.Mixture(4),
         "PhysicsFlow": physics_flow.PhysicsFlow(),
         "Mixture8": mixture.Mixture(8),
-        "SplineFlow": flow.SplineFlow(),
     }
 
 
@@ -123,7 +123,7 @@ def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, neglig
         if item.excess <= max(min(item.excess_error, most), negligible):
             return item
     raise ValueError(
-        "some validation pixels are impossible under every candidate; add a more flexible candidate such as SplineFlow()"
+        "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"
     )
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.electrons.exact import log_density
+from noiseflow.fitting.cells import count
 from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32
@@ -20,8 +21,6 @@ _NUM_CLIMBS = 3
 _SETTLED, _SETTLING_STEPS = 16384, 24
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
-# Levels up to which pixels are counted, and ranges of signals, each a small fraction of a standard deviation of shot noise.
-_MOST_LEVELS, _RANGES = 512, 96
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
 _FLATTEST = 0.04
 
@@ -188,16 +187,11 @@ def few_pixels(signal: Tensor, observation: Tensor, *, most: int = _SETTLED) -> 
     Returns:
         Signals, observations and weights, (C,) each; the weights sum to 1.
     """
-    levels, level = torch.unique(observation, return_inverse=True)
-    if levels.numel() > _MOST_LEVELS:
-        part = _part(signal, most)
-        return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
-    root = torch.sqrt((signal - signal.min()).double())
-    row = torch.floor(root / root.max().clamp(min=1e-30) * (_RANGES - 1)).long()
-    _, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
-    count = torch.bincount(cell).double()
-    mean, value = (torch.bincount(cell, each.double()) / count for each in (signal, levels[level]))
-    return mean.to(signal.dtype), value.to(observation.dtype), count / count.sum()
+    cells = count(signal, observation)
+    if cells is not None:
+        return cells.signal, cells.values, cells.weight.double()
+    part = _part(signal, most)
+    return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:

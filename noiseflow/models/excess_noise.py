@@ -28,6 +28,8 @@ _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
 _FITTED, _ITERATIONS = 8192, 40
+# Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
+_LEAST_GAIN = 1e-3
 
 
 class ExcessNoise(ElectronCounter):
@@ -99,7 +101,7 @@ class ExcessNoise(ElectronCounter):
         third = torch.stack([(residual[group] ** 3).mean() for group in groups])
         product, floor = _line(mean, second, second**2)
         skew, _ = _line(mean, third, second**3)
-        product = max(product, 1e-6 * float(second.mean()) / max(float(s.abs().mean()), 1e-12))
+        product = max(product, _LEAST_GAIN * math.sqrt(float(second.mean())))
         squared = 1 / (2 - min(max(skew / product**2, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product
@@ -206,7 +208,10 @@ class ExcessNoiseDistribution(NoiseDistribution):
         phase = turn / unit
         zero = torch.zeros_like(phase)
         pulse = torch.exp(-torch.log1p(torch.complex(zero, -phase * self.pulse_variance)) / self.pulse_variance)
-        several = torch.exp(-rate[:, None]) * torch.expm1(rate[:, None] * pulse) / -torch.expm1(-rate[:, None])
+        few, many = rate[:, None].clamp(max=_ALIGNED), rate[:, None].clamp(min=_ALIGNED)
+        several = torch.exp(-few) * torch.expm1(few * pulse) / -torch.expm1(-few)
+        # without a pulse there are then fewer than 1e-13 of the pixels, and exponentials of large rates would overflow
+        several = torch.where(rate[:, None] > _ALIGNED, torch.exp(many * (pulse - 1)), several)
         moved = torch.complex(-0.5 * (phase * self.read_noise) ** 2, -(turn * _START + phase * origin))
         density = torch.fft.irfft(torch.conj(several * torch.exp(moved)), n=_CELLS) / _WIDTH
         density = density.clamp(min=_LEAST)

@@ -310,7 +310,7 @@ def reconstruct(
         raise ValueError("--fsc needs a report; name its folder with --report")
     if save_noise_model is not None:
         require_setting(method, "save-noise-model")
-    with ExitStack() as locks, warnings_as_lines(output) as warned:
+    with ExitStack() as locks, warnings_as_lines() as warned:
         for target in targets.values():
             locks.enter_context(locked(target.volume))
         fixed = load_noise_model(noise_model)

@@ -96,7 +96,7 @@ def resume_command(context: typer.Context) -> str:
 
 
 @contextlib.contextmanager
-def warnings_as_lines(output: Output) -> Iterator[list[str]]:
+def warnings_as_lines() -> Iterator[list[str]]:
     """Show each warning once, as one line; yield the list that collects them."""
     told: list[str] = []
 

@@ -13,12 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.fitting.contest import mean_and_error
 from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
 from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
+from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
@@ -29,6 +32,9 @@ _BATCH = 4096  # pixels per noise-model step
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _TABULATED = 0.05  # nats per pixel
+# Standard errors by which another regulariser must predict better: on most scenes, the difference is about one.
+_SIGNIFICANT = 3
+_BLOCK = 4  # pixels
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class Runner:
         models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_signal: the lowest signal that a noise model allows, detector units.
+        regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         first_weight: initial weight of the search.
         generator: source of the random choices.
         run_fit: runs every fit.
@@ -83,6 +90,7 @@ class Runner:
         *,
         candidates: MakeCandidates | None = None,
         least_signal: Callable[[nn.Module], float] | None = None,
+        regularisers: Sequence[Regulariser] = (),
         first_weight: float,
         generator: torch.Generator,
         run_fit: RunFit = run_fit,
@@ -92,6 +100,7 @@ class Runner:
     ) -> None:
         self.tasks, self.models = tasks, models
         self.candidates, self.least_signal = candidates, least_signal
+        self.regularisers = regularisers
         self.first_weight, self.generator, self.run_fit = first_weight, generator, run_fit
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
@@ -196,8 +205,32 @@ class Runner:
 
         self.weight_choice = choose_weight(held_out_nll, self.first_weight)
         model.load_state_dict(min(states.values(), key=lambda tried: tried[0])[1])
+        model.weight = self.weight_choice.weight
+        self._priors(stage, task)
         for each in self.tasks.values():
-            each.signal_model.weight = self.weight_choice.weight
+            each.signal_model.weight, each.signal_model.regulariser = model.weight, model.regulariser
+
+    def _priors(self, stage: FitStage, task: Task) -> None:
+        """Compare the other regularisers with the usual one at its weight, and take one that predicts held-out pixels
+        significantly better. The task is left in that state.
+
+        On smooth blobs with 100 counts, the second order gains 2.7 dB; half the weight loses against the usual regulariser there.
+        """
+        model, noise_model = task.signal_model, self.models[stage.noise]
+        if needs_image(noise_model):
+            return
+        usual = _held_out(task, noise_model)
+        for regulariser in self.regularisers:
+            before, state = model.regulariser, copy.deepcopy(model.state_dict())
+            model.regulariser = regulariser
+            self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
+            found = _held_out(task, noise_model)
+            gain, error = mean_and_error(found - usual, _blocks(task))
+            if gain > _SIGNIFICANT * error:
+                usual = found
+            else:
+                model.load_state_dict(state)
+                model.regulariser = before
 
     def _fit_signal(self, stage: FitStage, task: Task, name: str) -> FitResult:
         """Fit volume and response with a fixed noise model."""
@@ -252,6 +285,24 @@ def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     judged = [replace(each, excess=each.excess - best) for each in tried]
     found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
     return tried[judged.index(found)]
+
+
+@torch.no_grad()
+def _held_out(task: Task, noise_model: nn.Module) -> Tensor:
+    """Log-likelihoods of the held-out pixels, (P,)."""
+    judged = _judged(task)
+    log_prob: Tensor = noise_model(task.signal()[judged]).log_prob(task.observation[judged])
+    return log_prob.double()
+
+
+def _judged(task: Task) -> Tensor:
+    return task.held_out if task.use is None else task.held_out & task.use
+
+
+def _blocks(task: Task) -> Tensor:
+    """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
+    tilt, u, y = torch.nonzero(_judged(task), as_tuple=True)
+    return (tilt * task.observation.shape[1] + u // _BLOCK) * task.observation.shape[2] + y // _BLOCK
 
 
 @torch.no_grad()

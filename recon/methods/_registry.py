@@ -40,7 +40,9 @@ class Settings:
     """User settings of a reconstruction. The method chooses the values of settings that are None.
 
     Attributes:
-        weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`.
+        weight: weight of the regulariser, see `recon.joint.signal_model.TomographySignal`; None to choose it by the likelihood
+            of held-out pixels. Three times the chosen weight smooths visibly: a smooth object lost 5 dB. The noise model does not
+            depend on it.
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
         field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
@@ -221,7 +223,9 @@ def require_setting(method: str, name: str) -> None:
     """
     if not find_method(method).takes(name):
         able = [other for other in method_names() if find_method(other).takes(name)]
-        raise ValueError(f"--{name}: method {method} does not support it; use --method {', '.join(able)}")
+        raise ValueError(
+            f"--{name}: method {method} does not support it; use --method {', '.join(able)}, or remove --{name}"
+        )
 
 
 @takes_fields_of(Settings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from recon.joint.stages import Repeated
 from recon.methods._classical import LineIntegralProblem, best_num_iterations, classical, in_blocks
 from recon.methods._registry import Method, Settings
-from recon.projection.sirt import sirt
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -14,12 +13,8 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 def _run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
     count = settings.num_steps or best_num_iterations(tilt_series, grid, run_stage=settings.run_stage)
     problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
-    measured, projector = problem.line_integrals, problem.projector
-    iterations = Repeated(
-        measured.new_zeros(grid.shape),
-        lambda volume, _: sirt(measured, projector, num_iterations=1, start=volume),
-        count,
-    )
+    empty = problem.line_integrals.new_zeros(grid.shape)
+    iterations = Repeated(empty, lambda volume, _: problem.sirt(1, volume), count)
     settings.run_stage("SIRT", iterations)
     return classical("sirt", problem, iterations.value, grid, {"iterations": count})
 
@@ -31,7 +26,7 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
         tilt_series,
         grid,
         settings.device,
-        lambda problem: sirt(problem.line_integrals, problem.projector, num_iterations=count),
+        lambda problem: problem.sirt(count),
         {"iterations": count},
     )
 

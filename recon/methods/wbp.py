@@ -17,7 +17,7 @@ def _filter(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
 def _run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
     window, cutoff = _filter(tilt_series, grid, settings)
     problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
-    volume = wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff)
+    volume = wbp(problem.filled(), problem.projector, window=window, cutoff=cutoff)
     return classical("wbp", problem, volume, grid, {"window": window, "cutoff": cutoff})
 
 
@@ -28,7 +28,7 @@ def _blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) ->
         tilt_series,
         grid,
         settings.device,
-        lambda problem: wbp(problem.line_integrals, problem.projector, window=window, cutoff=cutoff),
+        lambda problem: wbp(problem.filled(), problem.projector, window=window, cutoff=cutoff),
         {"window": window, "cutoff": cutoff},
     )
 

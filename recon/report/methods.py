@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from noiseflow.checks import Finding, Verdict
+from noiseflow.checks import Verdict
 from noiseflow.installation import library_version
 from recon.methods._registry import find_method
 from recon.reconstruction import Reconstruction
@@ -12,7 +12,7 @@ _MODES = {"transmission": "bright-field images", "linear": "images of linear con
 _PAPER = "H. Kniesel et al., Clean Implicit 3D Structure from Noisy 2D STEM Images, CVPR 2022, doi:10.1109/CVPR52688.2022.02018"
 
 
-def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict[Finding] | None = None) -> str:
+def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None = None) -> str:
     """Sentences with data, method, chosen parameters, grade, version and citation.
 
     Args:

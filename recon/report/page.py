@@ -11,7 +11,7 @@ import torch
 
 from noiseflow import io
 from noiseflow.arrays import strided
-from noiseflow.checks import Finding, Guard, Verdict
+from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
@@ -48,7 +48,7 @@ def reconstruction_report(
     seed: int | None = None,
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
-    verdict: Verdict[Finding] | None = None,
+    verdict: Verdict | None = None,
     guard: Guard | None = None,
 ) -> Report:
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
@@ -101,12 +101,10 @@ def _add_uncertainty(report: Report, tilt_series: TiltSeries, outcome: Reconstru
 
 def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     report.heading("Settings and choices", folded=True)
-    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    report.table(("setting", "value", "evidence"), settings(outcome), prose=True)
 
 
-def _add_methods(
-    report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict[Finding] | None
-) -> None:
+def _add_methods(report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None) -> None:
     report.heading("Methods, to paste into a paper", folded=True)
     report.text(methods_paragraph(tilt_series, outcome, verdict))
 
@@ -136,7 +134,7 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
     return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
 
 
-def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
+def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [

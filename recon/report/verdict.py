@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import Finding, Verdict
+from noiseflow.checks import Verdict
 from noiseflow.report import COLOURS, Report, add_legend, new_chart
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
@@ -29,7 +29,7 @@ _EFFECTS = (
 )
 
 
-def add_verdict(report: Report, verdict: Verdict[Finding]) -> None:
+def add_verdict(report: Report, verdict: Verdict) -> None:
     """Add heading, grade, reasons and effects of a verdict to a report.
 
     Args:

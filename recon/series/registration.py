@@ -136,7 +136,7 @@ def register(
                 f"the two series do not show one specimen about axes near 90° apart: the volume of each explains {share:.0%} of "
                 "the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
             )
-        return _registration(pair.settled(found[0]), pair)
+        return _registration(pair.settled(found[0]))
 
 
 def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
@@ -316,7 +316,7 @@ def _correlated(one: Tensor, other: Tensor) -> tuple[float, Tensor]:
     return float(found.max() / norm), place.flip(0).to(one)
 
 
-def _registration(pose: _Pose, pair: _Pair) -> AxisRegistration:
+def _registration(pose: _Pose) -> AxisRegistration:
     """The rotation as one about the first axis, one in the plane of the specimen, and one about the second axis."""
     rotation, shift = pose.rotation.double().cpu().numpy(), pose.shift.double().cpu().numpy()
     sign = 1.0 if rotation[0, 1] > 0 else -1.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import Effect
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import robust_deviation, white_regression
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -61,7 +61,7 @@ def distortions(residuals: Residuals) -> dict[str, Distortion]:
     absorb a part of each distortion, so the result is a lower bound. Tilts at the ends of the range are measured but not
     included, because there a regularised volume has neighbours on one side only, and its projection lags behind the image.
     """
-    found = [_of_tilt(*pair) for pair in _fields(residuals)]
+    found = [white_regression(*pair, ridge=1e-6) for pair in _fields(residuals)]
     estimates, errors = zip(*found, strict=True)
     units = _units(residuals)
     return {
@@ -99,17 +99,6 @@ def _slope_over_tilts(residuals: Residuals) -> Array:
     if len(angles) < 2:
         return np.zeros_like(residuals.projections)
     return np.asarray(np.gradient(residuals.projections[first], np.deg2rad(angles), axis=0)[back])
-
-
-def _of_tilt(columns: Array, residual: Array) -> tuple[Array, Array]:
-    """Coefficients and their standard errors; undetermined coefficients have infinite errors."""
-    scale = np.sqrt((columns**2).sum(0)) + 1e-30
-    scaled = columns / scale
-    inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))
-    found = inverse @ (scaled.T @ residual)
-    left = scaled * (residual - scaled @ found)[:, None]
-    variance: Array = np.diag(inverse @ (left.T @ left) @ inverse)
-    return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distortion:

@@ -1,6 +1,7 @@
 """The plan as data: what will be done for six kinds of series, and that what is done is what was planned."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import noiseflow
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
+from recon.joint.run import run_fit
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import shells
@@ -199,3 +201,22 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
 def test_stages_are_values():
     assert FitStage("a", "signal", "whole", "simple", 3) == FitStage("a", "signal", "whole", "simple", 3)
     assert total_steps([FitStage("a", "weights", "slab", "simple", 3, fits=5)]) == 15
+
+
+def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None:
+    clean, _ = clean_tilt_series(
+        shells(16, generator=np.random.default_rng(1), count=4),
+        np.arange(-60, 61, 10.0),
+        acquisition=ACQUISITIONS["skewed"],
+    )
+    weights: dict[str, float] = {}
+
+    def watched(name: str, noise_model: Any, signal: Any, observation: Any, **options: Any) -> noiseflow.FitResult:
+        weights[name] = getattr(signal, "weight", np.nan)
+        return run_fit(name, noise_model, signal, observation, **options)
+
+    once = Schedule(settle=1, candidate=1, adapt=1, refine=1, learn=1, describe=1, whole=4)
+    noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=1)
+    JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
+    assert weights["settle"] == weights["adapt"] < 1
+    assert weights["begin"] == weights["fit"] == 16
