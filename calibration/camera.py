@@ -232,7 +232,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
     for name, attribute in intervals.items():
         value = getattr(figures, attribute)
-        found[name] = None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
+        found[name] = None if value is None else vars(value)
     found["electrons_per_count"] = 1 / figures.gain.median
     found["correlation_factor"] = figures.correlation.factor
     zero = figures.offset or 0.0
@@ -257,21 +257,17 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
         return figures
     factor = correlation.factor
 
-    def times(value: Interval, by: float) -> Interval:
-        return Interval(value.median * by, value.q05 * by, value.q95 * by)
+    def over(value: float | None) -> float | None:
+        return None if value is None else value / factor
 
-    gain, straight = times(figures.gain, factor), times(figures.if_linear, factor)
-    noise = None if figures.dark_noise is None else times(figures.dark_noise, 1 / np.sqrt(factor))
-    dsnu = None if figures.dsnu is None else figures.dsnu / factor
-    current = None if figures.dark_current is None else figures.dark_current / factor
     return replace(
         figures,
-        gain=gain,
-        if_linear=straight,
-        dark_noise=noise,
+        gain=figures.gain.times(factor),
+        if_linear=figures.if_linear.times(factor),
+        dark_noise=None if figures.dark_noise is None else figures.dark_noise.times(1 / np.sqrt(factor)),
         saturation=figures.saturation / factor,
-        dsnu=dsnu,
-        dark_current=current,
+        dsnu=over(figures.dsnu),
+        dark_current=over(figures.dark_current),
     )
 
 

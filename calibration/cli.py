@@ -246,7 +246,7 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
         return None
 
     def interval(value: Interval | None) -> dict[str, float] | None:
-        return None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
+        return None if value is None else vars(value)
 
     found = detector.posterior
     return {

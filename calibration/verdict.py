@@ -122,7 +122,7 @@ def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
         return Effect(0.0)
     before, after = (max(fits, key=lambda one: one.largest[1]) for fits in (repairs.scene, repairs.scene_after))
     left = case.correlation.found or (after.clear and after.largest[1] > LEAST_SHARE)
-    if (repairs.refitted and not left) != corrected:
+    if (repairs.refitted and not left) != corrected or before.largest[1] <= LEAST_SHARE:
         return Effect(0.0)
     return Effect(before.largest[1], before.error, CAUSES[before.largest[0]])
 
@@ -275,8 +275,9 @@ SCENES: tuple[Row, ...] = (
         "of the residual variance", LEAST_SHARE,
         "{value:.1%} of the residual variance follows the scene ({what}); a convolution kernel between the exposures corrects it "
         "to a few percent of the gain", "repeat the exposures", score=CLEAR, local=True),
+    # what a kernel leaves is no blur, and changes the gain by many times its share
     Row("fit to the scene", "scene misfit", "distortion", lambda case: _misfit(case, corrected=False),
-        "of the residual variance", LEAST_SHARE,
+        "of the residual variance", lambda case: LEAST_SHARE / (3 if case.repairs.refitted else 1),
         "{value:.1%} of the residual variance follows the scene ({what})", "repeat the exposures", score=CLEAR),
     # whichever their size: those subtracted matter
     Row("rows", "row offsets", "distortion", lambda case: Effect(case.repairs.rows), "counts", 0.0,

@@ -161,10 +161,9 @@ def _of_interpolation(pair: AlignedPair) -> Image:
     """Return the (K,) correlation that warping introduces into white noise of the long exposure."""
     if pair.frames > 1:
         return np.zeros(len(LAGS))
-    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-    warped = pair.registration.warp(noise)[0]
-    if warped is noise:
+    if not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
+    warped = pair.registration.warped_noise(pair.long.shape)
     products = [float(np.mean(warped[first] * warped[second])) for first, second in (_shifted(*lag) for lag in LAGS)]
     return np.array(products) / float(np.mean(warped**2))
 

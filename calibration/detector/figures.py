@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.measure import Detector
-from calibration.detector.posterior import Interval
+from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.repair import Repairs
 from noiseflow.checks import Effect
 from noiseflow.described import described
@@ -26,9 +26,6 @@ by its square, 0.25 %, which biases the offset but hardly the gain."""
 RESAMPLED_ERROR = 0.03
 """Relative standard error of a gain corrected for linear interpolation, whose noise depends on the sampled sub-pixel positions
 (frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
-
-NINETY = 1.645
-"""Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
 
 @described(gain="counts per electron", offset="counts", read_noise="electrons")
@@ -116,7 +113,7 @@ def _with_line(detector: Detector) -> Interval:
     value in 83 to 86 % of simulated pairs. The interval of photon transfer uses no prior and contained it in 91 %.
     Single-electron peaks determine the gain to 0.1 % and need no correction.
     """
-    gain, line = detector.posterior.gain, _normal(detector.line.gain, detector.line.gain_error)
+    gain, line = detector.posterior.gain, Interval.normal(detector.line.gain, detector.line.gain_error)
     if detector.electrons or detector.offset is not None or any(one.common.any() for one in detector.levels):
         return gain
     return Interval(gain.median, min(gain.q05, line.q05), max(gain.q95, line.q95))
@@ -125,13 +122,13 @@ def _with_line(detector: Detector) -> Interval:
 def _by_line(detector: Detector) -> Figures:
     """Return the gain from photon transfer, and offset and read noise from dark frames only."""
     line = detector.line
-    gain = _normal(line.gain, line.gain_error)
+    gain = Interval.normal(line.gain, line.gain_error)
     if detector.offset is None:
         return Figures(gain, None, None, "photon transfer")
     read = detector.dark_deviation
     relative = float(np.hypot(line.gain_error / line.gain, 1e-3))
-    noise = None if read is None else _normal(read / line.gain, read / line.gain * relative)
-    return Figures(gain, _normal(*detector.offset), noise, "photon transfer")
+    noise = None if read is None else Interval.normal(read / line.gain, read / line.gain * relative)
+    return Figures(gain, Interval.normal(*detector.offset), noise, "photon transfer")
 
 
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
@@ -146,11 +143,5 @@ def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
     whole = middle * float(np.linalg.norm((width, error / factor, resampled)))
     read = figures.read_noise
-    noise = (
-        None if read is None else Interval(*(value / np.sqrt(factor) for value in (read.median, read.q05, read.q95)))
-    )
-    return Figures(_normal(middle, whole), figures.offset, noise, figures.source, factor)
-
-
-def _normal(middle: float, error: float) -> Interval:
-    return Interval(middle, middle - NINETY * error, middle + NINETY * error)
+    noise = None if read is None else read.times(1 / np.sqrt(factor))
+    return Figures(Interval.normal(middle, whole), figures.offset, noise, figures.source, factor)

@@ -80,7 +80,7 @@ def contained_share(pair: AlignedPair) -> float:
     both exposures is then white, and includes all noise of the long one. Detail of a scene is not white because of the optics,
     and the long exposure has additional noise.
     """
-    if pair.frames > 1 or pair.registration.warp(pair.long)[0] is not pair.long:  # a contained frame needs no warping
+    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
         return 0.0
     inner = np.asarray(ndimage.binary_erosion(pair.mask, np.ones((5, 5)), border_value=0))
     inner &= np.abs(pair.short - pair.signal) < CLEAR * np.std((pair.short - pair.signal)[pair.mask])

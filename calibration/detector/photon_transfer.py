@@ -134,6 +134,14 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
     rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
-    variance = (levels.variance - rounding) / (1 + levels.shot_share)
+    signal, variance = levels.signal, levels.variance - rounding
+    if levels.absolute and len(signal) > 2:
+        # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
+        true = signal + levels.shift
+        slope = np.gradient(true, signal)
+        kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
+        signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
+    else:
+        variance = variance / (1 + levels.shot_share)
     error = variance * np.sqrt(2 / np.maximum(levels.count * levels.weight, 1))
-    return levels.signal, variance, error, levels.clipped()
+    return signal, variance, error, levels.clipped()

@@ -176,6 +176,5 @@ def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Imag
 
 
 def _gain_of_warped(pair: AlignedPair, kernel: Image) -> float:
-    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-    warped = pair.registration.warp(noise)[0]
+    warped = pair.registration.warped_noise(pair.long.shape)
     return float(np.var(ndimage.correlate(warped, kernel, mode="nearest")) / np.var(warped))

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import stats
+from numpy.typing import NDArray
+from scipy.special import bdtr, bdtrc
 from torch import Tensor, nn
 
 from noiseflow.described import described
@@ -16,8 +17,10 @@ from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 BEYOND = (3.0, 4.0, 5.0)
 """Distances from the mean, standard deviations of the model."""
 
-# Signals that represent a bin; within one, the mean moves by less than a tenth of the bin.
+# Signals that represent all pixels; within one, the mean moves by less than a tenth of the range.
 _LEVELS = 32
+# Signals that represent one of several bins, which are narrow.
+_LEVELS_OF_A_BIN = 8
 
 
 @described(signal="detector units")
@@ -32,7 +35,8 @@ class Tails:
         signal: mean signal of the pixels.
         observed: (3,) shares of the pixels.
         expected: (3,) shares under the model.
-        p_value: (3,) two-sided probabilities, under the model, of counts at least as unlikely as the observed ones.
+        p_value: (3,) two-sided probabilities, under the model, of counts as far from the expected ones as the observed: twice the
+            smaller of those of at most and of at least the observed count.
     """
 
     signal: float
@@ -61,9 +65,9 @@ def tails_of_bins(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
 ) -> tuple[Tails, ...]:
     """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
+    number = _LEVELS if len(bins) == 1 else _LEVELS_OF_A_BIN
     parts = [
-        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(_LEVELS, one.numel()))]
-        for one in bins
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(number, one.numel()))] for one in bins
     ]
     level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))
@@ -87,8 +91,18 @@ def tails_of_bins(
         ]
         distance = torch.cat(moved).abs().cpu().numpy()
         counts = np.array([(distance > k).sum() for k in BEYOND])
-        tests = [stats.binomtest(int(c), distance.size, float(q)) for c, q in zip(counts, expected, strict=True)]
         middle = float(torch.cat([signal[part] for part in one]).double().mean())
-        shares, p_values = tuple(counts / distance.size), tuple(float(test.pvalue) for test in tests)
-        found.append(Tails(middle, shares, tuple(map(float, expected)), p_values))
+        found.append(
+            Tails(
+                middle,
+                tuple(counts / distance.size),
+                tuple(map(float, expected)),
+                tuple(map(float, _two_sided(counts, distance.size, expected))),
+            )
+        )
     return tuple(found)
+
+
+def _two_sided(counts: NDArray[np.int64], number: int, share: NDArray[np.float64]) -> NDArray[np.float64]:
+    at_least = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), number, share), 1.0)
+    return np.asarray(np.minimum(2 * np.minimum(bdtr(counts, number, share), at_least), 1.0))

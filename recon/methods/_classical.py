@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
+from recon.methods._registry import Method, Settings
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
@@ -84,37 +85,44 @@ class LineIntegralProblem:
             return np.asarray(images.contiguous().cpu().numpy() + np.float32(self.level))
 
 
-def classical(
-    name: str, problem: LineIntegralProblem, volume: Tensor, grid: VolumeGrid, choices: dict[str, float | str]
-) -> Reconstruction:
-    """The result of a method without a fitted noise model."""
-    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
-    return Reconstruction(result, problem.predict(volume), name, choices=choices)
+Solve = Callable[[LineIntegralProblem, RunStage | None], Tensor]
+Settle = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, dict[str, float | str]]]
 
 
-def in_blocks(
-    name: str,
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    device: torch.device | str,
-    solve_problem: Callable[[LineIntegralProblem], Tensor],
-    choices: dict[str, float | str],
-) -> Blockwise:
-    """Block-wise reconstruction by a method with independent slices, with the response of the whole series."""
-    level = level_of(tilt_series)
-    response = estimate_response(tilt_series, level=level).to(device)
-    projector = projector_of(tilt_series, grid, device)
+def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str, ...]) -> Method:
+    """A method with independent slices and without a fitted noise model.
 
-    def solve(part: TiltSeries, block: Block) -> tuple[Images, Images]:
-        lowered = part.with_images(np.asarray(part.images - np.float64(level), dtype=np.float32), part.mask)
-        problem = LineIntegralProblem.seen_by(response, projector, lowered, level)
-        volume = solve_problem(problem)
-        return volume.cpu().numpy(), problem.predict(volume)
+    Args:
+        name, description, refuses: as for `Method`.
+        settle: makes the choices for a series; returns how to solve a problem, with stages or at once, and the choices.
+    """
 
-    def finish(volume: Volume, projections: Images) -> Reconstruction:
-        return Reconstruction(volume, projections, name, choices=choices)
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        solve, choices = settle(tilt_series, grid, settings)
+        problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
+        volume = solve(problem, settings.run_stage)
+        result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
+        return Reconstruction(result, problem.predict(volume), name, choices=choices)
 
-    return Blockwise(solve, finish)
+    def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
+        """All blocks have the response of the whole series."""
+        solve, choices = settle(tilt_series, grid, settings)
+        level = level_of(tilt_series)
+        response = estimate_response(tilt_series, level=level).to(settings.device)
+        projector = projector_of(tilt_series, grid, settings.device)
+
+        def solve_block(part: TiltSeries, block: Block) -> tuple[Images, Images]:
+            lowered = part.with_images(np.asarray(part.images - np.float64(level), dtype=np.float32), part.mask)
+            problem = LineIntegralProblem.seen_by(response, projector, lowered, level)
+            volume = solve(problem, None)
+            return volume.cpu().numpy(), problem.predict(volume)
+
+        def finish(volume: Volume, projections: Images) -> Reconstruction:
+            return Reconstruction(volume, projections, name, choices=choices)
+
+        return Blockwise(solve_block, finish)
+
+    return Method(name, description, run, refuses=refuses, blockwise=blockwise)
 
 
 def best_window(

@@ -65,7 +65,7 @@ def test_signal_without_gradients_follows_every_step():
         optimiser.step()
         with torch.no_grad():
             torch.testing.assert_close(model(everything), model.signal())
-            model.field.values.add_(0.1)
+            model.field.grids[0].add_(0.1)
             torch.testing.assert_close(model(everything), model.signal())
 
 
@@ -107,7 +107,7 @@ def test_a_step_after_any_change_sees_it():
     model.image_formation.requires_grad_(False)
     with torch.no_grad():
         before = model(torch.arange(model.num_pixels))
-        model.field.values += 1
+        model.field.grids[0] += 1
     assert (model.signal() < before).any()
     with torch.no_grad():
         model(torch.tensor([0]))  # after a step: its gradient is kept
@@ -120,8 +120,8 @@ def test_penalty_does_not_depend_on_the_unit_of_attenuation():
     small, large = small_signal_model(), small_signal_model()
     with torch.no_grad():
         large.field.scale.mul_(7.0)
-        small.field.values.add_(torch.rand(5, 6, 4, generator=torch.Generator().manual_seed(0)))
-        large.field.values.copy_(small.field.values)
+        small.field.grids[0].add_(torch.rand(5, 6, 4, generator=torch.Generator().manual_seed(0)))
+        large.field.grids[0].copy_(small.field.grids[0])
     torch.testing.assert_close(small.penalty(), large.penalty())
     torch.testing.assert_close(small_signal_model(weight=0.0).penalty(), torch.tensor(0.0))
 
