@@ -143,8 +143,9 @@ def select(
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit, and those that start
-    at their maximum likelihood, are fitted once; of the default candidates, `costly` ones only if no simpler model suffices.
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit are first
+    fitted for 80 steps, and those that search for a detector only started; those far behind then stop. Of the default candidates,
+    `costly` ones are tried only if no simpler model suffices.
     Others are first fitted briefly to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats
     and three standard errors); the
     rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is
