@@ -127,8 +127,8 @@ def page(content: dict[str, Any]) -> str:
         f"{len(cells(0))} cells have been measured; any number of the first ones covers scenes, noises and tilt ranges evenly. "
         "Cells of commits before 9005e41 lack the choice of the regulariser.\n\n"
         "The truncated object at 0…177° with outliers is a failure, and its cause is not known. Without the tilts beyond 60° it "
-        "is the same (14.2 dB). The flexible noise models are suspected: what leaves the field of view looks like outliers. With "
-        "`--method l2` there is no such loss."
+        "is the same (14.2 dB). The flexible noise models are suspected: what leaves the field of view looks like outliers. "
+        "Least squares at its default weight has not been measured there."
         "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
     )
     summary = table(["scenes", f"default within {_EQUAL} dB of the best", "mean gain (dB)", "worst (dB)"], lines)
