@@ -9,7 +9,6 @@ from noiseflow.runs.outputs import require_other as require_other
 from noiseflow.runs.partials import partial_folder as partial_folder
 
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
-from .angles import advice_on_count as advice_on_count
 from .angles import angle_file_of as angle_file_of
 from .angles import read_angles as read_angles
 from .angles import read_tilts as read_tilts

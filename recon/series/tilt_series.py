@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from noiseflow import io, statistics
 from noiseflow.described import described, size_of
 from noiseflow.io import mapped
+from noiseflow.io.angles import advice_on_count
 from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
@@ -81,7 +82,7 @@ class TiltSeries:
         if len(self.images) != len(self.tilt_angles):
             raise ValueError(
                 f"the stack has {len(self.images)} images, but there are {len(self.tilt_angles)} tilt angles; "
-                f"{io.advice_on_count(self.images.shape, len(self.tilt_angles))}"
+                f"{advice_on_count(self.images.shape, len(self.tilt_angles))}"
             )
         if len(self.images) < 2:
             raise ValueError("a tilt series needs at least two tilts")

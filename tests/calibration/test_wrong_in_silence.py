@@ -63,7 +63,7 @@ def test_a_check_that_fails_loses_no_verdict(monkeypatch):
     bright = calibration_burst([sim.exposed(generator, np.full((64, 64), e)) for e in (900.0, 900.0)])
     names = [check.name for check in (*verdict.SCENES, *verdict.COMMON)]
     assert len(set(names)) == len(names)
-    monkeypatch.setattr(verdict.Case, "pattern", property(lambda case: 1 / 0))
+    monkeypatch.setattr(verdict.CalibrationCase, "pattern", property(lambda case: 1 / 0))
     found = calibrate_camera([frames, bright]).verdict
     assert {"noise across the field", "classes of pixels"} <= set(found.not_tested)
     assert set(found.subjects) == {"no dark frames", "few levels"}
