@@ -138,7 +138,7 @@ def _result(series: TiltSeries, method: str, thickness: int | None) -> tuple[np.
         return result.volume.attenuation, graded(judge(prepared, result, screening=screening))
 
 
-def graded(verdict: Verdict[Any]) -> Cell:
+def graded(verdict: Verdict) -> Cell:
     """Grade and reasons, and value, error and tolerance of every check."""
     evidence = {
         name: [each[part] for part in ("value", "error", "tolerance")] for name, each in verdict.evidence.items()
@@ -152,15 +152,13 @@ def regraded(cell: Cell) -> Cell:
     """The cell as the present table of checks grades its evidence; tolerances that depend on the series are those stored."""
     if "evidence" not in cell:
         return cell
-    findings = [
-        CHECKS[name].of(
-            Effect(value or 0.0, np.inf if error is None else error),
-            tolerance if callable(CHECKS[name].tolerance) else CHECKS[name].tolerance,
-        )
-        for name, (value, error, tolerance) in cell["evidence"].items()
-        if name in CHECKS
-    ]
-    first = ranked(sorted(findings, key=lambda finding: list(CHECKS).index(finding.name)))
+    findings = []
+    for name, check in CHECKS.items():
+        if name in cell["evidence"]:
+            value, error, stored = cell["evidence"][name]
+            effect = Effect(value or 0.0, np.inf if error is None else error)
+            findings.append(check.of(effect, stored if callable(check.tolerance) else check.tolerance))
+    first = ranked(findings)
     names, subjects = [finding.name for finding in first], [finding.reason for finding in first]
     return cell | {"grade": grade(first), "names": names, "subjects": subjects}
 
@@ -182,7 +180,7 @@ def outcome(way: str, cell: Cell, reference: float) -> tuple[str, float | None]:
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Table header and rows: every way and its series, which half it belongs to, its loss, and its outcome."""
-    rows, judging = [], kept(WAYS)
+    rows, judging = list[tuple[str, ...]](), kept(WAYS)
     for key, cell in cells.items():
         kind, *names = key.split("/", 2)
         if kind != "spoilt":

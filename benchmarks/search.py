@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.scenes import Scene
+from noiseflow.fitting.weight import choose_weight
 from recon.denoise.denoisers import find_denoiser
 from recon.joint.joint import JointReconstructor
-from recon.joint.weight import choose_weight
 from recon.methods._classical import LineIntegralProblem
 from recon.projection.sirt import sirt
 from recon.projection.wbp import WINDOWS, wbp

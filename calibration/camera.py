@@ -13,15 +13,8 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.verdict import (
-    BIAS,
-    Reason,
-    bent_response,
-    frames_correlated,
-    verdict_of,
-    with_pattern,
-)
-from noiseflow.checks import Grade, Verdict
+from calibration.verdict import CalibrationCase, judge, said
+from noiseflow.checks import Verdict
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 
@@ -30,12 +23,6 @@ if TYPE_CHECKING:
 
 EXCESS = 1.2
 """Smallest excess-noise factor F² of a detector that multiplies electrons: direct detectors and EMCCDs have 1.4 to 2."""
-
-LARGEST_CHI_SQUARED = 4.0
-"""χ² per degree of freedom above which the photon-transfer curve counts as nonlinear."""
-
-STEADY = 0.003
-"""Largest relative change of the light between equal frames without a warning."""
 
 LEAST_FRAMES = 8
 """Fewest frames for a variance map: each pixel's variance is then known to a factor of 1.5."""
@@ -69,7 +56,7 @@ class Camera:
     """
 
     figures: CameraFigures
-    verdict: Verdict[Reason]
+    verdict: Verdict
     maps: dict[str, Image]
     model: nn.Module
 
@@ -88,72 +75,9 @@ def calibrate_camera(
     return Camera(figures, judge_camera(figures), maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
-def judge_camera(figures: CameraFigures) -> Verdict[Reason]:
+def judge_camera(figures: CameraFigures) -> Verdict:
     """Test the assumptions behind the figures."""
-    found: list[Reason] = []
-
-    def add(name: str, grade: Grade, text: str) -> None:
-        found.append(Reason(name, grade, text))
-
-    correlation = figures.correlation
-    if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
-        text = "the noise of neighbouring pixels is correlated: the frames were filtered, resampled or binned"
-        if correlation.local and correlation.factor > 0.5:
-            add(
-                "correlated pixels",
-                "doubtful",
-                f"{text}. The reported gain applies before this step and is {correlation.factor:.3g} times as large. "
-                "Use raw frames to be sure.",
-            )
-        else:
-            add("correlated pixels", "bad", f"{text}, or contain row noise or interference. Use raw frames.")
-    if correlation.period:
-        add(
-            "periodic noise",
-            "bad",
-            f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled or compressed. "
-            "Use raw frames.",
-        )
-    found += frames_correlated(figures.lag) + bent_response(figures.bend)
-    if figures.chi_squared > LARGEST_CHI_SQUARED:
-        text = f"the variance is not linear in the signal (χ² per degree of freedom {figures.chi_squared:.1f})"
-        add(
-            "bent line",
-            "doubtful",
-            text + ": flickering light or a nonlinear converter. Check the photon-transfer plot.",
-        )
-    flicker = max(level.flicker for level in figures.levels)
-    if flicker > STEADY:
-        add(
-            "unsteady light",
-            "doubtful",
-            f"the light changed by {flicker:.1%} between equal frames; this was corrected. Use a more stable source.",
-        )
-    if figures.dark is None:
-        add(
-            "no dark frames",
-            "doubtful",
-            "there are no dark frames, so offset, dark noise, dynamic range, DSNU and PRNU are not determined. Give --dark.",
-        )
-    elif figures.dark.clipped:
-        text = f"{figures.dark.clipped:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
-        text += "DSNU are biased, and the gain is determined from the flats alone. Increase the camera's offset"
-        add("clipped darkness", "doubtful", text + " setting.")
-    elif figures.dark.coarse:
-        text = "the noise of the dark frames is smaller than the converter's rounding step: dark noise and dynamic range are not "
-        add("coarse codes", "doubtful", text + "determined, and the gain is determined from the flats alone.")
-    number = len(figures.linear)
-    if number < 3:
-        below = " below saturation" if number < len(figures.levels) else ""
-        add(
-            "few levels",
-            "doubtful",
-            f"{number} level{'s' * (number > 1)} of light{below} cannot reveal a nonlinear response. Give three or more.",
-        )
-    if not figures.saturated:
-        add("not saturated", "doubtful", "no level is saturated: capacity and dynamic range are lower bounds.")
-    found = with_pattern(found, figures.pattern, correlation, figures.gain.median)
-    return verdict_of([one for one in found if one.name != "not saturated"])
+    return judge(CalibrationCase(figures.correlation, camera=figures))
 
 
 def maps_of(figures: CameraFigures) -> dict[str, Image]:
@@ -308,7 +232,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
     for name, attribute in intervals.items():
         value = getattr(figures, attribute)
-        found[name] = None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
+        found[name] = None if value is None else vars(value)
     found["electrons_per_count"] = 1 / figures.gain.median
     found["correlation_factor"] = figures.correlation.factor
     zero = figures.offset or 0.0
@@ -323,7 +247,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
     found["outliers"] = figures.outliers
     found["defects"] = int(camera.maps["defects"].sum())
-    return {"verdict": camera.verdict.grade, "reasons": [vars(one) for one in camera.verdict.findings], "camera": found}
+    return said(camera.verdict) | {"camera": found}
 
 
 def _before_filter(figures: CameraFigures) -> CameraFigures:
@@ -333,21 +257,17 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
         return figures
     factor = correlation.factor
 
-    def times(value: Interval, by: float) -> Interval:
-        return Interval(value.median * by, value.q05 * by, value.q95 * by)
+    def over(value: float | None) -> float | None:
+        return None if value is None else value / factor
 
-    gain, straight = times(figures.gain, factor), times(figures.if_linear, factor)
-    noise = None if figures.dark_noise is None else times(figures.dark_noise, 1 / np.sqrt(factor))
-    dsnu = None if figures.dsnu is None else figures.dsnu / factor
-    current = None if figures.dark_current is None else figures.dark_current / factor
     return replace(
         figures,
-        gain=gain,
-        if_linear=straight,
-        dark_noise=noise,
+        gain=figures.gain.times(factor),
+        if_linear=figures.if_linear.times(factor),
+        dark_noise=None if figures.dark_noise is None else figures.dark_noise.times(1 / np.sqrt(factor)),
         saturation=figures.saturation / factor,
-        dsnu=dsnu,
-        dark_current=current,
+        dsnu=over(figures.dsnu),
+        dark_current=over(figures.dark_current),
     )
 
 

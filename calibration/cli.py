@@ -160,7 +160,8 @@ def _calibrate_camera(
     import noiseflow
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
     from calibration.exposures.frames import read_burst, read_levels
-    from calibration.report.camera_page import describe_camera_verdict, write_camera_report
+    from calibration.report.camera_page import write_camera_report
+    from calibration.report.page import describe_verdict
 
     if not flat:
         raise ValueError(
@@ -183,7 +184,7 @@ def _calibrate_camera(
     )
     maps = write_maps(camera, output)
     out.table(("figure", "value"), rows_of(camera))
-    out.line("\n" + "\n".join(describe_camera_verdict(camera)))
+    out.line("\n" + "\n".join(describe_verdict(camera.verdict)))
     out.line(
         f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else "")
     )
@@ -191,12 +192,12 @@ def _calibrate_camera(
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain values: ``verdict``, ``reasons``, ``detector``, ``registration``, ``models``, ``burst``."""
+    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
     from calibration.detector.models import foremost
+    from calibration.verdict import said
 
     found: dict[str, Any] = {
-        "verdict": findings.verdict.grade,
-        "reasons": [vars(reason) for reason in findings.verdict.findings],
+        **said(findings.verdict),
         "detector": _detector(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
@@ -245,7 +246,7 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
         return None
 
     def interval(value: Interval | None) -> dict[str, float] | None:
-        return None if value is None else {"median": value.median, "q05": value.q05, "q95": value.q95}
+        return None if value is None else vars(value)
 
     found = detector.posterior
     return {

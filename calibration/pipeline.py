@@ -19,7 +19,7 @@ from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
-from calibration.verdict import Reason, compression, judge_calibration, verdict_of
+from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
 
@@ -75,7 +75,7 @@ class Findings:
     no_detector: str = ""
     burst: BurstReport | None = None
     figures: Figures | None = None
-    verdict: Verdict[Reason] = field(default_factory=lambda: Verdict("bad", ()))
+    verdict: Verdict = field(default_factory=lambda: Verdict("bad", ()))
     correlation: Correlation | None = None
     repairs: Repairs = field(default_factory=Repairs)
     pattern: Image | None = None
@@ -138,7 +138,6 @@ def measure_exposures(
         if frames is not None:
             frames.require_unsaturated()
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
-    compressed = compression(*raw)
     exposures, (join, joined) = below_joins(exposures)
     pattern = None if dark is None else dark_pattern(exposures, dark)
     exposures = exposures if pattern is None else without_pattern(exposures, pattern)
@@ -157,16 +156,14 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    verdict: Verdict[Reason] = Verdict("bad", ())
+    case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
-        judged = judge_calibration(pairs, detector, figures, correlation, repairs)
-        verdict = verdict_of([*judged.findings, *compressed])
+        verdict = judge(replace(case, detector=detector, figures=figures))
     except (NotMeasurable, np.linalg.LinAlgError) as error:
         reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
-        refused = Reason("not measurable", "bad", f"the detector was not measured: {reason}.")
-        verdict = verdict_of([refused, *compressed])
+        verdict = refusal(case, reason)
     return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 
 

@@ -1,332 +1,181 @@
-"""Reliability of the results: tests of every assumption, and a grade with its reasons."""
+"""The checks of a calibration, one row each: what is measured, what is tolerated, and what to do."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from calibration.detector.correlation import Correlation
-from calibration.detector.figures import (
-    LARGEST_DISAGREEMENT,
-    LARGEST_MISFIT,
-    LARGEST_UNEVENNESS,
-    Figures,
-    correctable,
-    disagrees,
-)
+from calibration.detector.emva import CameraFigures
+from calibration.detector.figures import MODEL_MISFIT, SHAPE_BIAS, UNEVEN, Figures, correctable, disagreement
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
+from calibration.detector.photon_transfer import departure
 from calibration.detector.repair import LEAST_SHARE, Repairs
 from calibration.detector.residual import residual_of
-from calibration.detector.response import Response
+from calibration.detector.response import LEAST_CURVATURE, LINEAR, Response
 from calibration.exposures.codes import MOST_JOINED
 from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Image, rails
-from calibration.registration.aligned import AlignedPair
-from noiseflow.checks import Grade, Verdict
-from noiseflow.described import described
+from calibration.exposures.scaling import CLEAR
+from calibration.registration.aligned import LARGEST_RATIO_ERROR, AlignedPair
+from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
 
-GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
-
-LEAST_MISFIT = 0.8
-"""χ² per degree of freedom below which the histograms scatter less than those of independent pixels can. It varies by 0.05 over
-the roughly 1000 cells of a typical calibration. The frames of a burst share their mean, which reduces the scatter a little."""
-
+# of the gain: the target accuracy of the calibration. Tolerances of other quantities change the gain by as much
 BIAS = 0.02
-"""Largest relative error of the gain without a warning: the target accuracy of the calibration."""
-
-MOST_UNEVEN_CODES = 0.05
-"""Largest relative deviation of the converter's code widths without a warning. Good converters stay within a few percent of a
-step. The entropy of the noise changes by half the square of the deviation: a thousandth of a nat."""
-
-MOST_UNEVEN_FIELD = 0.04
-"""Relative deviation of the noise variance across the field above which one gain does not describe the field: twice the target
-accuracy, because residuals at levels of few electrons are standardised to 2 %."""
-
-MOST_CHANGED = 0.005
-"""Largest share of pixels in changing regions that is excluded without a warning."""
-
-BINS = 32
-"""Number of bins in the upper half of the histogram, which is searched for a second mode."""
+RAW = "use raw frames"
+LAG = "leave more time between frames, and switch off averaging in the camera"
+GOOD = "all assumptions passed their tests"
 
 
-@described()
 @dataclass(frozen=True)
-class Reason:
-    """A failed test.
+class CalibrationCase:
+    """A calibration to assess, from exposures of a scene or from flats and darks.
 
     Attributes:
-        name: short identifier, for programs.
-        grade: ``"doubtful"`` or ``"bad"``.
-        text: what was found, how it affects the results, and what to do.
+        correlation: correlation of the noise of neighbouring pixels.
+        frame: (y, x) raw frame, the short exposure or the first of a burst; None for flats.
+        long: (y, x) raw long exposure; None for bursts and flats.
+        pairs, repairs, detector, figures: results from exposures of a scene.
+        camera: results from flats and darks.
     """
 
-    name: str
-    grade: Grade
-    text: str
+    correlation: Correlation
+    frame: Image | None = None
+    long: Image | None = None
+    pairs: Sequence[AlignedPair] = ()
+    repairs: Repairs = field(default_factory=Repairs)
+    detector: Detector | None = None
+    figures: Figures | None = None
+    camera: CameraFigures | None = None
 
     @property
-    def reason(self) -> str:
-        """The name, as that of other findings."""
-        return self.name
+    def gain(self) -> float:
+        """Reported gain, counts per electron."""
+        found = self.camera if self.camera is not None else self.figures
+        return np.nan if found is None else found.gain.median
+
+    @property
+    def response(self) -> Response:
+        """Exponent of the response to light."""
+        return self.camera.bend if self.camera is not None else self.detector.response if self.detector else LINEAR
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Dependence of the noise on the place; none if the frames were resampled, which has a pattern of its own."""
+        if self.correlation.found and self.correlation.period:
+            return Pattern()
+        if self.camera is not None:
+            return self.camera.pattern
+        # residuals from a mean that the frames of a burst share
+        shared = self.pairs[0].frames / max(self.pairs[0].frames - 1, 1)
+        inflation = self.correlation.inflation * np.sqrt(shared)
+        return pattern_of([residual_of(pair) for pair in self.pairs], inflation=inflation)
+
+    @property
+    def classes(self) -> bool:
+        """Whether classes of pixels have gains of their own: they have a period, and give both exposures the same detail."""
+        return bool(self.pattern.factors) and self.pattern.relative > BIAS
+
+    @property
+    def electrons(self) -> bool:
+        """Whether single-electron peaks show: no filter leaves them intact, and they determine the gain."""
+        return self.detector is not None and self.detector.electrons
+
+    @property
+    def filtered(self) -> bool:
+        """Whether the correlation is that of a short filter, before which the gain is reported."""
+        known = (
+            self.correlation.local and self.correlation.factor > 0.5
+        )  # the factor of sharpened frames is poorly known
+        return known and (self.camera is not None or correctable(self.correlation, self.repairs))
 
 
-def judge_calibration(
-    pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, correlation: Correlation, repairs: Repairs
-) -> Verdict[Reason]:
-    """Test the assumptions behind the results.
-
-    Args:
-        pairs: the pairs that were measured, after repairs.
-        detector: the measured detector.
-        figures: the reported results.
-        correlation: correlation of the residuals of `pairs`.
-        repairs: violated assumptions that were modelled before the measurement.
-    """
-    shared = pairs[0].frames / max(pairs[0].frames - 1, 1)  # residuals from a mean that the frames of a burst share
-    pattern = pattern_of([residual_of(pair) for pair in pairs], inflation=correlation.inflation * np.sqrt(shared))
-    reasons = [
-        *_scene(repairs, correlation),
-        *_independence(pairs),
-        *_correlation(pairs, correlation, repairs, figures, detector.electrons),
-        *_shape(detector, figures),
-        *_range(pairs, detector, figures, repairs),
-    ]
-    return verdict_of(with_pattern(reasons, pattern, correlation, figures.gain.median))
+def _shown(case: CalibrationCase, *, filtered: bool) -> Effect:
+    """Change of the gain by correlated pixels."""
+    found = case.correlation
+    if not found.found or case.electrons or case.filtered != filtered:
+        return Effect(0.0)
+    lag = int(np.argmax(np.abs(found.value)))
+    distance, value = tuple(int(step) for step in found.lags[lag]), float(found.value[lag])
+    what = f"at a distance of (y, x) = {distance} by {value:+.3f}"
+    return Effect(found.factor - 1 if found.local else value, found.factor_error if filtered else 0.0, what)
 
 
-def verdict_of(reasons: Sequence[Reason]) -> Verdict[Reason]:
-    """Return the verdict for these reasons: its grade is the worst of theirs."""
-    ordered = sorted(reasons, key=lambda one: -GRADES.index(one.grade))
-    texts = tuple(one.text for one in ordered)
-    return Verdict(ordered[0].grade if ordered else "good", texts, findings=tuple(ordered))
+def _period(case: CalibrationCase, *, linear: bool) -> Effect:
+    found = case.correlation
+    known = found.step != 1 and case.filtered
+    if not found.period or case.classes or case.electrons or known != linear:
+        return Effect(0.0)
+    return Effect(found.period, what=f" by {1 / found.step:.2g} with linear interpolation" if linear else "")
 
 
-def _scene(repairs: Repairs, correlation: Correlation) -> list[Reason]:
-    found = []
-    if repairs.changed > MOST_CHANGED:
-        grade: Grade = "bad" if repairs.changed > 0.2 else "doubtful"
-        text = (
-            f"{repairs.changed:.1%} of the pixels lie in regions that changed between the exposures and were excluded"
-        )
-        found.append(Reason("scene changed", grade, text + ". Check the residual map, or record a static scene."))
-    causes = {
-        "blur": "one exposure is blurred, drifted or differs in focus",
-        "illumination": "light or dose changed across the field",
-        "response": "one exposure is not linear in the signal",
-    }
-    before = max(repairs.scene, key=lambda one: one.largest[1], default=None)
-    after = max(repairs.scene_after, key=lambda one: one.largest[1], default=None)
-    if before is None or after is None or not (before.clear and before.largest[1] > LEAST_SHARE):
-        return found
-    name, share = before.largest
-    text = f"{share:.1%} of the residual variance follows the scene; likely cause: {causes[name]}"
-    left = after.clear and after.largest[1] > LEAST_SHARE
-    if not repairs.refitted:
-        found.append(
-            Reason("scene misfit", "bad" if share > 5 * LEAST_SHARE else "doubtful", text + " (not modelled).")
-        )
-    elif left or correlation.found:
-        text += ". A convolution kernel fitted between the exposures removes only part of it. Repeat the exposures"
-        found.append(Reason("scene misfit", "bad", text + "."))
-    else:
-        text += ". A convolution kernel fitted between the exposures corrects it; expect errors of a few percent in the results"
-        found.append(Reason("scene misfit", "doubtful", text + "."))
-    return found
+def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
+    """Largest share of the residual variance that follows the scene; corrected if a kernel leaves no share and no correlation."""
+    repairs = case.repairs
+    if not repairs.scene:
+        return Effect(0.0)
+    before, after = (max(fits, key=lambda one: one.largest[1]) for fits in (repairs.scene, repairs.scene_after))
+    left = case.correlation.found or (after.clear and after.largest[1] > LEAST_SHARE)
+    if (repairs.refitted and not left) != corrected or before.largest[1] <= LEAST_SHARE:
+        return Effect(0.0)
+    return Effect(before.largest[1], before.error, CAUSES[before.largest[0]])
 
 
-def _correlation(
-    pairs: Sequence[AlignedPair], correlation: Correlation, repairs: Repairs, figures: Figures, electrons: bool
-) -> list[Reason]:
-    found = []
-    for name, deviation in (("rows", repairs.rows), ("columns", repairs.columns)):
-        if deviation:
-            text = f"{name} have individual offsets of {deviation:.3g} counts rms, which were subtracted before the measurement"
-            found.append(Reason(f"{name[:-1]} offsets", "doubtful", text + ". Use ScanNoise(model) to model them."))
-    if electrons:  # no filter leaves these peaks intact, and they determine the gain in spite of any correlation
-        return found
-    if correlation.found and (abs(correlation.factor - 1) > BIAS or not correlation.local):
-        lag = int(np.argmax(np.abs(correlation.value)))
-        distance, value = tuple(int(step) for step in correlation.lags[lag]), correlation.value[lag]
-        text = f"the noise of pixels at a distance of (y, x) = {distance} has a correlation of {value:+.3f}: the frames were "
-        text += "filtered or resampled, or contain afterglow or interference"
-        if correctable(correlation, repairs):
-            text += (
-                f". If a filter that preserves the mean is the cause, the variance before it was {figures.factor:.3g} times as "
-                "large. The reported gain applies before the filter; the gain per pixel of the recorded frames is "
-                f"{figures.gain.median / figures.factor:.3g} counts/e⁻. Use raw frames to be sure"
-            )
-            # the factor of a sharpened frame is poorly known
-            grade: Grade = "bad" if correlation.factor < 0.5 else "doubtful"
-        else:
-            grade, text = "bad", text + ". No short filter explains it. Use raw frames, or remove the interference"
-        found.append(Reason("correlated pixels", grade, text + "."))
-    if correlation.period:
-        text = f"the noise is periodic, with a period of {correlation.period:.3g} pixels: the frames were resampled "
-        if correlation.step != 1 and correctable(correlation, repairs):
-            text += f"by {1 / correlation.step:.2g} with linear interpolation; the gain is corrected to within a few percent"
-            grade = "doubtful"
-        else:
-            text, grade = text + "or compressed, so the gain is not that of the camera", "bad"
-        found.append(Reason("periodic noise", grade, text + ". Use raw frames."))
-    return found
+CAUSES = {
+    "blur": "one exposure is blurred, drifted or differs in focus",
+    "illumination": "light or dose changed across the field",
+    "response": "one exposure is not linear in the signal",
+}
 
 
-def _independence(pairs: Sequence[AlignedPair]) -> list[Reason]:
-    found = []
-    found += frames_correlated(correlation_in_time(pairs))
-    share = max(map(contained_share, pairs))
-    if share > BIAS:
-        text = f"{share:.1%} of the long exposure's signal is the short exposure itself: the long exposure is a mean or sum of "
-        text += "frames that include the short one, and the gain is too low by the same share"
-        found.append(
-            Reason("short contained", "bad", text + ". Use a short exposure that is not part of the long one.")
-        )
-    return found
+def _lag(case: CalibrationCase) -> Effect:
+    lag, error = case.camera.lag if case.camera is not None else correlation_in_time(case.pairs)
+    return Effect(2 * lag, 2 * error, f"{lag:+.3f}")  # the variance of differences changes by twice the correlation
 
 
-def frames_correlated(lag: float) -> list[Reason]:
-    """Return the reason to report for a correlation `lag` between successive frames, if the gain suffers from it."""
-    if abs(lag) <= BIAS / 2:  # a correlation reduces the variance by twice its value
-        return []
-    text = f"the noise of successive frames has a correlation of {lag:+.3f} (image lag, temporal filter or changing scene); "
-    text += f"the gain is wrong by about {abs(2 * lag):.0%}"
-    grade: Grade = "bad" if abs(lag) > 5 * BIAS / 2 else "doubtful"
-    end = ". Leave more time between frames, and switch off averaging in the camera."
-    return [Reason("frames correlated", grade, text + end)]
+def _field(case: CalibrationCase) -> Effect:
+    return Effect(0.0) if case.pattern.factors else Effect(case.pattern.relative, case.pattern.error)
 
 
-def compression(short: Image, long: Image | None = None) -> list[Reason]:
-    """Test whether a frame or its long exposure was compressed with loss.
-
-    Args:
-        short: (y, x) raw frame; of a burst the first one.
-        long: (y, x) raw long exposure, if there is one.
-    """
-    looked_at: list[tuple[Image, str, Grade]] = [(short, "frame", "bad")]
-    looked_at += [] if long is None else [(long, "long exposure", "doubtful")]
-    for frame, name, grade in looked_at:
-        if block_compressed(frame):
-            kind = "in blocks of 8 × 8 pixels (JPEG)"
-        elif wavelet_compressed(frame):
-            kind = "by wavelets (JPEG 2000), or every second pixel was interpolated"
-        else:
-            continue
-        text = f"the {name} was compressed with loss {kind}, which removes noise and adds artefacts. Use raw frames."
-        return [Reason("compressed", grade, text)]
-    return []
+def _classes(case: CalibrationCase) -> Effect:
+    gains = ", ".join(f"{case.gain * one:.4g}" for one in case.pattern.factors)
+    what = f"{case.pattern.name}, with gains of {gains} counts/e⁻"
+    return Effect(case.pattern.relative, case.pattern.error, what) if case.pattern.factors else Effect(0.0)
 
 
-def _shape(detector: Detector, figures: Figures) -> list[Reason]:
-    found = []
-    line, gain = detector.line, detector.posterior.gain.median
-    by_line = (
-        " The reported gain is that of photon transfer, which is valid for any detector of independent events; it "
-    )
-    by_line += "includes the excess-noise factor." + (
-        " Add dark frames to determine offset and read noise." if detector.offset is None else ""
-    )
-    if detector.misfit > LARGEST_MISFIT:
-        text = "the histograms do not fit a Poisson-Gaussian detector "
-        text += f"(χ² per degree of freedom {detector.misfit:.2f})."
-        found.append(Reason("not Poisson-Gaussian", "bad" if detector.misfit > 3 else "doubtful", text + by_line))
-    if detector.misfit < LEAST_MISFIT:
-        text = "the histograms scatter less than those of independent pixels "
-        text += f"(χ² per degree of freedom {detector.misfit:.2f}): the values were rescaled or filtered"
-        found.append(Reason("too even", "doubtful", text + ". Use raw frames."))
-    if disagrees(detector):
-        text = (
-            f"the shape of the noise distribution gives a gain of {gain:.4g} counts/e⁻, its variance {line.gain:.4g}."
-        )
-        grade: Grade = "bad" if abs(gain / line.gain - 1) > 5 * LARGEST_DISAGREEMENT else "doubtful"
-        found.append(Reason("shape against variance", grade, text + by_line))
-    if detector.codes > MOST_UNEVEN_CODES:
-        text = f"the converter's codes are uneven: the width of each differs by {detector.codes:.0%} rms from its neighbours"
-        text += ". Typical causes are frames that were rescaled and rounded again, and cameras that combine two converters. "
-        text += (
-            "Gain and variance hardly change, but a noise model with equal rounding steps does not reproduce the codes"
-        )
-        found.append(Reason("uneven codes", "doubtful", text + ". Use raw frames if these are not raw."))
-    if detector.uneven > LARGEST_UNEVENNESS:
-        text = f"the variances of individual pixels differ by {detector.uneven:.0%} rms at equal signal (sCMOS, hot pixels)."
-        found.append(
-            Reason("uneven pixels", "doubtful", text + " Calibrate with flats and darks for per-pixel maps." + by_line)
-        )
-    if line.bent:
-        text = "the variance is not linear in the signal: saturation, rescaled pixel values, or a change of light"
-        found.append(Reason("bent line", "doubtful", text + ". Check the photon-transfer plot."))
-    return found
+def _response(case: CalibrationCase) -> Effect:
+    if not case.response.known:
+        raise NotTested("the exposures do not determine the response")
+    return Effect(case.response.exponent - 1, case.response.error, f"{case.response.exponent:.3f}")
 
 
-def _range(pairs: Sequence[AlignedPair], detector: Detector, figures: Figures, repairs: Repairs) -> list[Reason]:
-    found = []
-    if repairs.joined:
-        text = f"pixels above {repairs.join:.5g} counts ({repairs.joined:.1%}) use fewer of the converter's codes: the frame "
-        text += "combines two converters (high dynamic range), or its values are companded. "
-        few = repairs.joined <= MOST_JOINED
-        text += (
-            "These pixels were treated as clipped; the results and noise models apply to the darker pixels"
-            if few
-            else "No single gain fits both ranges"
-        )
-        found.append(
-            Reason(
-                "joined converters", "doubtful" if few else "bad", text + ". Record with a single converter setting."
-            )
-        )
-    found += bent_response(detector.response)
-    for pair in pairs:
-        if pair.exposure_ratio is not None and not pair.one_setting:
-            text = f"the fitted ratio of the exposures is {1 / pair.scaling.slope:.3g}, the given one {pair.exposure_ratio:.3g}. "
-            text += "The given ratio was not used: it is wrong, or the exposures differ in gain or processing"
-            found.append(Reason("exposure ratio", "doubtful", text + ". Check --exposure-ratio, or leave it out."))
-            break
-    shares = [full_share(pair) for pair in pairs]
-    if max(shares) > 0.001:
-        text = f"{max(shares):.1%} of the pixels are at full-well saturation, below the converter's upper limit"
-        found.append(Reason("saturation", "doubtful", text + ". Use a shorter exposure."))
-    return found
+def _compressed(frame: Image | None) -> Effect:
+    if frame is None:
+        raise NotTested("there is no such frame")
+    if block_compressed(frame):
+        return Effect(1.0, what="in blocks of 8 × 8 pixels (JPEG)")
+    kind = "by wavelets (JPEG 2000), or every second pixel was interpolated"
+    return Effect(1.0, what=kind) if wavelet_compressed(frame) else Effect(0.0)
 
 
-def bent_response(response: Response) -> list[Reason]:
-    """Return the reason to report if the response is not linear."""
-    if not response.bent:
-        return []
-    text = f"the response is not linear: the signal grows as light^{response.exponent:.3f} (± {response.error:.3f}), or the dark "
-    text += "frames or the exposure ratio belong to another setting. The gain is the local one at the mean signal"
-    return [Reason("nonlinear response", "doubtful", text + ". Use raw frames, and dark frames of the same setting.")]
+def _joined(case: CalibrationCase, *, few: bool) -> Effect:
+    share = case.repairs.joined
+    return Effect(share if (share <= MOST_JOINED) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
 
 
-def with_pattern(reasons: Sequence[Reason], pattern: Pattern, correlation: Correlation, gain: float) -> list[Reason]:
-    """Add that the noise depends on the place, and leave out what follows from it.
-
-    Classes of pixels with gains of their own have a period, and give both exposures the same fine detail. Resampling has a period
-    too, but correlates neighbours.
-    """
-    if correlation.found and correlation.period:
-        return list(reasons)
-    found = uneven_field(pattern, gain)
-    explained = ("periodic noise", "short contained") if found and pattern.factors else ()
-    return [*found, *(one for one in reasons if one.name not in explained)]
+def _ratio(case: CalibrationCase) -> Effect:
+    ratios = [pair.scaling.slope * pair.exposure_ratio for pair in case.pairs if pair.exposure_ratio is not None]
+    worst = max((abs(float(np.log(one))) if one > 0 else np.inf for one in ratios), default=0.0)
+    return Effect(worst, what="" if not worst else f"{1 / case.pairs[0].scaling.slope:.3g}")
 
 
-def uneven_field(pattern: Pattern, gain: float) -> list[Reason]:
-    """Return the reason to report if the noise at equal signal depends on the place."""
-    if pattern.relative <= (MOST_UNEVEN_FIELD if pattern.name == "field" else BIAS):
-        return []
-    text = f"at equal signal the noise variance differs by {pattern.relative:.1%} rms (± {pattern.error:.1%}) "
-    if pattern.name == "field":
-        text += "across the field: the frames were divided by a flat field or corrected for shading, so no single gain applies"
-        return [Reason("uneven field", "doubtful", text + ". Use uncorrected frames.")]
-    gains = ", ".join(f"{gain * one:.4g}" for one in pattern.factors)
-    text += f"between classes of pixels ({pattern.name}), whose gains are {gains} counts/e⁻: amplifiers or filters of their own"
-    return [Reason("uneven gains", "doubtful", text + ". Calibrate each class alone.")]
-
-
-def full_share(pair: AlignedPair) -> float:
+def full_share(pair: AlignedPair, *, bins: int = 32) -> float:
     """Share of pixels in a peak at the upper end of the histogram that no clipping limit explains.
 
     The histogram of a scene falls off towards its brightest values. A full well followed by read noise adds a second mode there.
@@ -335,11 +184,188 @@ def full_share(pair: AlignedPair) -> float:
         return 0.0
     values = pair.short[pair.mask]
     low, high = np.percentile(values, (50, 99.99))
-    width = max(1.0, np.ceil((high - low) / BINS))  # whole counts avoid aliasing with the converter's steps
-    counts, _ = np.histogram(values, low - 0.5 + width * np.arange(BINS + 1))
+    width = max(1.0, np.ceil((high - low) / bins))  # whole counts avoid aliasing with the converter's steps
+    counts, _ = np.histogram(values, low - 0.5 + width * np.arange(bins + 1))
     smooth = np.convolve(counts, np.ones(3) / 3, mode="same")
     last = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
-    peak = BINS // 4 + int(np.argmax(smooth[BINS // 4 :]))
-    valley = BINS // 8 + int(np.argmin(smooth[BINS // 8 : peak + 1]))
+    peak = bins // 4 + int(np.argmax(smooth[bins // 4 :]))
+    valley = bins // 8 + int(np.argmin(smooth[bins // 8 : peak + 1]))
     second = peak > 0.6 * last and smooth[peak] > 3 * (smooth[valley] + np.sqrt(smooth[valley]) + 1)
     return float(counts[valley:].sum() / values.size) if second else 0.0
+
+
+def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
+    """An attribute of the detector."""
+    return lambda case: Effect(getattr(case.detector, name, null))
+
+
+def _levels(case: CalibrationCase) -> Effect:
+    assert case.camera is not None
+    used, given = len(case.camera.linear), len(case.camera.levels)
+    what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
+    return Effect(max(3 - used, 0), what=what)
+
+
+def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationCase], Effect]:
+    def of_case(case: CalibrationCase) -> Effect:
+        assert case.camera is not None
+        return Effect(float(measure(case.camera)))
+
+    return of_case
+
+
+Row = Check[CalibrationCase]
+# fmt: off
+COMMON: tuple[Row, ...] = (
+    Row("filter", "correlated pixels", "distortion", lambda case: _shown(case, filtered=True), "of the gain", BIAS,
+        "the noise of pixels correlates {what}: the frames were filtered or resampled. If the filter preserves the mean, the "
+        "gain before it, which is reported, differs by {value:+.1%}", RAW, local=True),
+    Row("correlation of pixels", "correlated pixels", "distortion", lambda case: _shown(case, filtered=False), "of the gain",
+        BIAS, "the noise of pixels correlates {what}, and no short filter explains it: afterglow, interference, row noise or "
+        "strong filters", f"{RAW}, or remove the interference"),
+    Row("linear interpolation", "periodic noise", "distortion", lambda case: _period(case, linear=True), "pixels", 0.0,
+        "the noise has a period of {value:.3g} pixels: the frames were resampled{what}; the gain is corrected to a few percent",
+        RAW, local=True),
+    Row("period of the noise", "periodic noise", "distortion", lambda case: _period(case, linear=False), "pixels", 0.0,
+        "the noise has a period of {value:.3g} pixels: the frames were resampled or compressed, and the gain is not that of the "
+        "camera", RAW),
+    Row("successive frames", "frames correlated", "distortion", _lag, "of the gain", BIAS,
+        "the noise of successive frames has a correlation of {what} (image lag, temporal filter or changing scene), and the gain "
+        "is wrong by about {value:+.0%}", LAG, score=CLEAR),
+    # significance is that of χ² over all parts; residuals at levels of few electrons are standardised to 2 %
+    Row("noise across the field", "uneven field", "distortion", _field, "of the variance", 2 * BIAS,
+        "at equal signal the noise variance differs by {value:.1%} rms across the field: the frames were divided by a flat field "
+        "or corrected for shading, so no single gain applies", "use uncorrected frames", score=0.0, local=True),
+    Row("classes of pixels", "uneven gains", "distortion", _classes, "of the variance", BIAS,
+        "at equal signal the noise variance differs by {value:.1%} rms between classes of pixels ({what}): they have amplifiers "
+        "or filters of their own", "calibrate each class alone", score=0.0, local=True),
+    # an exponent off by one hundredth changes the gain by 2 %; the reported gain is the local one
+    Row("response", "nonlinear response", "distortion", _response, "", LEAST_CURVATURE,
+        "the response is not linear: the signal grows as light^{what}, or dark frames or exposure ratio belong to another "
+        "setting. The gain is the local one at the mean signal", f"{RAW}, and dark frames of the same setting", score=3.0,
+        local=True),
+)
+
+SCENES: tuple[Row, ...] = (
+    Row("compression", "compressed", "fact", lambda case: _compressed(case.frame), "", 0.0,
+        "the frames were compressed with loss {what}, which removes noise and adds artefacts", RAW),
+    Row("compression of the long exposure", "compressed", "fact", lambda case: _compressed(case.long), "", 0.0,
+        "the long exposure was compressed with loss {what}", RAW, local=True),
+    # a join shifts the photon-transfer line by about the share of the pixels above it
+    Row("converters, joined", "joined converters", "fact", lambda case: _joined(case, few=True), "of the pixels", 0.005,
+        "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values); "
+        "they are treated as clipped, and the results apply to darker pixels", "record with a single converter setting",
+        local=True),
+    Row("converters, mixed", "joined converters", "fact", lambda case: _joined(case, few=False), "of the pixels", 0.005,
+        "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values), and "
+        "no single gain fits both ranges", "record with a single converter setting"),
+    Row("full well", "saturation", "fact", lambda case: Effect(max(map(full_share, case.pairs))), "of the pixels", 0.001,
+        "{value:.1%} of the pixels are at full-well saturation, below the converter's upper limit", "use a shorter exposure",
+        local=True),
+    Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
+        "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
+        "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
+    Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.005,
+        "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
+        "check the residual map, or record a static scene", local=True),
+    # beyond a fifth of the pixels, the others may have changed unseen
+    Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.07,
+        "{value:.1%} of the pixels lie in regions that changed between the exposures", "record a static scene"),
+    Row("fit to the scene, corrected", "scene misfit", "distortion", lambda case: _misfit(case, corrected=True),
+        "of the residual variance", LEAST_SHARE,
+        "{value:.1%} of the residual variance follows the scene ({what}); a convolution kernel between the exposures corrects it "
+        "to a few percent of the gain", "repeat the exposures", score=CLEAR, local=True),
+    # what a kernel leaves is no blur, and changes the gain by many times its share
+    Row("fit to the scene", "scene misfit", "distortion", lambda case: _misfit(case, corrected=False),
+        "of the residual variance", lambda case: LEAST_SHARE / (3 if case.repairs.refitted else 1),
+        "{value:.1%} of the residual variance follows the scene ({what})", "repeat the exposures", score=CLEAR),
+    # whichever their size: those subtracted matter
+    Row("rows", "row offsets", "distortion", lambda case: Effect(case.repairs.rows), "counts", 0.0,
+        "rows have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
+        local=True),
+    Row("columns", "column offsets", "distortion", lambda case: Effect(case.repairs.columns), "counts", 0.0,
+        "columns have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
+        local=True),
+    Row("separate exposures", "short contained", "distortion",
+        lambda case: Effect(0.0 if case.classes else max(map(contained_share, case.pairs))), "of the gain", BIAS,
+        "{value:.1%} of the long exposure's signal is the short exposure itself, and the gain is too low by the same share",
+        "use a short exposure that is not part of the long one"),
+    Row("code widths", "uneven codes", "distortion", _of("codes"), "rms", 0.05,
+        "the converter's codes are uneven: each width differs by {value:.0%} rms from its neighbours (rescaled and rounded "
+        "again, or two converters). A noise model with equal rounding steps does not reproduce them", RAW, local=True),
+    Row("variances of pixels", "uneven pixels", "distortion", _of("uneven"), "rms", UNEVEN,
+        "the variances of individual pixels differ by {value:.0%} rms at equal signal (sCMOS, hot pixels); the gain is that of "
+        "photon transfer", "calibrate with flats and darks for per-pixel maps", local=True),
+    Row("shape of the noise", "not Poisson-Gaussian", "predictive", _of("misfit", null=1.0), "χ² per degree of freedom",
+        MODEL_MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
+        "that of photon transfer, which includes the excess-noise factor", "give dark frames for offset and read noise",
+        null=1.0, local=True),
+    # χ² varies by 0.05 over the cells of a typical calibration; the frames of a burst share their mean
+    Row("scatter of the histograms", "too even", "predictive",
+        lambda case: Effect(min(1.0, case.detector.misfit) if case.detector else 1.0), "χ² per degree of freedom", 0.2,
+        "the histograms scatter less than those of independent pixels (χ² per degree of freedom {value:.2f}): the values were "
+        "rescaled or filtered", RAW, null=1.0, local=True),
+    Row("shape and variance", "shape against variance", "predictive",
+        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", SHAPE_BIAS,
+        "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
+        "give dark frames for offset and read noise", score=3.0, local=True),
+    Row("line of variance", "bent line", "predictive",
+        lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", BIAS,
+        "the variance is not linear in the signal, by {value:.1%}: saturation, rescaled values, or a change of light",
+        "check the photon-transfer plot", local=True),
+)
+
+FLATS: tuple[Row, ...] = (
+    # typical instability of sources between equal frames
+    Row("light", "unsteady light", "distortion", _camera(lambda one: max(level.flicker for level in one.levels)), "", 0.003,
+        "the light changed by {value:.1%} between equal frames, which was corrected", "use a more stable source", local=True),
+    Row("line of variance", "bent line", "predictive", _camera(lambda one: max(one.chi_squared, 1.0)),
+        "χ² per degree of freedom", 3.0, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
+        "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),
+    Row("clipped darks", "clipped darkness", "distortion", _camera(lambda one: one.dark.clipped if one.dark else 0.0),
+        "of the pixels", 0.0, "{value:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
+        "DSNU are biased, and the gain is that of the flats alone", "increase the camera's offset setting", local=True),
+    Row("codes of darks", "coarse codes", "distortion", _camera(lambda one: bool(one.dark and one.dark.coarse)), "", 0.0,
+        "the noise of the dark frames is smaller than the rounding step: dark noise and dynamic range are not determined",
+        "use a higher gain setting", local=True),
+    Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", 0.5,
+        "without dark frames, offset, dark noise, dynamic range, DSNU and PRNU are not determined", "give --dark", local=True),
+    Row("levels of light", "few levels", "predictive", _levels, "levels", 0.5,
+        "{what} cannot reveal a nonlinear response", "give three or more", local=True),
+)
+# fmt: on
+
+CHECKS: tuple[Row, ...] = (*SCENES, *COMMON)
+"""The checks of exposures of a scene."""
+
+CAMERA_CHECKS: tuple[Row, ...] = (*FLATS, *COMMON)
+"""The checks of flats and darks."""
+
+
+def judge(case: CalibrationCase) -> Verdict:
+    """Test the assumptions behind the results."""
+    guard = Guard()
+    found = run(CHECKS if case.camera is None else CAMERA_CHECKS, case, guard)
+    evidence = {name: finding.as_dict() for name, finding in found.items()}
+    return verdict_of(found.values(), evidence, good=GOOD, guard=guard)
+
+
+def said(verdict: Verdict) -> dict[str, Any]:
+    """The verdict as plain values: ``verdict``, its ``reasons``, the ``evidence`` of every check, and what was ``not_tested``."""
+    reasons = [
+        {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
+        for one, text in zip(verdict.findings, verdict.reasons, strict=False)
+    ]
+    return {
+        "verdict": verdict.grade,
+        "reasons": reasons,
+        "evidence": verdict.evidence,
+        "not_tested": verdict.not_tested,
+    }
+
+
+def refusal(case: CalibrationCase, why: str) -> Verdict:
+    """The verdict on exposures whose gain cannot be measured, for the reason `why`; compression may explain it."""
+    guard, sentence = Guard(), f"the detector was not measured: {why}"
+    reason = Finding("detector", "not measurable", "fact", Effect(1.0), "", 0.0, 3.0, sentence, RAW)
+    return verdict_of([*run(SCENES[:2], case, guard).values(), reason], {}, good="", guard=guard)

@@ -1,4 +1,4 @@
-"""Writes the table of all checks of a reconstruction, docs/api/generated/checks.md; Sphinx calls it on each build."""
+"""Writes the tables of all checks, docs/api/generated/checks.md; Sphinx calls it on each build."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import noiseflow
 import recon
+from calibration.verdict import CHECKS as OF_EXPOSURES
+from calibration.verdict import COMMON, FLATS
 from noiseflow.checks import Check
 from recon.report.verdict import effects_chart
 from recon.verdict.coarse import WIDTH
@@ -40,8 +42,9 @@ def page() -> str:
     """How a verdict is made, and every check with its tolerance, as Markdown."""
     parts = [
         "# How a verdict is made",
-        "A verdict is a table. Each row states one assumption of the reconstruction, measures how far the data deviate from "
-        "it, and compares the deviation with its standard error and with a tolerance. A row gives a reason if the deviation is "
+        "A verdict is a table. Each row states one assumption of the reconstruction or calibration, measures how far the data "
+        "deviate from it, and compares the deviation with its standard error and with a tolerance. A row gives a reason "
+        "if the deviation is "
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
         "distortions of the images relative to the other tilts; then statistics without a parameter. Within "
         "each group, the reason that exceeds its tolerance most comes first. The grade is *bad* if one of the reasons exceeds "
@@ -57,8 +60,12 @@ def page() -> str:
         "**Replicates** are series that the given geometry explains: the linear fit, with its own residuals in random signs. "
         "Statistics without a parameter, and other geometries, count by what they exceed those of the replicates.",
     ]
-    for engine, title in ENGINES.items():
-        rows = [_row(check) for check in CHECKS.values() if check.engine == engine]
+    tables = {title: [row for row in CHECKS.values() if row.engine == engine] for engine, title in ENGINES.items()}
+    tables["Calibration from exposures of a scene"] = [row for row in OF_EXPOSURES if row not in COMMON]
+    tables["Calibration from flats and darks"] = list(FLATS)
+    tables["Calibration from either"] = list(COMMON)
+    for title, checks in tables.items():
+        rows = [_row(check) for check in checks]
         parts += [f"## {title}", "| check | reason | tolerance | advice |\n|---|---|---|---|\n" + "\n".join(rows)]
     return "\n\n".join(parts) + "\n"
 

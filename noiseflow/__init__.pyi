@@ -7,6 +7,7 @@ from .fitting.loop import FitResult as FitResult
 from .fitting.selection import select as select
 from .fitting.signal_models import KnownSignal as KnownSignal
 from .fitting.signal_models import StaticScene as StaticScene
+from .fitting.stream import sample_pixels as sample_pixels
 from .io.model_files import load as load
 from .io.model_files import register as register
 from .io.model_files import save as save
@@ -14,6 +15,8 @@ from .models.at_level import AtLevel as AtLevel
 from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson
+from .models.conditioned import Conditioned as Conditioned
+from .models.correlated import Correlated as Correlated
 from .models.dead_time import DeadTimeCounter as DeadTimeCounter
 from .models.digitisation import Digitisation as Digitisation
 from .models.digitisation import detect_digitisation as detect_digitisation

@@ -24,7 +24,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("offset", "level"), _FINITE),
     **dict.fromkeys(("held_out", "dead_time"), _INSIDE),
     **dict.fromkeys(("batch_size", "noise_interval", "num_components", "num_bins", "width"), _COUNT),
-    **dict.fromkeys(("num_signal_bins", "num_groups"), _COUNT),
+    **dict.fromkeys(("num_signal_bins", "num_groups", "most"), _COUNT),
     **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _NONE_OR_MORE),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),

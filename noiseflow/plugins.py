@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
@@ -62,17 +62,42 @@ def load_plugins(group: str) -> dict[str, Any]:
     return loaded
 
 
-def names_of(folder: Path, group: str, *, first: str) -> list[str]:
-    """Names that the modules of a folder and the entry points of a group provide, without importing them; `first` comes first.
-    Modules with an underscore, or named ``base``, provide nothing."""
-    own = [module.name for module in iter_modules([str(folder)])]
-    names = sorted(name.replace("_", "-") for name in own if not name.startswith("_") and name != "base")
-    return [first, *(name for name in names if name != first), *sorted(plugins(group))]
+@dataclass(frozen=True)
+class Registry:
+    """Things of one kind by name: the modules of a package, then entry points of other packages.
 
+    Modules with an underscore, or named ``base``, provide nothing.
 
-def provided(name: str, package: str, group: str, attribute: str) -> Any:
-    """The object of that name: an attribute of a module of the package, or what an entry point of the group loads."""
-    other = plugins(group).get(name)
-    if other is not None:
-        return load_plugin(other)
-    return getattr(import_module(f"{package}.{name.replace('-', '_')}"), attribute)
+    Attributes:
+        kind: one word; the things are module attributes of this name in capitals, and chosen by the option of this name.
+        package: name of the package.
+        group: group of the entry points.
+        first: the usual one, which is listed first.
+        last: further names, which `find` does not know.
+    """
+
+    kind: str
+    package: str
+    group: str
+    first: str
+    last: tuple[str, ...] = ()
+
+    def names(self) -> list[str]:
+        """All names; nothing is imported."""
+        folders = import_module(self.package).__path__
+        own = (module.name for module in iter_modules(folders) if not module.name.startswith("_"))
+        names = sorted(name.replace("_", "-") for name in own if name not in ("base", self.first))
+        return [self.first, *names, *sorted(plugins(self.group)), *self.last]
+
+    def find(self, name: str) -> Any:
+        """The thing of that name, from a module or an entry point.
+
+        Raises:
+            ValueError: the name is unknown.
+        """
+        if name not in self.names() or name in self.last:
+            raise ValueError(f"--{self.kind} {name}: choose one of {', '.join(self.names())}")
+        other = plugins(self.group).get(name)
+        if other is not None:
+            return load_plugin(other)
+        return getattr(import_module(f"{self.package}.{name.replace('-', '_')}"), self.kind.upper())

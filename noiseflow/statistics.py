@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 Array = NDArray[Any]
 
@@ -87,13 +89,16 @@ def weighted_line(x: Array, y: Array, weight: Array) -> Line:
     return Line(slope, intercept, float(np.sqrt(1 / information)), chi_squared)
 
 
-def white_regression(columns: Array, values: Array, *, ridge: float = 0.0) -> tuple[Array, Array]:
+def white_regression(
+    columns: Array, values: Array, *, ridge: float = 0.0, clusters: Array | None = None
+) -> tuple[Array, Array]:
     """Least squares with White's standard errors, which hold for noise of any variance (doi:10.2307/1912934).
 
     Args:
         columns: (N, K) regressors; their scales do not matter.
         values: (..., N) one or several series of values.
         ridge: addition to the diagonal of the normal matrix of scaled columns, for columns that are nearly alike.
+        clusters: (N,) numbers of groups of values whose noise may be correlated (doi:10.1080/07350015.2011.623093).
 
     Returns:
         (..., K) coefficients and their standard errors; an undetermined coefficient is 0, or has a very large error with a ridge.
@@ -113,8 +118,14 @@ def white_regression(columns: Array, values: Array, *, ridge: float = 0.0) -> tu
     found = values @ spread
     left = values - found @ scaled.T
     # the factor corrects for the fitted coefficients, as in any estimate of a variance
-    errors = np.sqrt((left**2) @ spread**2 * (rows / max(1, rows - fitted)))
-    return found / scale, np.maximum(errors, 1e-30) / scale
+    if clusters is None:
+        power = (left**2) @ spread**2
+    else:
+        _, number = np.unique(clusters, return_inverse=True)
+        member = sparse.csr_array((np.ones(rows), (number, np.arange(rows))))
+        power = np.stack([((member @ (left * each).T) ** 2).sum(0) for each in spread.T], -1)
+    errors = np.sqrt(power * (rows / max(1, rows - fitted)))
+    return found / scale, np.maximum(errors, 1e-15) / scale
 
 
 def block_means(images: Array, down: int, across: int) -> Array:
@@ -130,3 +141,11 @@ def block_means(images: Array, down: int, across: int) -> Array:
     height, width = rows // down, columns // across
     whole = images[..., : height * down, : width * across]
     return np.asarray(whole.reshape(*stack, height, down, width, across).mean((-3, -1)))
+
+
+def own_random(seed: int) -> np.random.Generator:
+    """A random stream that shares no numbers with ``np.random.default_rng(seed)``, which may have drawn the data.
+
+    A split of pixels drawn with the numbers of their signals would hold out the darkest pixels.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(b"noiseflow"),)))

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow import FitResult
+    from noiseflow.fitting.result import WeightChoice
     from recon.fields.fields import Field
     from recon.joint.signal_model import TomographySignal
-    from recon.joint.weight import WeightChoice
     from recon.uncertainty.result import Uncertainty
 
 
@@ -82,6 +82,15 @@ class Reconstruction:
             uncertainty=bars,
             orientation=orientation,
         )
+
+    def levelled(self, x_tilt: float) -> Reconstruction:
+        """The result with a level volume and level error bars, see `recon.Volume.levelled`; projections do not change."""
+        if not x_tilt:
+            return self
+        bars, choices = self.uncertainty, self.choices | {"levelled about x (°)": f"{x_tilt:.3g}"}
+        if bars is not None:
+            bars = replace(bars, std=bars.std.levelled(x_tilt), bias=bars.bias.levelled(x_tilt))
+        return replace(self, volume=self.volume.levelled(x_tilt), uncertainty=bars, choices=choices)
 
     @property
     def field(self) -> Field | None:

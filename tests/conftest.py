@@ -12,25 +12,29 @@ from typing import Any
 import pytest
 
 from noiseflow.commands.cli import main
+from tests.seconds import TABLE
 from tests.shares import shares
 
 DATA = Path(__file__).parent.parent / "noiseflow" / "data"
-SLOW_SECONDS = Path(__file__).parent / "slow_seconds.json"
-"""Of each slow test, all run one after another; other work was done beside them, so only their proportions count."""
-
 # a shell's background jobs ignore Ctrl-C, and the programs under test would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep one share of the slow tests where ``NOISEFLOW_SLOW_SHARD`` asks for it, as ``K/N``: the same share every time."""
+    """Mark the tests of the table as slow; keep one share of the slow tests where ``NOISEFLOW_SLOW_SHARD`` asks for it, as
+    ``K/N``: the same share every time."""
+    seconds = json.loads(TABLE.read_text(encoding="utf-8"))
+    for item in items:
+        if item.nodeid in seconds:
+            item.add_marker(pytest.mark.slow)
     wanted = os.environ.get("NOISEFLOW_SLOW_SHARD")
     if wanted is None:
         return
     share, count = map(int, wanted.split("/"))
     slow = {item.nodeid: item for item in items if item.get_closest_marker("slow")}
-    kept = shares(list(slow), json.loads(SLOW_SECONDS.read_text(encoding="utf-8")), count)[share]
+    kept = shares(list(slow), seconds, count)[share]
     left_out = {item for name, item in slow.items() if name not in kept}
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]

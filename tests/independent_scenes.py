@@ -37,7 +37,7 @@ def scene(density: Density) -> Density:
 
 
 def ball(x: Array, y: Array, z: Array, centre: Any, radius: float) -> Array:
-    return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2 < radius**2
+    return np.asarray((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2 < radius**2)
 
 
 def balls(x: Array, y: Array, z: Array, random: np.random.Generator, count: int, spread: Any, radii: Any) -> Array:
@@ -66,7 +66,7 @@ def core_shell(x: Array, y: Array, z: Array, random: np.random.Generator) -> Arr
 def gyroid(x: Array, y: Array, z: Array, random: np.random.Generator) -> Array:
     a, b, c = 5 * x, 5 * y, 5 * z
     wall = np.sin(a) * np.cos(b) + np.sin(b) * np.cos(c) + np.sin(c) * np.cos(a) > 0.2
-    return 0.7 * (wall & ball(x, y, z, (0, 0, 0), 0.8))
+    return np.asarray(0.7 * (wall & ball(x, y, z, (0, 0, 0), 0.8)))
 
 
 @scene
@@ -136,7 +136,7 @@ def text(x: Array, y: Array, z: Array, random: np.random.Generator) -> Array:
     letters = np.array([list(row) for row in ("###.###", ".#..#..", ".#..##.", ".#..#..", ".#..###")]) == "#"
     column, row = (np.floor((each + 0.7) / 0.2).astype(int) for each in (x, 1.4 * y))
     inside = (column >= 0) & (column < 7) & (row >= 0) & (row < 5) & (np.abs(z + 0.1) < 0.12)
-    return 0.9 * (inside & letters[row.clip(0, 4), column.clip(0, 6)])
+    return np.asarray(0.9 * (inside & letters[row.clip(0, 4), column.clip(0, 6)]))
 
 
 def poisson(counts: float, *, offset: float = 0.0, read_noise: float = 0.0) -> Noise:
@@ -243,4 +243,4 @@ def _project(density: Array, size: int, theta: float) -> Array:
         (weights[on], (rows[on] // _PIXEL_PARTS, columns[on])), shape=(size, u.size), dtype=np.float32
     )
     image = matrix @ density.transpose(0, 2, 1).reshape(u.size, high)
-    return image.reshape(size, size, _VOXEL_PARTS).mean(2).T.astype(np.float64)
+    return np.asarray(image.reshape(size, size, _VOXEL_PARTS).mean(2).T.astype(np.float64))

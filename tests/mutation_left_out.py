@@ -131,7 +131,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "float(railed.float().mean()) > _RAILED",
             "no share in single precision is 0.02: that number lies between two of them",
         ),
-        ("self.forward(signal[:0]).edges[1]", "0", "the edges are those of the converter, whatever the signals"),
+        (
+            "DigitisedDistribution(self, self.model(signal[:0])).edges[1]",
+            "0",
+            "the edges are those of the converter, whatever the signals",
+        ),
     ],
     "noiseflow/metrics/evaluation.py": [
         ("_CHUNK = 65536", "numbers", SPEED),

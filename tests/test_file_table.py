@@ -88,6 +88,7 @@ def folder_of(kind: str) -> Callable[[Path], Path]:
         text = {
             "one mdoc": ("all.mdoc", f"PixelSpacing = {PIXEL}\n\n{''.join(sections)}"),
             "movies, one mdoc": ("all.mdoc", f"PixelSpacing = {PIXEL}\n\n{''.join(paths)}"),
+            "names": ("all.tlt", "".join(f"{name}.tif {angle}\n" for _, name, angle in sorted(rows))),
             "star": ("all.star", _star("rln", [f"{name}.eer" for name in np.array(names)[SHUFFLED]], SHUFFLED)),
             "tomostar": ("all.tomostar", _star("wrp", [f"{name}.eer" for name in np.array(names)[SHUFFLED]], SHUFFLED)),
         }.get(kind)
@@ -204,6 +205,7 @@ MORE: dict[str, Callable[[Path], Path]] = {
     "images, one mdoc each": folder_of("each"),
     "movies, one mdoc": folder_of("movies, one mdoc"),
     "movies, one mdoc each": folder_of("movies, each"),
+    "images, list of names": folder_of("names"),
     "images, RELION table": folder_of("star"),
     "images, Warp table": folder_of("tomostar"),
     "list": mrc_with("series.rawtlt", _lines("{angle}")),

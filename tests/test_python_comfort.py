@@ -29,6 +29,7 @@ NOISY = (SIGNAL + RANDOM.normal(0, 4, SIGNAL.shape)).astype(np.float32)
 FRAMES = RANDOM.poisson(np.tile(SIGNAL, (5, 1, 1))).astype(np.float64)
 VOLUME = RANDOM.random((6, 5, 8), dtype=np.float32)
 ANGLES = np.linspace(-60, 60, 7)
+FIELDS = (recon.VoxelField, recon.MultiresolutionField, recon.CoordinateNetwork, recon.GaussianField)
 MODELS: list[Callable[[], torch.nn.Module]] = [
     noiseflow.Gaussian,
     noiseflow.SignalDependentGaussian,
@@ -109,7 +110,7 @@ def test_functions_return_what_they_are_given(function: Callable[[Any], Any], ar
         lambda s, o: metrics.kl_divergence(noiseflow.Gaussian(4.0), noiseflow.Gaussian(5.0), s.reshape(-1)),
         lambda s, o: select(s, o, candidates={"a": noiseflow.Gaussian()}, num_steps=5).chosen.nll,
         lambda s, o: spatial_structure(noiseflow.Gaussian(4.0), s, o).rows,
-        lambda s, o: noiseflow.detect_digitisation(o),
+        lambda s, o: noiseflow.detect_digitisation(o)[:4],
         lambda s, o: recon.compare(o, s).psnr,
         lambda s, o: noiseflow.KnownSignal(s).signal().sum().item(),
         lambda s, o: noiseflow.StaticScene(o).image().sum().item(),
@@ -172,12 +173,17 @@ def instances() -> list[Any]:
     return [
         *(make() for make in MODELS),
         noiseflow.AtLevel(noiseflow.Gaussian(0.1), 1000.0),
+        noiseflow.Correlated(noiseflow.Gaussian(0.1), torch.ones(1, 3)),
         noiseflow.Digitisation(1.0, 0, 255),
         noiseflow.KnownSignal(SIGNAL),
         noiseflow.StaticScene(NOISY),
         *(pair, aligned, aligned.registration, calibration.Burst(FRAMES)),
         *(series, grid, reconstructor, result, result.volume, result.fit_result, result.signal_model, projector()),
-        *(kind((6, 5, 8)) for kind in (recon.VoxelField, recon.MultiresolutionField, recon.CoordinateNetwork)),
+        *(kind((6, 5, 8)) for kind in FIELDS),
+        recon.DualAxisProjector(
+            tilt_angles=ANGLES, axes=[0.0] * (len(ANGLES) - 1) + [90.0], depth=6, height=5, width=8
+        ),
+        recon.Alignment(3.0, np.zeros((len(ANGLES), 2)), np.asarray(ANGLES)),
         *(recon.Linear(), recon.Transmission(torch.ones(7))),
         *(recon.prepare(series), find_method("sirt")),
     ]

@@ -125,7 +125,7 @@ def test_provenance_of_a_folder_is_that_of_its_images(tmp_path):
 
 def test_included_report_keeps_its_pictures_under_its_own_title(tmp_path):
     inner = Report("inner & more")
-    inner.heading("Part")
+    inner.heading("Part", folded=True)
     inner.widget("volume", {"text": "</main>"}, caption="inner")
     outer = Report("outer")
     outer.include(inner.save(tmp_path / "inner.html"))
@@ -133,6 +133,7 @@ def test_included_report_keeps_its_pictures_under_its_own_title(tmp_path):
     assert "<h2>inner &amp; more</h2>" in page
     assert "<h3>Part</h3>" in page
     assert page.count("</main>") == 1
+    assert page.count("<details>") == page.count("</details>") == 1
 
 
 def test_even_and_odd_tilts_are_all_tilts_once():
@@ -334,12 +335,30 @@ def test_page_names_its_contents_and_its_file_as_text(open_page):
         "Volume",
         "Error bars",
         "Tilt series",
+        "Differences of each image",
         "Noise",
         "Convergence",
         "Resolution",
         "Settings and choices",
+        "Methods, to paste into a paper",
         "Provenance",
     ]
+
+
+def test_folded_parts_open_by_their_link_and_numbers_and_charts_are_saved(open_page):
+    page = open_page()
+    settings = page.locator("details", has=page.get_by_role("heading", name="Settings and choices"))
+    assert settings.locator("table").is_hidden()
+    page.locator(".contents a", has_text="Settings and choices").click()
+    assert settings.locator("table").is_visible()
+    with page.expect_download() as numbers:
+        settings.get_by_role("button", name="CSV").click()
+    assert numbers.value.suggested_filename == "settings_and_choices.csv"
+    assert '"setting","value","evidence"' in numbers.value.path().read_text(encoding="utf-8")
+    page.locator(".contents a", has_text="Noise").click()
+    with page.expect_download() as chart:
+        page.locator("details[open] button", has_text="SVG").first.click()
+    assert "var(--" not in chart.value.path().read_text(encoding="utf-8")
 
 
 def test_resolution_is_drawn_of_halves_and_reference_alike(scene, tmp_path):

@@ -11,6 +11,8 @@ import tifffile
 import recon
 from noiseflow import io
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # files that lead to warnings open all the same
+
 CASES = Path(__file__).parents[2] / "shared" / "data" / "cases_series"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 with_cases = pytest.mark.skipif(not CASES.is_dir(), reason="the small series are not here")
@@ -84,11 +86,30 @@ def test_angles_of_a_full_turn_are_read(tmp_path: Path) -> None:
     assert recon.read_tilt_series(CASES / "de360.h5").tilt_angles[[0, -1]].tolist() == [0, 350]
 
 
-@with_cases
-def test_pixels_that_are_not_square_are_refused_unless_their_size_is_given() -> None:
-    with pytest.raises(ValueError, match="10 x 20"):
-        recon.read_tilt_series(CASES / "aniso.mrc")
-    assert recon.read_tilt_series(CASES / "aniso.mrc", pixel_size=12).pixel_size == 12
+@pytest.mark.parametrize(
+    ("edges", "shape"), [((10, 20), (4, 12, 8)), ((20, 10), (4, 6, 16)), ((10, 12.5), (4, 12, 12))]
+)
+def test_pixels_become_square_and_counts_stay_counts(
+    edges: tuple[float, float], shape: tuple[int, int, int], tmp_path: Path
+) -> None:
+    counts = np.random.default_rng(0).poisson(3.0, (4, 12, 16)).astype(np.int16)
+    mask, (x, y) = np.ones(counts.shape, np.bool_), edges
+    mask[1, 4, 5] = False
+    io.write(tmp_path / "a.mrc", counts, voxel_size=(1, y, x), stack=True)
+    (tmp_path / "a.rawtlt").write_text("-20\n-10\n10\n20\n")
+    with pytest.warns(UserWarning, match=f"{x:g} x {y:g}"):
+        series = recon.read_tilt_series(tmp_path / "a.mrc", mask=mask)
+    assert series.images.shape == shape
+    assert series.pixel_size == max(edges)
+    if max(edges) / min(edges) == 2:
+        summed = counts.reshape(4, shape[1], 12 // shape[1], shape[2], 16 // shape[2]).sum((2, 4))
+        assert series.images.dtype.kind == "i"
+        np.testing.assert_array_equal(series.images[series.used], summed[series.used])
+        assert (~series.used).sum() == 1
+    else:  # 12 pixels of 12.5 Å show 15 of the 16 pixels of 10 Å
+        shares = np.r_[0.5, np.ones(14), 0.5] / 15
+        np.testing.assert_allclose(series.images[0].mean(1), counts[0] @ shares, rtol=1e-5)
+    assert recon.read_tilt_series(tmp_path / "a.mrc", pixel_size=12).images.shape == counts.shape
 
 
 TEXTS = {
@@ -101,6 +122,11 @@ TEXTS = {
     "one line, commas": ("-60, -58,-56\n", [-60, -58, -56]),
     "one line, semicolons": ("-60,5;-58,5;-56,5", [-60.5, -58.5, -56.5]),
     "units": ("tilt (degrees)\n-60 deg\n-58 deg\n-56 deg\n", [-60, -58, -56]),
+    "title in another language": ("Serie\nWinkel\n-60\n-58\n-56\n", [-60, -58, -56]),
+    "quoted": ('"angle","dose"\n"-60","0"\n"-58","3"\n"-56","6"\n', [-60, -58, -56]),
+    "json": ("[-60.0, -58.0, -56.0]\n", [-60, -58, -56]),
+    "end mark of old files": ("-60\r\n-58\r\n-56\r\n\x1a", [-60, -58, -56]),
+    "names of images": ("b_001.tif -60\nb_002.tif -58\nb_003.tif -56\n", [-60, -58, -56]),
     "typographic minus": ("−60\n−58\n−56°\n", [-60, -58, -56]),
 }
 
@@ -249,6 +275,7 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     (tmp_path / "tilt.com").write_text(command)
     with pytest.warns(UserWarning, match=r"1\.5.*views 2"), pytest.warns(UserWarning, match="about x"):
         series = recon.read_tilt_series(tmp_path / "a_ali.mrc")
+    assert series.x_tilt == 3
     assert series.tilt_angles.tolist() == [-18.5, 11.5, 21.5]
     np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
     with pytest.warns(UserWarning, match="about x"):
@@ -541,3 +568,117 @@ def test_angles_of_hdf5_files_by_name_and_unit(name: str, unit: str | None, tmp_
         if unit is not None:
             file[name].attrs["units"] = unit
     np.testing.assert_allclose(recon.read_tilt_series(tmp_path / "a.h5").tilt_angles, angles)
+
+
+BORDER = np.ones((3, 6, 8), np.bool_)
+BORDER[:, :2], BORDER[1, :, 6:] = False, False
+
+
+def write_mask(path: Path, mask: np.ndarray) -> None:
+    """A mask as a program writes it: 0 for pixels to leave out."""
+    if path.suffix == ".h5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            file["mask"] = mask
+    elif path.suffix == ".npy":
+        np.save(path, mask)
+    elif path.suffix == ".npz":
+        np.savez(path, mask=mask)
+    elif path.suffix == ".png":
+        from PIL import Image
+
+        Image.fromarray(mask[0]).save(path)
+    elif path.suffix == ".tif":
+        tifffile.imwrite(path, mask)  # of one bit
+    else:
+        io.write(path, mask.astype(np.int8))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".tif", ".png", ".h5", ".mrc"])
+@pytest.mark.parametrize("common", [False, True])
+def test_masks_open_from_every_reader(suffix: str, common: bool, tmp_path: Path) -> None:
+    if suffix == ".png" and not common:
+        pytest.skip("a PNG file holds one image")
+    images = np.random.default_rng(0).random(BORDER.shape).astype(np.float32)
+    recon.write_tilt_series(tmp_path / "a.mrc", recon.TiltSeries(images, [-30.0, 0.0, 30.0]))
+    write_mask(tmp_path / f"mask{suffix}", BORDER[:1] if common else BORDER)
+    series = recon.read_tilt_series(tmp_path / "a.mrc", mask=tmp_path / f"mask{suffix}")
+    np.testing.assert_array_equal(series.used, np.broadcast_to(BORDER[0], BORDER.shape) if common else BORDER)
+
+
+def test_a_folder_of_masks_is_joined_by_the_angles_in_names(tmp_path: Path) -> None:
+    images = np.random.default_rng(0).random(BORDER.shape).astype(np.float32)
+    recon.write_tilt_series(tmp_path / "a.mrc", recon.TiltSeries(images, [-30.0, 0.0, 30.0]))
+    folder = folder_of(tmp_path / "m", ["m_-30.0.tif", "m_0.0.tif", "m_30.0.tif"], BORDER.astype(np.uint8))
+    assert io.read(folder).tilt_angles.tolist() != [-30, 0, 30]
+    np.testing.assert_array_equal(recon.read_tilt_series(tmp_path / "a.mrc", mask=folder).used, BORDER)
+
+
+def test_a_smaller_image_of_an_ome_file_is_read_by_its_name(tmp_path: Path) -> None:
+    haadf = np.random.default_rng(0).random((5, 8, 10)).astype(np.float32)
+    counts = np.random.default_rng(1).poisson(2, (5, 4, 5)).astype(np.uint8)
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif", ome=True) as file:
+        for name, data in (("HAADF", haadf), ("Fe", counts)):
+            file.write(data, metadata={"axes": "ZYX", "Name": name}, photometric="minisblack")
+    np.testing.assert_array_equal(io.read(tmp_path / "a.ome.tif").data, haadf)
+    np.testing.assert_array_equal(io.read(tmp_path / "a.ome.tif", channel="Fe").data, counts)
+
+
+def test_command_files_of_both_axes_and_lists_of_views_to_use(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 8, 9)).astype(np.float32)
+    for axis in "ab":
+        io.write(tmp_path / f"s{axis}.ali", stack)
+        (tmp_path / f"s{axis}.tlt").write_text("-20\n-10\n10\n20\n")
+        command = f"InputProjections s{axis}.ali\nTILTFILE s{axis}.tlt\nOFFSET 2\nINCLUDE 1-2\nINCLUDE 4\n"
+        (tmp_path / f"tilt{axis}.com").write_text(command)
+        with pytest.warns(UserWarning, match="views 3"):
+            assert recon.read_tilt_series(tmp_path / f"s{axis}.ali").tilt_angles.tolist() == [-18, -8, 22]
+
+
+def test_images_that_a_table_of_sections_leaves_out_are_left_out(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 8, 9)).astype(np.float32)
+    io.write(tmp_path / "a.mrc", stack)
+    rows = "4@a.mrc 20 nan 3\n1@a.mrc -20 nan 0\n3@a.mrc 10 nan 6\n"
+    columns = ("rlnMicrographName", "rlnTomoNominalStageTiltAngle", "rlnTomoYTilt", "rlnMicrographPreExposure")
+    names = "".join(f"_{name} #{place}\n" for place, name in enumerate(columns, 1))
+    (tmp_path / "a.star").write_text(f"data_a\n\nloop_\n{names}{rows}")
+    with pytest.warns(UserWarning, match="3 of 4"):
+        series = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert series.tilt_angles.tolist() == [-20, 10, 20]
+    assert series.dose is not None
+    assert series.dose.tolist() == [0, 6, 3]
+    np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
+
+
+@pytest.mark.parametrize("suffix", [".gz", ".bz2"])
+def test_damaged_packed_files_are_named(suffix: str, tmp_path: Path) -> None:
+    import bz2
+    import gzip
+
+    packed = (gzip if suffix == ".gz" else bz2).compress(np.random.default_rng(0).bytes(3000))
+    for content in (packed[:1000], packed[:300] + bytes(300) + packed[600:], b"nothing packed" * 9):
+        (tmp_path / f"a.mrc{suffix}").write_bytes(content)
+        with pytest.raises(ValueError, match=r"a\.mrc"):
+            io.read(tmp_path / f"a.mrc{suffix}")
+
+
+def turned_slab(degrees: float) -> np.ndarray:
+    """A slab whose z rises with y by an angle."""
+    z, y, _ = np.meshgrid(*(np.arange(32) - 15.5 for _ in range(3)), indexing="ij")
+    radians = np.deg2rad(degrees)
+    return np.clip(3.0 - np.abs(z * np.cos(radians) - y * np.sin(radians)), 0, 1) * (np.abs(y) < 11)
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_a_specimen_that_is_turned_about_x_is_written_level(invert: bool, tmp_path: Path, run) -> None:
+    series, _ = recon.clean_tilt_series(turned_slab(10.0), np.arange(-90, 90, 9.0))
+    recon.write_tilt_series(tmp_path / "a.mrc", series)
+    (tmp_path / "a.xtilt").write_text("-10\n" * 20 if invert else "10\n" * 20)
+    if invert:
+        (tmp_path / "a.rawtlt").write_text("".join(f"{-angle}\n" for angle in series.tilt_angles))
+    options = ["--method", "sirt", "--steps", "20", *(["--invert-tilt"] if invert else [])]
+    run("reconstruct", tmp_path / "a.mrc", "-o", tmp_path / "v.mrc", *options)
+    volume = io.read(tmp_path / "v.mrc").data
+    places = np.arange(32) - 15.5
+    heights = [float(np.average(places, weights=volume[:, y].sum(1).clip(0))) for y in (9, 22)]
+    assert abs(heights[1] - heights[0]) < 0.3  # 2.3 voxels as it was

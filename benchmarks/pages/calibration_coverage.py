@@ -68,7 +68,7 @@ def found_of(kind: str, seed: int) -> Row:
         found = measure_exposures(exposures, dark=dark)
     except ValueError as error:
         return row | {"refused": str(error)}
-    row |= {"verdict": found.verdict.grade, "reasons": [one.name for one in found.verdict.findings]}
+    row |= {"verdict": found.verdict.grade, "reasons": [one.reason for one in found.verdict.findings]}
     for name in PARAMETERS:
         value = getattr(found.figures, name) if found.figures else None
         row[name] = None if value is None else [value.q05, value.median, value.q95]

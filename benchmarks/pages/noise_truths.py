@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import noiseflow
+from noiseflow.distributions.laws.textbook import GaussianDistribution
 
 SIDE = 512
 
@@ -58,6 +59,12 @@ class TruthDistribution:
             return self.signal + self.scale * (self.truth.shape.sample(self.signal.shape) - self.truth.mean)
 
 
+class UnevenGaussian(GaussianDistribution):
+    """A Gaussian whose width differs between pixels."""
+
+    per_pixel = ("signal", "log_scale")
+
+
 class Analytic(nn.Module):
     """Gaussian noise of given signal dependence, as a noise model."""
 
@@ -65,8 +72,8 @@ class Analytic(nn.Module):
         super().__init__()
         self.scale = scale
 
-    def forward(self, signal: Tensor) -> noiseflow.models.baselines.GaussianDistribution:
-        return noiseflow.models.baselines.GaussianDistribution(signal, torch.log(self.scale(signal)))
+    def forward(self, signal: Tensor) -> UnevenGaussian:
+        return UnevenGaussian(signal, torch.log(self.scale(signal)))
 
 
 def growing(signal: Tensor) -> Tensor:

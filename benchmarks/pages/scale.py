@@ -31,9 +31,9 @@ from benchmarks.pages.scale_measure import mapped, middle_rows, psnr, run, seams
 from benchmarks.scenes import Results
 from benchmarks.search import best_fit
 from noiseflow.commands.console import Output
-from recon.fields.regularisers._names import DEFAULT
 from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import fourier_shell_correlation, resolution
+from recon.names import REGULARISERS
 from recon.scale.blocks import HALO
 from recon.series.tilt_series import VolumeGrid, read_tilt_series
 from recon.simulate.simulation import ACQUISITIONS
@@ -164,7 +164,7 @@ def measure(row: Row, folder: Path, threads: int) -> Cell:
         judged |= {"fsc 0.5": resolution(*fourier_shell_correlation(volume, truth), 0.5)}
         judged |= seams(volume, truth, said["slices_at_once"])
     keep = {
-        "regulariser": said["choices"].get("regulariser", DEFAULT),
+        "regulariser": said["choices"].get("regulariser", REGULARISERS.first),
         "seconds inside": said["seconds"],
         "choices": said["choices"],
         "verdict": said["verdict"]["grade"],

@@ -10,15 +10,13 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import CLEAR
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
-
-CLEAR = 5.0
-"""Standard errors above which a correlation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
 
 PEAK = 25.0
 """Significant power of a spectral line, relative to the mean of its neighbourhood. Noise exceeds it with probability exp(−25).
@@ -163,10 +161,9 @@ def _of_interpolation(pair: AlignedPair) -> Image:
     """Return the (K,) correlation that warping introduces into white noise of the long exposure."""
     if pair.frames > 1:
         return np.zeros(len(LAGS))
-    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-    warped = pair.registration.warp(noise)[0]
-    if warped is noise:
+    if not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
+    warped = pair.registration.warped_noise(pair.long.shape)
     products = [float(np.mean(warped[first] * warped[second])) for first, second in (_shifted(*lag) for lag in LAGS)]
     return np.array(products) / float(np.mean(warped**2))
 

@@ -12,7 +12,7 @@ from calibration.detector.independence import correlation_of_flats
 from calibration.detector.moments import Level, level_of
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import NotMeasurable
-from calibration.detector.posterior import Interval
+from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.residual import CUT, Residual
 from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image
@@ -26,7 +26,6 @@ LINEAR_RANGE = 0.7
 LEVEL_ERROR = 0.003
 """Relative model error added to the error of each level's variance: typical instability of light and converter."""
 
-NINETY = 1.645
 LEAST_LEVELS = 2
 _POINT = ("mean", "variance", "variance_error")
 
@@ -69,7 +68,7 @@ class CameraFigures:
         bend: exponent of the response to light; the gain is the local one at the mean signal.
         pattern: places whose noise differs at equal signal.
         outliers: number of values that stood out in one frame only and were replaced.
-        lag: correlation of the noise of successive frames; 0 if not significant.
+        lag: correlation of the noise of successive frames, and its standard error.
     """
 
     gain: Interval
@@ -92,7 +91,7 @@ class CameraFigures:
     bend: Response
     pattern: Pattern
     outliers: int = 0
-    lag: float = 0.0
+    lag: tuple[float, float] = (0.0, 0.0)
 
     @property
     def linear(self) -> list[Level]:
@@ -174,8 +173,10 @@ def measure_camera(
     half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
     times = None if flat_times is None else [flat_times[int(index)] for index in order]
     return CameraFigures(
-        gain=bend.local(_normal(slope, error)),
-        dark_noise=None if dark_noise is None or dark is None else _normal(dark_noise, _read_error(dark, slope, error)),
+        gain=bend.local(Interval.normal(slope, error)),
+        dark_noise=None
+        if dark_noise is None or dark is None
+        else Interval.normal(dark_noise, _read_error(dark, slope, error)),
         offset=offset,
         saturation=float(saturation),
         saturated=bool(top.mean < levels[-1].mean or top.clipped > 0),
@@ -190,7 +191,7 @@ def measure_camera(
         dark=dark,
         correlation=correlation,
         chi_squared=chi_squared,
-        if_linear=_normal(slope, error),
+        if_linear=Interval.normal(slope, error),
         bend=bend,
         pattern=pattern_of(residuals, inflation=correlation.inflation),
         outliers=outliers,
@@ -283,10 +284,6 @@ def _residual(burst: Burst, variance: Image) -> Residual:
     z = z - z.mean(axis=(1, 2), keepdims=True)
     z = z / max(float(z.std()), np.finfo(float).tiny)
     return Residual(np.clip(z, -CUT, CUT), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
-
-
-def _normal(middle: float, error: float) -> Interval:
-    return Interval(float(middle), float(middle - NINETY * error), float(middle + NINETY * error))
 
 
 def _require_equal(

@@ -8,27 +8,24 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.measure import Detector
-from calibration.detector.posterior import Interval
+from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.repair import Repairs
+from noiseflow.checks import Effect
 from noiseflow.described import described
 
-LARGEST_MISFIT = 1.3
-"""Largest χ² per degree of freedom of the histograms for a Poisson-Gaussian detector."""
+MODEL_MISFIT = 0.3
+"""Largest excess of χ² per degree of freedom of the histograms of a Poisson-Gaussian detector."""
 
-LARGEST_DISAGREEMENT = 0.02
-"""Largest relative difference between the gain of the posterior and that of the photon-transfer line, unless it is within three
-standard errors of the line: the target accuracy of the gain."""
+SHAPE_BIAS = 0.02
+"""Largest relative difference between the gain of the posterior and that of the photon-transfer line: the target accuracy."""
 
-LARGEST_UNEVENNESS = 0.05
+UNEVEN = 0.05
 """Largest relative deviation of the pixels' variances that one gain and read noise describe. The mixture then has tails heavier
 by its square, 0.25 %, which biases the offset but hardly the gain."""
 
 RESAMPLED_ERROR = 0.03
 """Relative standard error of a gain corrected for linear interpolation, whose noise depends on the sampled sub-pixel positions
 (frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
-
-NINETY = 1.645
-"""Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
 
 @described(gain="counts per electron", offset="counts", read_noise="electrons")
@@ -90,15 +87,17 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
 
 def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
-    return detector.misfit <= LARGEST_MISFIT and not disagrees(detector) and detector.uneven <= LARGEST_UNEVENNESS
+    value, error, _ = disagreement(detector)
+    agrees = abs(value) <= max(SHAPE_BIAS, 3 * error)
+    return detector.misfit <= 1 + MODEL_MISFIT and agrees and detector.uneven <= UNEVEN
 
 
-def disagrees(detector: Detector) -> bool:
-    """Whether the posterior's gain differs from photon transfer; never if single-electron peaks determine the gain."""
+def disagreement(detector: Detector) -> Effect:
+    """Difference of the posterior's gain from photon transfer, of the gain; none if single-electron peaks determine it."""
     if detector.electrons:
-        return False
+        return Effect(0.0)
     line, gain = detector.line, detector.posterior.gain.median
-    return bool(abs(gain - line.gain) > max(LARGEST_DISAGREEMENT * gain, 3 * line.gain_error))
+    return Effect(1 - line.gain / gain, line.gain_error / gain)
 
 
 def correctable(correlation: Correlation, repairs: Repairs) -> bool:
@@ -114,7 +113,7 @@ def _with_line(detector: Detector) -> Interval:
     value in 83 to 86 % of simulated pairs. The interval of photon transfer uses no prior and contained it in 91 %.
     Single-electron peaks determine the gain to 0.1 % and need no correction.
     """
-    gain, line = detector.posterior.gain, _normal(detector.line.gain, detector.line.gain_error)
+    gain, line = detector.posterior.gain, Interval.normal(detector.line.gain, detector.line.gain_error)
     if detector.electrons or detector.offset is not None or any(one.common.any() for one in detector.levels):
         return gain
     return Interval(gain.median, min(gain.q05, line.q05), max(gain.q95, line.q95))
@@ -123,13 +122,13 @@ def _with_line(detector: Detector) -> Interval:
 def _by_line(detector: Detector) -> Figures:
     """Return the gain from photon transfer, and offset and read noise from dark frames only."""
     line = detector.line
-    gain = _normal(line.gain, line.gain_error)
+    gain = Interval.normal(line.gain, line.gain_error)
     if detector.offset is None:
         return Figures(gain, None, None, "photon transfer")
     read = detector.dark_deviation
     relative = float(np.hypot(line.gain_error / line.gain, 1e-3))
-    noise = None if read is None else _normal(read / line.gain, read / line.gain * relative)
-    return Figures(gain, _normal(*detector.offset), noise, "photon transfer")
+    noise = None if read is None else Interval.normal(read / line.gain, read / line.gain * relative)
+    return Figures(gain, Interval.normal(*detector.offset), noise, "photon transfer")
 
 
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
@@ -144,11 +143,5 @@ def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
     whole = middle * float(np.linalg.norm((width, error / factor, resampled)))
     read = figures.read_noise
-    noise = (
-        None if read is None else Interval(*(value / np.sqrt(factor) for value in (read.median, read.q05, read.q95)))
-    )
-    return Figures(_normal(middle, whole), figures.offset, noise, figures.source, factor)
-
-
-def _normal(middle: float, error: float) -> Interval:
-    return Interval(middle, middle - NINETY * error, middle + NINETY * error)
+    noise = None if read is None else read.times(1 / np.sqrt(factor))
+    return Figures(Interval.normal(middle, whole), figures.offset, noise, figures.source, factor)

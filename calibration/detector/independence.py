@@ -9,11 +9,8 @@ from scipy import ndimage
 
 from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.scaling import BLOCK, finest_band
+from calibration.exposures.scaling import BLOCK, CLEAR, finest_band
 from calibration.registration.aligned import AlignedPair
-
-CLEAR = 5.0
-"""Standard errors above which shared noise is significant; exceeded by chance once in 10⁶ calibrations."""
 
 LEAST_FRAMES = 3
 """Fewest frames of a burst that include both successive and more distant frames."""
@@ -34,14 +31,14 @@ LEAST_COMMON = 0.75
 is 1 in that case, and 0 for separate exposures."""
 
 
-def correlation_in_time(pairs: Sequence[AlignedPair]) -> float:
-    """Correlation of the noise of successive frames of a burst, minus that of more distant frames; 0 if not significant.
+def correlation_in_time(pairs: Sequence[AlignedPair]) -> tuple[float, float]:
+    """Correlation of the noise of successive frames of a burst, minus that of more distant frames, and its standard error.
 
     Image lag, recursive filters and running means correlate successive frames. This reduces the variance of their differences,
     by twice the correlation if the next frame loses what the filter keeps of the previous one.
     """
     if pairs[0].frames == 1:
-        return 0.0
+        return 0.0, 0.0
     chosen = pairs[:MOST_FRAMES]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
     z = np.stack([residual_of(pair).z[mask] for pair in chosen])
@@ -49,8 +46,8 @@ def correlation_in_time(pairs: Sequence[AlignedPair]) -> float:
     return _of_successive([np.sqrt(1 - 1 / len(pairs)) * z])
 
 
-def correlation_of_flats(bursts: Sequence[Burst]) -> float:
-    """Correlation of successive frames without a scene, all levels together; 0 if every level has only two frames."""
+def correlation_of_flats(bursts: Sequence[Burst]) -> tuple[float, float]:
+    """The same for frames without a scene, all levels together; 0 if every level has only two frames."""
     standardised = []
     for burst in bursts:
         frames = burst.frames[:MOST_FRAMES].reshape(-1, burst.frames[0].size)
@@ -61,7 +58,7 @@ def correlation_of_flats(bursts: Sequence[Burst]) -> float:
     return _of_successive(standardised)
 
 
-def _of_successive(bursts: Sequence[Image]) -> float:
+def _of_successive(bursts: Sequence[Image]) -> tuple[float, float]:
     """Mean product of successive frames minus that of distant frames, for (frame, pixel) residuals of unit variance."""
     excess = information = 0.0
     for z in bursts:
@@ -73,8 +70,7 @@ def _of_successive(bursts: Sequence[Image]) -> float:
         weight = z.shape[1] / (1 / near.sum() + 1 / (~near).sum())
         excess += weight * float(products[first, second][near].mean() - products[first, second][~near].mean())
         information += weight
-    found = excess / information if information else 0.0
-    return found if abs(found) * np.sqrt(information) > CLEAR else 0.0
+    return (excess / information, float(1 / np.sqrt(information))) if information else (0.0, 0.0)
 
 
 def contained_share(pair: AlignedPair) -> float:
@@ -84,7 +80,7 @@ def contained_share(pair: AlignedPair) -> float:
     both exposures is then white, and includes all noise of the long one. Detail of a scene is not white because of the optics,
     and the long exposure has additional noise.
     """
-    if pair.frames > 1 or pair.registration.warp(pair.long)[0] is not pair.long:  # a contained frame needs no warping
+    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
         return 0.0
     inner = np.asarray(ndimage.binary_erosion(pair.mask, np.ones((5, 5)), border_value=0))
     inner &= np.abs(pair.short - pair.signal) < CLEAR * np.std((pair.short - pair.signal)[pair.mask])

@@ -264,8 +264,7 @@ def _plain_ratio(pair: AlignedPair) -> float | None:
 
 def _kept(pair: AlignedPair) -> float:
     """Return the fraction of white-noise variance that interpolation of the long exposure preserves."""
-    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-    return float(np.var(pair.registration.warp(noise)[0][pair.mask]))
+    return float(np.var(pair.registration.warped_noise(pair.long.shape)[pair.mask]))
 
 
 def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:

@@ -38,7 +38,7 @@ BLOCK = 8
 """Side of the held-out blocks, pixels."""
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
-"""Models that are always fitted; flexible models are fitted only if these can be improved."""
+"""Models fitted beside one that is asked for; alone, the last one is fitted only if the others can be improved."""
 
 MOST_COUNTS = 1e4
 """Largest mean of counts of single events: the dead time of counters limits them to fewer per frame."""
@@ -202,7 +202,7 @@ def fit_models(
 
     Args:
         pixels: from `collect_pixels`.
-        kinds: names in `KINDS`; by default the simple models, and the flexible ones if these can be improved by more than
+        kinds: names in `KINDS`; by default the simplest ones, and others as long as the best can be improved by more than
             `WORTH_FITTING` nats per pixel.
         detector: measured gain, offset and read noise for the Poisson-Gaussian model; None to fit them.
         seed: random seed.
@@ -226,19 +226,20 @@ def fit_models(
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """
-    models = _fitted(sorted(kinds or SIMPLE, key=_rank), pixels, detector, seed, device)
-    if progress is not None:
-        progress("Fitting noise models", len(models), len(KINDS), "simple models")
-    losses = {name: _losses(model, pixels) for name, model in models.items()}
-    best = min(losses, key=lambda name: float(losses[name].mean()))
-    for more in (_special(pixels), FLEXIBLE):
-        if kinds is None and (
-            attainable(models[best], pixels) > WORTH_FITTING
-            or (more == FLEXIBLE and heavy_tailed(models[best], pixels))
-        ):
-            models |= _fitted(more, pixels, detector, seed, device)
-            losses |= {name: _losses(models[name], pixels) for name in more}
-            best = min(losses, key=lambda name: float(losses[name].mean()))
+    models: dict[str, nn.Module] = {}
+    losses: dict[str, NDArray[np.float64]] = {}
+    left: dict[str, float] = {}
+    best = ""
+    for more in (SIMPLE[:3], SIMPLE[3:], _special(pixels), FLEXIBLE) if kinds is None else (kinds,):
+        if best and best not in left:
+            left[best] = attainable(models[best], pixels)
+        if best and left[best] <= WORTH_FITTING and not (more == FLEXIBLE and heavy_tailed(models[best], pixels)):
+            continue
+        models |= _fitted(sorted(more, key=_rank), pixels, detector, seed, device)
+        losses |= {name: _losses(models[name], pixels) for name in more}
+        best = min(losses, key=lambda name: float(losses[name].mean()))
+        if progress is not None:
+            progress("Fitting noise models", len(models), len(KINDS), best)
     if progress is not None:
         progress("Fitting noise models", len(KINDS), len(KINDS), "all models")
     return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]

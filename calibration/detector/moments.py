@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
+from calibration.exposures.scaling import CLEAR
 from noiseflow.described import described
 
 MOST_CLIPPED = 1e-3
 """Largest share of clipped pixel values that hardly affects the variance: clipping at three standard deviations reduces it by
 0.3 %."""
-
-CLEAR = 5.0
-"""Standard errors above which the light is not steady; the means of a few pixels of skewed noise exceed three once in 100."""
 
 COARSE = 0.24
 """Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between

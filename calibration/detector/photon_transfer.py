@@ -10,6 +10,7 @@ import numpy as np
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
+from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -66,16 +67,18 @@ class PhotonTransfer:
     gain_error: float = 0.0
     chi_squared: float = 1.0
 
-    @property
-    def bent(self) -> bool:
-        """Whether at least two points deviate from the line significantly and by over 2 % of the largest variance."""
-        free = self.clipped < 1e-3
-        if free.sum() < 5:
-            return False
-        departure = self.variance[free] - (self.gain * self.signal[free] + self.intercept)
-        significant = np.abs(departure) > 4 * self.variance_error[free] * max(1.0, self.chi_squared**0.25)
-        large = np.abs(departure) > 0.02 * self.variance[free].max()
-        return bool(np.sum(significant & large) >= 2)
+
+def departure(line: PhotonTransfer) -> Effect:
+    """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
+    free = line.clipped < 1e-3
+    if free.sum() < 5:
+        return Effect(0.0)
+    largest = float(line.variance[free].max())
+    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept))[free] / largest
+    second = int(np.argsort(departures)[-2])
+    # χ² counts a bend as scatter; its fourth root is between the errors with and without that
+    error = line.variance_error[free][second] / largest * max(1.0, line.chi_squared**0.25)
+    return Effect(float(departures[second]), float(error))
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
@@ -131,6 +134,14 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
 
 def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
     rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
-    variance = (levels.variance - rounding) / (1 + levels.shot_share)
+    signal, variance = levels.signal, levels.variance - rounding
+    if levels.absolute and len(signal) > 2:
+        # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
+        true = signal + levels.shift
+        slope = np.gradient(true, signal)
+        kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
+        signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
+    else:
+        variance = variance / (1 + levels.shot_share)
     error = variance * np.sqrt(2 / np.maximum(levels.count * levels.weight, 1))
-    return levels.signal, variance, error, levels.clipped()
+    return signal, variance, error, levels.clipped()

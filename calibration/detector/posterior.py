@@ -18,6 +18,9 @@ from noiseflow.described import described
 if TYPE_CHECKING:
     from noiseflow.progress import Progress
 
+NINETY = 1.645
+"""Half-width of a 90 % interval, in standard deviations of a normal distribution."""
+
 NUM_WALKERS = 16
 
 NUM_TIMES = 50
@@ -54,6 +57,15 @@ class Interval:
     median: float
     q05: float
     q95: float
+
+    @classmethod
+    def normal(cls, middle: float, error: float) -> Interval:
+        """Return the interval of a normal distribution with a standard deviation `error`."""
+        return cls(float(middle), float(middle - NINETY * error), float(middle + NINETY * error))
+
+    def times(self, factor: float) -> Interval:
+        """Return the interval of a multiple of the parameter."""
+        return Interval(*(float(factor * one) for one in (self.median, self.q05, self.q95)))
 
 
 @described(samples="gain (counts per electron), offset (counts), read noise (electrons)", autocorrelation_time="steps")

@@ -11,7 +11,7 @@ from calibration.detector.residual import residual_of
 from calibration.detector.scene_fit import SceneFit, changed_places, fit_scene, refitted, without_places
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import VarianceLine, fit_line
+from calibration.exposures.scaling import CLEAR, VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 
@@ -21,9 +21,6 @@ error is a few times the share, because the misfit is concentrated where the sce
 
 LEAST_OFFSETS = 0.1
 """Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
-
-CLEAR = 5.0
-"""Standard errors above which row offsets are significant."""
 
 
 @described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")

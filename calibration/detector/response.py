@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Image
 from noiseflow.described import described
+from noiseflow.statistics import weighted_line
 
-PRIOR = 0.09
-"""Standard deviation of the exponent about 1 before anything is measured: nine of ten detectors have exponents of 0.85 to 1.15.
+PRIOR = 0.125
+"""Standard deviation of the exponent about 1 before anything is measured: nine of ten detectors have exponents of 0.8 to 1.2.
 Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillators lose a tenth, and encoded images far more."""
 
 RATIO_ERROR = 0.01
@@ -27,7 +28,13 @@ CLEAR = 3.0
 LEAST_CURVATURE = 0.01
 """Least deviation of the exponent that is reported; it changes the gain by 2 %, the target accuracy."""
 
-EXPONENTS = np.linspace(0.6, 1.5, 361)
+LEAST_POINTS = 8
+"""Fewest variances that determine the exponent without the offset: four parameters, and as many to test them."""
+
+UNKNOWN = np.linspace(0.05, 2.0, 14)
+"""Unknown offsets, as distances from the darkest signal over that of the zero of the variance line."""
+
+EXPONENTS = np.linspace(0.6, 1.5, 181)
 
 
 @described(exponent="power of the light", error="power of the light")
@@ -82,8 +89,8 @@ def response_of(
     """Fit the exponent to the variances at several signals.
 
     With electrons n and a signal m = c·nᵞ above the offset, the local gain is g = γ·m/n and the shot-noise variance g²·n = γ·g·m,
-    which grows as m^(2 − 1/γ). Variances near the mean signal have the slope g·(2γ − 1). Without the offset, the curve determines
-    no exponent: read noise that is shaped by the response hides it, so that the prior remains.
+    which grows as m^(2 − 1/γ). Read noise is constant, or varies as m^(2 − 2/γ) if it precedes the response. An unknown offset
+    lies between the zero of a line and the darkest signal, or as far below that zero.
 
     Args:
         signal: (L,) counts; dark frames may be among them.
@@ -93,47 +100,69 @@ def response_of(
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
     """
     weight = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
-    change = 1 / (2 * EXPONENTS - 1)
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
         weight = weight * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
-    # the nodes and weights of a Gauss-Hermite rule of three points
-    shifts = () if offset is None else ((0.0, 2 / 3), (-np.sqrt(3), 1 / 6), (np.sqrt(3), 1 / 6))
-    found = [(_curve(signal - offset[0] - by * offset[1], variance, error), share) for by, share in shifts if offset]
-    curves = [(one, share) for one, share in found if one is not None]
-    if curves:
-        chi_squared = -2 * np.logaddexp.reduce([np.log(share) - 0.5 * one[0] for one, share in curves])
-        gains = curves[0][0][1]
+    weight, change = weight[:, None], 1 / (2 * EXPONENTS - 1)[:, None]
+    curves = _curves(signal, variance, error, offset)
+    if curves is not None:
+        chi_squared, gains = curves
         scale = max(float(chi_squared.min()) / max(len(signal) - 3, 1), 1.0)
         weight = weight * np.exp(-0.5 * (chi_squared - chi_squared.min()) / scale)
-        change = gains / float(np.interp(1.0, EXPONENTS, gains))
+        straight = int(np.argmin(np.abs(EXPONENTS - 1)))
+        change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
     weight = weight / weight.sum()
-    exponent = float(weight @ EXPONENTS)
-    spread = float(np.sqrt(weight @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
-    low, middle, high = (float(one) for one in _quantiles(change, weight, (0.05, 0.5, 0.95)))
-    return Response(exponent, spread, bool(curves) or ratio is not None, low, middle, high)
+    by_exponent = weight.sum(axis=1)
+    exponent = float(by_exponent @ EXPONENTS)
+    spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
+    low, middle, high = (float(one) for one in _quantiles(change.ravel(), weight.ravel(), (0.05, 0.5, 0.95)))
+    known = ratio is not None or (curves is not None and (offset is not None or spread < PRIOR / 2))
+    return Response(exponent, spread, known, low, middle, high)
 
 
-def _curve(light: Image, variance: Image, error: Image) -> tuple[Image, Image] | None:
-    """Return χ² and the local gain at the mean signal for each of `EXPONENTS`; None if the curve has too few points."""
+def _curves(
+    signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None
+) -> tuple[Image, Image] | None:
+    """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points."""
+    if offset is not None:
+        # a Gauss-Hermite rule of three points
+        offsets = offset[0] + offset[1] * np.sqrt(3) * np.array([0, -1, 1])
+        share = np.array([2 / 3, 1 / 6, 1 / 6])
+    else:
+        line, darkest = weighted_line(signal, variance, 1 / error**2), float(signal.min())
+        if len(signal) < LEAST_POINTS or not line.slope > 0:
+            return None
+        offsets = darkest - max(darkest + line.intercept / line.slope, 0.0) * UNKNOWN
+        share = np.full(len(offsets), 1 / len(offsets))
+    light = signal - offsets[:, None]
     lit = light > 0
-    if lit.sum() < 2 or len(light) < 3:
+    if lit.sum(axis=1).min() < 2 or len(signal) < 3:
         return None
-    reference = float(light[lit].mean())
-    share = np.maximum(light, 0.0) / reference
-    found = np.array([_shot_and_read(share ** (2 - 1 / power), variance, error) for power in EXPONENTS])
-    return found[:, 0], np.maximum(found[:, 1], np.finfo(float).tiny) / (EXPONENTS * reference)
+    reference = np.array([one[use].mean() for one, use in zip(light, lit, strict=True)])
+    relative = np.maximum(light / reference[:, None], 1e-9)
+    shot, late = relative ** (2 - 1 / EXPONENTS)[:, None, None], np.ones((len(EXPONENTS), *light.shape))
+    shapes, reads = np.where(lit, shot, 0.0), late
+    if offset is None:  # in darkness, which dark frames show, noise before the response has no such power
+        shapes = np.concatenate([shapes, shapes], axis=1)
+        reads = np.concatenate([late, relative ** (2 - 2 / EXPONENTS)[:, None, None]], axis=1)
+        share, reference = np.tile(share, 2), np.tile(reference, 2)
+    chi_squared, shots, rest = _shot_and_read(shapes, reads, variance, error)
+    if offset is None:  # a response shows only above the noise before it
+        chi_squared[:, len(offsets) :][rest[:, len(offsets) :] > shots[:, len(offsets) :]] = np.inf
+    gains = np.maximum(shots, np.finfo(float).tiny) / (EXPONENTS[:, None] * reference)
+    return chi_squared - 2 * np.log(share), gains
 
 
-def _shot_and_read(shape: Image, variance: Image, error: Image) -> tuple[float, float]:
-    """Fit variance = shot·shape + read with read ≥ 0; return χ² and shot."""
+def _shot_and_read(shape: Image, read: Image, variance: Image, error: Image) -> tuple[Image, Image, Image]:
+    """Fit variance = a·shape + b·read with b ≥ 0 along the last axis; return χ², a and b."""
     weight = 1 / np.maximum(error, 1e-3 * np.abs(variance).max()) ** 2
-    design = np.stack([shape, np.ones_like(shape)])
-    gram, moment = design * weight @ design.T, design * weight @ variance
-    shot, read = np.linalg.solve(gram + 1e-12 * np.diag(np.diag(gram)), moment)
-    if read < 0:
-        shot, read = moment[0] / gram[0, 0], 0.0
-    return float(np.sum(weight * (variance - shot * shape - read) ** 2)), float(shot)
+    ss, sr, rr = ((weight * one).sum(-1) for one in (shape * shape, shape * read, read * read))
+    sv, rv = ((weight * variance * one).sum(-1) for one in (shape, read))
+    determinant = np.maximum(ss * rr - sr**2, 1e-12 * ss * rr)
+    b = np.maximum((ss * rv - sr * sv) / determinant, 0.0)
+    a = (sv - b * sr) / ss
+    residual = variance - a[..., None] * shape - b[..., None] * read
+    return np.asarray((weight * residual**2).sum(-1)), a, b
 
 
 def _quantiles(values: Image, weight: Image, shares: tuple[float, ...]) -> NDArray[np.float64]:

@@ -11,15 +11,12 @@ from scipy import ndimage
 from calibration.detector.residual import residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import VarianceLine, fit_line
+from calibration.exposures.scaling import CLEAR, VarianceLine, fit_line
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
 BLUR = 1.5
 """Smoothing of the signal before differentiation, pixels, which suppresses its noise."""
-
-CLEAR = 5.0
-"""Standard deviations of the χ² of noise above which the residual is considered to follow the scene."""
 
 KERNEL_REACH = 4
 """Half-width of the kernel fitted between the exposures, pixels."""
@@ -179,6 +176,5 @@ def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Imag
 
 
 def _gain_of_warped(pair: AlignedPair, kernel: Image) -> float:
-    noise = np.random.default_rng(0).standard_normal(pair.long.shape)
-    warped = pair.registration.warp(noise)[0]
+    warped = pair.registration.warped_noise(pair.long.shape)
     return float(np.var(ndimage.correlate(warped, kernel, mode="nearest")) / np.var(warped))

@@ -9,8 +9,9 @@ from scipy import ndimage
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
+from calibration.detector.residual import CUT
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line, spread_by_level
+from calibration.exposures.scaling import CLEAR, fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
 
 MERGED = 4
@@ -26,9 +27,6 @@ NEIGHBOURS = 9
 LEAST_DEVIATION = 2.0
 """Fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then resolved."""
 
-CLEAR = 5.0
-"""Standard errors above which codes count as uneven."""
-
 CLEAR_PIXELS = 4.0
 """Standard errors above which pixels count as uneven; the two tests of a burst exceed them by chance once in 10⁴ bursts."""
 
@@ -41,9 +39,6 @@ PER_LEVEL = 5000
 LEAST_VARIANCE = 0.05
 """Lower bound of the variance line, relative to the mean variance. Without light the line may cross zero, and dark pixels would
 appear many times noisier than expected."""
-
-CUT = 5.0
-"""Standard deviations at which differences are clipped to limit the effect of outliers."""
 
 
 def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:

@@ -15,6 +15,9 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
+CLEAR = 5.0
+"""Standard errors above which a deviation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
+
 CUT = 4.0
 """Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
 outliers then increase the standard deviation by 7 %."""
@@ -109,7 +112,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
 
 
 def own_variance(
-    short: Image, long: Image, mask: Mask, scaling: Scaling, warp: Callable[[Image], Image]
+    short: Image, long: Image, mask: Mask, scaling: Scaling, warp: Callable[[Image], Image], noise: Image
 ) -> VarianceLine:
     """Estimate the noise variance of the signal estimate, as a line in the signal, counts².
 
@@ -122,6 +125,7 @@ def own_variance(
         mask: (y, x) pixels of the short frame to use.
         scaling: scaling of the long exposure.
         warp: function that warps a long frame onto the short one.
+        noise: (y, x) warped white noise of unit variance.
     """
     signal = scaling.slope * warp(long) + scaling.intercept
     squares = scaling.slope**2 * warp(finest_band(long) ** 2) - finest_band(short) * finest_band(signal)
@@ -133,9 +137,7 @@ def own_variance(
     )  # the total variance is better known than that of the long exposure
     line = _line(chosen, squares[whole], weight)
     error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
-    kept = float(
-        np.var(warp(np.random.default_rng(0).standard_normal(long.shape))[whole])
-    )  # the fraction that interpolation preserves
+    kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves
     return VarianceLine(kept * line.floor, kept * line.rate, kept * error)
 
 

@@ -118,6 +118,12 @@ class Registration:
         x, y = self.matrix[:, :2] @ centre + self.matrix[:, 2] - centre
         return float(x), float(y)
 
+    def interpolates(self, shape: tuple[int, ...]) -> bool:
+        """Whether `warp` interpolates frames of `shape`."""
+        size = shape[::-1]
+        corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], float)
+        return bool(np.abs(corners @ self.matrix.T - corners[:, :2]).max() >= 0.01)
+
     def warp(self, long: Image) -> tuple[Image, NDArray[np.bool_]]:
         """Warp the long frame onto the pixels of the short one.
 
@@ -129,12 +135,21 @@ class Registration:
         import cv2
 
         size = long.shape[::-1]
-        corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], float)
-        if np.abs(corners @ self.matrix.T - corners[:, :2]).max() < 0.01:
+        if not self.interpolates(long.shape):
             return long, np.ones(long.shape, bool)
         flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
         warped = cv2.warpAffine(long, self.matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(warped, float), covered(self.matrix, long.shape)
+
+    def warped_noise(self, shape: tuple[int, ...]) -> Image:
+        """Return white noise of unit variance, warped as a long frame of this shape; it shows what interpolation keeps."""
+        return _warped_noise(self.matrix.tobytes(), shape)
+
+
+@functools.lru_cache(maxsize=2)  # several measurements of one pair ask for it
+def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
+    transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False)
+    return transform.warp(np.random.default_rng(0).standard_normal(shape))[0]
 
 
 def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:

@@ -152,7 +152,8 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
-    own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0])
+    noise = registration.warped_noise(pair.long.shape)
+    own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0], noise)
     _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)

@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.camera import Camera, rows_of
 from calibration.report.figures import correlation_figure, plain_log_ticks
+from calibration.report.page import describe_verdict
 from noiseflow.io import output_folder
 from noiseflow.report import Report, new_figure, provenance, show_image
 
@@ -18,15 +19,6 @@ if TYPE_CHECKING:
 
 MOST_LISTED = 50
 """Largest number of defective pixels listed in the report."""
-
-
-def describe_camera_verdict(camera: Camera) -> list[str]:
-    """Return the grade and its reasons, one string each."""
-    grade = camera.verdict.grade
-    if grade == "good":
-        return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
-    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in camera.verdict.findings)]
 
 
 def write_camera_report(
@@ -45,7 +37,7 @@ def write_camera_report(
         [("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])]
     )
     page.heading("Verdict")
-    for sentence in describe_camera_verdict(camera):
+    for sentence in describe_verdict(camera.verdict):
         page.text(sentence)
     page.heading("Figures")
     page.table(("figure", "value"), rows_of(camera), prose=True)
@@ -67,7 +59,7 @@ def write_camera_report(
             [f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:MOST_LISTED]
         ]
         page.table(("y", "x", *names), rows, caption=caption)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")

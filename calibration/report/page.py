@@ -26,6 +26,7 @@ from calibration.report.figures import (
     residual_figure,
     snr_figure,
 )
+from noiseflow.checks import Verdict
 from noiseflow.io import output_folder
 from noiseflow.report import Report, provenance
 
@@ -34,7 +35,7 @@ LARGEST_MISALIGNMENT = 0.1
 
 UNKNOWN_RESPONSE = (
     "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
-    "from 0.85 to 1.15; add dark frames or --exposure-ratio to measure it."
+    "from 0.8 to 1.2; add dark frames or --exposure-ratio to measure it."
 )
 
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
@@ -229,7 +230,7 @@ def write_report(
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
-    page.heading("Provenance")
+    page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
         return page.save(made / "report.html")
@@ -246,20 +247,18 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
     return facts
 
 
-def describe_verdict(findings: Findings) -> list[str]:
+def describe_verdict(verdict: Verdict) -> list[str]:
     """Return the grade and its reasons, one string each."""
-    grade = findings.verdict.grade
-    if grade == "good":
-        return [
-            "Verdict: good. All assumptions passed their tests; gain, offset and read noise are reliable within their intervals."
-        ]
-    head = "bad. Do not use the figures:" if grade == "bad" else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one.text[0].upper()}{one.text[1:]}" for one in findings.verdict.findings)]
+    if verdict.grade == "good":
+        return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
+    bad = verdict.grade == "bad"
+    head = "bad. Do not use the figures:" if bad else "doubtful. Use the figures with these reservations:"
+    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in verdict.reasons)]
 
 
 def judge(findings: Findings) -> list[str]:
     """Describe the reliability of the detector's parameters, the noise model and the registration."""
-    found = describe_verdict(findings)
+    found = describe_verdict(findings.verdict)
     if findings.scores:
         found.append(verdict(findings.scores))
     if findings.burst is None and findings.pairs:
@@ -305,7 +304,7 @@ def _add_detector(page: Report, findings: Findings) -> None:
 
 
 def _add_models(page: Report, findings: Findings) -> None:
-    page.heading("Noise models")
+    page.heading("Noise models", folded=True)
     caption = (
         "NLL: negative log-likelihood of held-out pixels, nats per pixel; lower is better. JSD (nats), "
         "1 − BC (Bhattacharyya coefficient) and BD (Bhattacharyya distance, nats) in units of 10⁻⁴; floor: expected value for "
@@ -330,7 +329,7 @@ def _add_models(page: Report, findings: Findings) -> None:
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
-    page.heading("Registration and residual")
+    page.heading("Registration and residual", folded=True)
     if findings.burst is not None:
         page.text(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs[:most], 1):

@@ -299,6 +299,7 @@ JUDGED = (
 
 MODELS: dict[str, Callable[[], nn.Module]] = {
     "Mixture8": lambda: noiseflow.Mixture(8),
+    "Mixture4": lambda: noiseflow.Mixture(4),
     "SharedMixture8": lambda: noiseflow.Mixture(8, shared_shape=True),
     "RadialFlow": noiseflow.RadialFlow,
     "SplineFlow": noiseflow.SplineFlow,

@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 from noiseflow.checks.engine import Finding, Grade, grade, ranked
 from noiseflow.checks.guard import Guard
 
 
-class Named(Protocol):
-    """A finding behind a reason."""
-
-    @property
-    def reason(self) -> str:
-        """One word or a few, for programs."""
-
-
-Found = TypeVar("Found", bound=Named, covariant=True)
-
-
 @dataclass(frozen=True)
-class Verdict(Generic[Found]):
+class Verdict:
     """The assessment of a result.
 
     Attributes:
@@ -36,7 +25,7 @@ class Verdict(Generic[Found]):
     grade: Grade
     reasons: tuple[str, ...]
     evidence: dict[str, Any] = field(default_factory=dict)
-    findings: tuple[Found, ...] = ()
+    findings: tuple[Finding, ...] = ()
     not_tested: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -63,7 +52,7 @@ class Verdict(Generic[Found]):
         ]
 
 
-def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict[Finding]:
+def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict:
     """The verdict from findings; `good` is the sentence if none fires, and `guard` knows what was not tested."""
     first = ranked(findings)
     reasons = [f"{each.sentence}; {each.advice}" for each in first] or [good]

@@ -23,6 +23,15 @@ if TYPE_CHECKING:
 
 _BASELINE_STEPS = 500
 
+ConditionOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--condition",
+        metavar="NAME=VALUE",
+        help="Condition of a model that depends on one, such as gain=4; repeatable.",
+    ),
+]
+
 
 def sample(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
@@ -38,6 +47,7 @@ def sample(
             "can store the noisy values, else uint16, int16 or int32 if the model rounds to whole numbers, else float32."
         ),
     ] = "auto",
+    condition: ConditionOption = None,
     json: JsonOption = False,
 ) -> None:
     """Add realistic noise to a clean image, stack, or array with any number of axes (4D as .npy)."""
@@ -51,7 +61,7 @@ def sample(
     sample_files.check_dtype(dtype)
     data, voxel_size = sample_files.read_any(clean, output)
     io.require_finite(data, clean)
-    noise_model = as_noise_model(noiseflow.load(model).to(choose_device(device)))
+    noise_model = as_noise_model(_at(noiseflow.load(model), condition).to(choose_device(device)))
     pieces = sample_files.pieces(noise_model, _tensor(data))
     with progress_shown(json_mode=json) as progress:
         noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
@@ -80,26 +90,26 @@ def evaluate(
             help="Fit Gaussian and Poisson models to one half of the pixels, and evaluate all models on the other half.",
         ),
     ] = False,
+    condition: ConditionOption = None,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
     json: JsonOption = False,
 ) -> None:
     """Evaluate a noise model on pairs of clean and noisy images: likelihood and divergences, each with its noise floor."""
-    import numpy as np
     import torch
 
     import noiseflow
     from noiseflow import metrics
     from noiseflow.metrics.spatial import spatial_structure
+    from noiseflow.statistics import own_random
 
     out = Output(json)
     where = choose_device(device)
-    models: dict[str, nn.Module] = {"model": noiseflow.load(model).to(where)}
+    models: dict[str, nn.Module] = {"model": _at(noiseflow.load(model), condition).to(where)}
     pairs = _read_pairs(signal, observation)
     clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
     if baselines:
-        # NumPy's generator, not torch's: the split must not depend on noise that `sample` drew with the same seed
-        half = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < 0.5).to(where)
+        half = torch.from_numpy(own_random(seed).random(clean.numel()) < 0.5).to(where)
         train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
         with progress_shown(json_mode=json) as progress:
             models |= _fitted_baselines(train_signal, train_observation, seed, progress)
@@ -113,6 +123,11 @@ def evaluate(
             structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
             progress("Judging", len(results) + len(structures), count, "neighbours")
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
+    outside = results["model"].num_outside
+    if outside:
+        out.line(
+            f"{outside} of {clean.numel()} pixels lie outside the signals that the model was fitted on; it extrapolates there"
+        )
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
     out.result(
@@ -122,6 +137,23 @@ def evaluate(
             "spatial": [asdict(structure) for structure in structures],
         }
     )
+
+
+def _at(model: nn.Module, condition: list[str] | None) -> nn.Module:
+    """The model at a condition given as NAME=VALUE."""
+    from noiseflow.models.conditioned import Conditioned
+
+    pairs = [each.partition("=") for each in condition or []]
+    try:
+        values = {name: float(value) for name, _, value in pairs}
+    except ValueError as error:
+        given = " ".join(condition or [])
+        raise ValueError(f"--condition {given} is not NAME=VALUE with a number; give for example gain=4") from error
+    if isinstance(model, Conditioned):
+        return model.at(values)
+    if values:
+        raise ValueError(f"this model does not depend on {', '.join(values)}; leave --condition out")
+    return model
 
 
 def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, progress: Progress) -> dict[str, nn.Module]:

@@ -15,6 +15,7 @@ from noiseflow.arguments import as_mask, in_single
 from noiseflow.arrays import as_tensor
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.statistics import own_random
 
 _JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model
 
@@ -59,7 +60,6 @@ class JudgedPixels:
         block = _flat(blocks, observation, "blocks")
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if np.ndim(held_out) == 0:
-            # NumPy's generator, not torch's: the split must not depend on noise sampled with the same seed
             draw = _drawn(group, observation.numel(), seed)
             judge, again = draw < float(held_out), draw < min(float(held_out), _JUDGING_AGAIN)
         else:
@@ -143,7 +143,7 @@ def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None
 
 def _drawn(group: Tensor | None, count: int, seed: int) -> Tensor:
     """A uniform random number for each pixel, the same for all pixels of a group."""
-    random = np.random.default_rng(seed)
+    random = own_random(seed)
     if group is None:
         return torch.from_numpy(random.random(count))
     _, number = torch.unique(group, return_inverse=True)

@@ -23,7 +23,13 @@ _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten
 _STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
 # Nats per pixel; a Poisson-Gaussian model of an EMCCD is 0.05 to 0.15 behind the best.
 _FAR = 0.2
+# Steps of a direct fit, after which those far behind the best stop; later steps gained up to 0.02 nats per pixel.
+_BRIEF = 80
+# Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
+_LOST = 0.1
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
+# Steps of a last direct fit, which starts from the weights of the comparison and has an eighth more pixels.
+_FEW_MORE = 50
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
@@ -53,29 +59,48 @@ class Contest:
 
     def screen(self) -> None:
         """Fit every model briefly to some pixels; screen out models far behind the best that do not catch up."""
-        for name, model in self.models.items():
-            if not model.costly:
-                self._enter(name)
+        plain = [name for name, model in self.models.items() if not model.costly]
+        for name in plain:
+            self._enter(name)
+        for name in plain:
+            self._complete(name)
         for name, model in self.models.items():
             if model.costly and not (self._skips and self._is_needless(name)):
                 self._enter(name)
+                self._complete(name)
         for name in self.scores:
             model = self.models[name]
             if self._is_hopeless(name) and not _is_quick(model):
                 self._go_on(name, self.pixels.training(model, most=_SCREENING_PIXELS), self._short(name))
-        self.screened_out = {name for name in self.scores if self._is_hopeless(name)}
+        self.screened_out |= {name for name in self.scores if self._is_hopeless(name)}
 
     def _enter(self, name: str) -> None:
-        """Fit a model fully if that is quick, otherwise briefly, and score it."""
+        """Fit a model briefly, or only start its search for a detector, and score it."""
         started, model = time.perf_counter(), self.models[name]
-        if _is_quick(model):
-            self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
-        else:
+        if not _is_quick(model):
             pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
             self._fit(name, pixels, 0, standardise=True)
             self.starts[name] = copy.deepcopy(model.state_dict())
             self._fit(name, pixels, self._short(name))
+        elif model.settles:
+            model.standardise(**self.pixels.training(model), settle=False)  # type: ignore[call-arg]
+        else:
+            self._fit(name, self.pixels.training(model), min(_BRIEF, self.steps[name]), standardise=True)
         self._score(name, started)
+
+    def _complete(self, name: str) -> None:
+        """Fit a quick model fully and score it, unless it is so far behind that it cannot catch up."""
+        started, model = time.perf_counter(), self.models[name]
+        if not _is_quick(model):
+            return
+        if self._gap(name) > _LOST or (not model.settles and self._is_hopeless(name)):
+            self.screened_out.add(name)
+        elif model.settles:
+            self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
+            self._score(name, started)
+        elif self.steps[name] > _BRIEF:
+            self._fit(name, self.pixels.training(model), self.steps[name] - _BRIEF)
+            self._score(name, started)
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""
@@ -148,7 +173,7 @@ class Contest:
             The gain of the second half of the fit, nats per pixel.
         """
         if _is_quick(self.models[name]):
-            return self._fit(name, pixels, self.steps[name], standardise=True)
+            return self._fit(name, pixels, min(_FEW_MORE, self.steps[name]), standardise=True)
         # does not continue the short fit: first steps of a new optimiser would move away from the learnt weights
         if name not in self._went_on:
             self.models[name].load_state_dict(self.starts[name])

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.fitting.cells import Cells, gather
+from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs
@@ -18,8 +18,9 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
 from noiseflow.progress import Progress
 
-# Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops.
-_ROUND, _PATIENCE = 10, 4
+# Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops. After four,
+# a spline flow stopped by chance at 0.0039 nats per pixel above the truth, and went on to 0.0017.
+_ROUND, _PATIENCE = 10, 8
 _STANDARDISED, _FINAL, _PART = 1_000_000, 100_000, 32_768
 
 
@@ -97,16 +98,23 @@ def _cells(
     noise_model: NoiseModelBase, signal: Tensor, pixels: FitPixels, part: Tensor, weight: Tensor | None
 ) -> Cells:
     observation, signal = pixels.observation[part], signal[part]
-    with torch.no_grad():
-        fixed = [
-            noise_model.fixed_part(s, o)
-            for s, o in zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
-        ]
-    values = observation if fixed[0] is None else torch.cat([each for each in fixed if each is not None])
+    weight = None if weight is None else weight[part]
+    counted = count(signal, observation, weight) if noise_model.describes_single_readings else None
+    if counted is not None:
+        fixed = _fixed_part(noise_model, counted.signal, counted.values)
+        return counted if fixed is None else counted._replace(values=fixed)
+    fixed = _fixed_part(noise_model, signal, observation)
     scale = Standardisation().to(signal.device)
     scale.set_from(signal, observation)
     limits = {"low": noise_model.low, "high": noise_model.high}
-    return gather(scale, signal, values, None if weight is None else weight[part], **limits)
+    return gather(scale, signal, observation if fixed is None else fixed, weight, **limits)
+
+
+@torch.no_grad()
+def _fixed_part(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor | None:
+    parts = zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
+    found = [noise_model.fixed_part(s, o) for s, o in parts]
+    return None if found[0] is None else torch.cat([each for each in found if each is not None])
 
 
 def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,14 +16,18 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.beginning import SHARE, begin
+from noiseflow.fitting.conditions import fit_by_condition
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
+from noiseflow.fitting.stages import fit_in_stages
+from noiseflow.fitting.steps import MakeOptimiser, adam
+from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
+from noiseflow.models.conditioned import Conditioned, flat_conditions
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
@@ -36,14 +40,16 @@ _log = logging.getLogger("noiseflow")
 _PART = 2**20  # pixels predicted at once
 
 
+@choosing_weight
 @torch.enable_grad()
 def fit(
     noise_model: nn.Module,
     signal: Tensor | NDArray[Any] | nn.Module,
     observation: Tensor | NDArray[Any],
     *,
+    condition: Mapping[str, Any] | None = None,
     mask: Tensor | NDArray[np.bool_] | None = None,
-    weights: Tensor | NDArray[Any] | None = None,
+    weights: Tensor | NDArray[Any] | str | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
@@ -62,6 +68,7 @@ def fit(
     checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
     parameter_groups: Sequence[dict[str, Any]] | None = None,
+    optimiser: MakeOptimiser = adam,
     tables: TableKeeper | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
@@ -69,9 +76,9 @@ def fit(
     The loss is the mean negative log-likelihood of the training pixels, plus the ``penalty()`` of the signal model if it has one.
     Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
 
-    A joint fit begins with a quarter of its steps by least squares, then fits the noise model to the residuals, and then both:
-    from a rough signal, a noise model would take the errors of the signal for outliers. It does not if `warm_up` or
-    ``standardise=False`` says that the signal is a good one.
+    A joint fit takes half of its steps by least squares, and then three times fits the noise model to the residuals and the
+    signal under that noise: from a rough signal, a noise model would take the errors of the signal for outliers. Both are fitted
+    together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -80,9 +87,13 @@ def fit(
             define ``parameter_groups()``, parameter groups with learning rates for Adam.
         observation: noisy images, a tensor or array of any shape and real type, detector units; images (..., y, x) if the
             noise model depends on neighbouring pixels.
+        condition: what the noise depends on beyond the signal, such as ``{"gain": …}``: numbers, or arrays that broadcast with
+            the observation, by name. The result holds a `Conditioned` model. Only for known signals and models of single pixels.
         mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
         weights: how much each pixel counts, shaped like `observation`, at least 0; all count alike by default. Pixels of weight 0
-            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`).
+            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`). Or
+            ``"held-out"``: choose the weight of the signal model's ``penalty()`` by the likelihood of the held-out pixels, with
+            about six fits; ``result.weight_choice`` holds it.
         skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
             in `Digitised`. The result holds the wrapped model; a log message reports it.
@@ -105,6 +116,8 @@ def fit(
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
         parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
+        optimiser: makes the optimiser of the signal model, `adam` or `noiseflow.fitting.steps.quasi_newton`; the latter needs
+            fewer steps, but only for signal models with ``signal()`` under a noise model that is not trained.
         tables: stores the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
@@ -141,13 +154,24 @@ def fit(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
-    if isinstance(signal_model, KnownSignal):
-        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
+    if isinstance(signal, Tensor):
+        known, seen = signal.detach().reshape(-1)[use], observation.detach().reshape(-1)[use]
         check_precision(known, seen)
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
+    model = model.model if isinstance(model, Conditioned) else model
+    options: dict[str, Any]
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
+    if condition is not None:
+        if model.needs_image or not isinstance(signal, Tensor) or np.ndim(held_out):
+            raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
+        given = {name: each[use] for name, each in flat_conditions(condition, observation).items()}
+        options = {"digitise": False, "held_out": held_out, "num_steps": num_steps, "batch_size": batch_size}
+        options |= {"learning_rate": learning_rate, "generator": generator, "progress": progress}
+        counted = None if counted is None else counted[use]
+        whole = FitResult(model, digitisation)
+        return fit_by_condition(fit, model, known, seen, given, counted, whole, options)
     if model.needs_image and observation.ndim < 2:
         raise ValueError(
             f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
@@ -160,6 +184,11 @@ def fit(
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
+    if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
+        raise ValueError(
+            "a quasi-Newton method needs the gradient of all pixels of one objective: a signal model with signal(), and "
+            "train_noise=False; leave out optimiser to fit by Adam"
+        )
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     direct = train_noise and resume is None and pixels.train.ndim == 1
     if (
@@ -169,14 +198,13 @@ def fit(
         and model.fits_directly
         and not model.needs_image
     ):
+        options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
         with few_threads(_CELLS):
-            options: dict[str, Any] = {
-                "num_steps": num_steps,
-                "weight": counted,
-                "standardise": standardise,
-                "progress": progress,
-            }
-            return fit_directly(model, signal_model.flat, pixels, result, **options)
+            fit_directly(model, signal_model.flat, pixels, result, **options)
+            if model.match_levels(signal_model.flat[use], pixels.observation[use]):
+                options |= {"standardise": False, "num_steps": result.num_steps + num_steps}
+                fit_directly(model, signal_model.flat, pixels, result, **options)
+            return result
     if weights is not None:
         raise ValueError(
             f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
@@ -184,34 +212,50 @@ def fit(
         )
     settings = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
     learns_signal = any(parameter.requires_grad for parameter in signal_model.parameters())
-    begun = 0
     if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
-        begun = round(SHARE * num_steps)
-        if resume is None and begun:
-            options = {"learning_rate": learning_rate, "parameter_groups": parameter_groups}
-            begin(model, signal_model, pixels, replace(settings, num_steps=begun), **options)
+        shared: dict[str, Any] = {
+            "mask": use.view(observation.shape),
+            "held_out": _judged(pixels),
+            "digitise": False,
+            "tabulate": tabulate,
+        }
+        shared |= {"batch_size": batch_size, "checkpoint_interval": checkpoint_interval}
+        shared |= {
+            "parameter_groups": parameter_groups,
+            "optimiser": optimiser,
+            "checkpoint": checkpoint,
+            "resume": resume,
+        }
+        options = {"num_steps": num_steps, "generator": pixels.generator, "progress": progress}
+        found = fit_in_stages(fit, model, signal_model, observation, **options, **shared)
+        return replace(found, noise_model=result.noise_model, digitisation=digitisation)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     loop.prepare(
         learning_rate,
-        standardise=standardise and resume is None and not begun,
+        standardise=standardise and resume is None,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
+        optimiser=optimiser,
     )
     if resume is not None:
         loop.load_state(resume)
-    settings = replace(settings, num_steps=num_steps - begun)
     if learns_signal:
         warn_if_spinning()
-        loop.run(settings, progress, checkpoint)
-        result.num_steps += begun
-        return result
+        return loop.run(settings, progress, checkpoint)
     with few_threads(batch_size):
         return loop.run(settings, progress, checkpoint)
 
 
+def _judged(pixels: FitPixels) -> Tensor:
+    """The held-out pixels as a mask shaped like the observation."""
+    judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
+    judged.view(-1)[pixels.judge] = True
+    return judged
+
+
 def _starts_cold(noise_model: NoiseModelBase, signal_model: nn.Module) -> bool:
-    """Whether a joint fit begins with least squares: not for Gaussian noise, which is least squares, and not for repeated
-    exposures, which start from their mean."""
+    """Whether a joint fit runs in stages from least squares on: not for Gaussian noise, which is least squares, and not for
+    repeated exposures, which start from their mean."""
     return noise_model.learns and not isinstance(noise_model, Gaussian) and not isinstance(signal_model, StaticScene)
 
 

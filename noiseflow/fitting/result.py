@@ -11,6 +11,20 @@ from noiseflow.described import described
 from noiseflow.models.digitisation import Digitisation
 
 
+@described()
+@dataclass(frozen=True)
+class WeightChoice:
+    """A weight and the evidence for it.
+
+    Attributes:
+        weight: the chosen weight.
+        tried: weight → held-out negative log-likelihood, nats per pixel, in the order tried.
+    """
+
+    weight: float
+    tried: dict[float, float]
+
+
 @described(held_out_nll="nats per pixel", seconds="s", table_error="nats per pixel")
 @dataclass
 class FitResult:
@@ -25,6 +39,7 @@ class FitResult:
         recoveries: number of non-finite steps that were undone and repeated with half the learning rate.
         history: step → held-out NLL, in order of measurement.
         table_error: interpolation error of the tabulated likelihood, nats per pixel; None if no table was used.
+        weight_choice: the chosen weight of the penalty and those it was compared with, if ``weights="held-out"``.
 
     Example:
         >>> import noiseflow, torch
@@ -43,3 +58,10 @@ class FitResult:
     recoveries: int = 0
     history: dict[int, float] = field(default_factory=dict)
     table_error: float | None = None
+    weight_choice: WeightChoice | None = None
+
+    @property
+    def last_nll(self) -> float:
+        """Held-out NLL after the last step, nats per pixel; infinite if it is NaN or there was no step."""
+        nll = next(reversed(self.history.values()), math.inf)
+        return nll if math.isfinite(nll) else math.inf

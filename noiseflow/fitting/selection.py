@@ -97,9 +97,9 @@ def default_candidates() -> dict[str, nn.Module]:
         "ExcessNoise": excess_noise.ExcessNoise(),
         "SharedMixture8": mixture.Mixture(8, shared_shape=True),
         "RadialFlow": flow.RadialFlow(),
+        "Mixture4": mixture.Mixture(4),
         "PhysicsFlow": physics_flow.PhysicsFlow(),
         "Mixture8": mixture.Mixture(8),
-        "SplineFlow": flow.SplineFlow(),
     }
 
 
@@ -123,7 +123,7 @@ def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, neglig
         if item.excess <= max(min(item.excess_error, most), negligible):
             return item
     raise ValueError(
-        "some validation pixels are impossible under every candidate; add a more flexible candidate such as SplineFlow()"
+        "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"
     )
 
 
@@ -143,8 +143,9 @@ def select(
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit, and those that start
-    at their maximum likelihood, are fitted once; of the default candidates, `costly` ones only if no simpler model suffices.
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit are first
+    fitted for 80 steps, and those that search for a detector only started; those far behind then stop. Of the default candidates,
+    `costly` ones are tried only if no simpler model suffices.
     Others are first fitted briefly to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats
     and three standard errors); the
     rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from pathlib import Path
@@ -14,16 +15,19 @@ from noiseflow.io.tilt_table import LARGEST_ANGLE, TiltTable
 
 _COMMENT = re.compile(r"[#!%].*|//.*")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-_UNIT = re.compile(r"°|(?<![a-z])deg(rees?)?(?![a-z])", re.IGNORECASE)
+_UNIT = re.compile(r"°|(?<![a-z_])deg(rees?)?(?!\w)", re.IGNORECASE)
+_MARKS = re.compile(r"[\"'\[\](){}\x00-\x08\x1a]")
+"""Quotes, brackets and the end mark of old text files."""
 _TITLE = re.compile(r"tilt|angle|theta|alpha|degree", re.IGNORECASE)
 
 
 def read(path: Path) -> TiltTable:
     """Angles of a text file.
 
-    Comments after ``#``, ``!``, ``%`` or ``//`` are skipped. Numbers are separated by spaces, tabs, semicolons or commas; a
-    comma between two groups of digits is a decimal comma. Of several columns, the one under a title such as ``tilt`` is used, or
-    the first one with negative numbers, or the first one that does not count the rows; a warning names it.
+    Comments after ``#``, ``!``, ``%`` or ``//`` are skipped, and so are quotes, brackets, and titles, which are lines without
+    digits at the start. Numbers are separated by spaces, tabs, semicolons or commas; a comma between two groups of digits is a
+    decimal comma. A column of other words names the images. Of several columns of numbers, the one under a title such as ``tilt``
+    is used, or the first one with negative numbers, or the first one that does not count the rows; a warning names it.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -31,26 +35,32 @@ def read(path: Path) -> TiltTable:
     """
     lines = [_COMMENT.sub("", line) for line in text_lines(path, "angle file", holds="one angle in degrees per line")]
     rows = [(count, words) for count, line in enumerate(lines, 1) if (words := _words(line))]
-    title = rows.pop(0)[1] if len(rows) > 1 and _is_title(rows[0][1]) else []
-    values = [[_angle(word, path, count) for word in words] for count, words in rows]
+    title: list[str] = []
+    while len(rows) > 1 and not any(re.search(r"\d", word) for word in rows[0][1]):
+        title = rows.pop(0)[1]
     if len(rows) < 2:  # all angles in one line
         return TiltTable(_within([(count, word) for count, words in rows for word in words], path))
-    lengths = {len(row) for row in values}
-    if len(lengths) > 1:
-        first, odd = len(values[0]), next(k for k, row in enumerate(values) if len(row) != len(values[0]))
-        raise ValueError(
-            f"{path} line {rows[odd][0]} has {len(values[odd])} numbers and line {rows[0][0]} has {first}; one angle in degrees "
-            "per line is required"
-        )
-    table = np.array(values, dtype=np.float64)
+    first = len(rows[0][1])
+    for count, words in rows:
+        if len(words) != first:
+            raise ValueError(
+                f"{path} line {count} has {len(words)} numbers and line {rows[0][0]} has {first}; one angle in degrees per line "
+                "is required"
+            )
+    named = next((k for k in range(first) if first > 1 and not any(_is_number(words[k]) for _, words in rows)), None)
+    names = () if named is None else tuple(words[named] for _, words in rows)
+    if named is not None:
+        rows = [(count, words[:named] + words[named + 1 :]) for count, words in rows]
+        title = title[:named] + title[named + 1 :] if len(title) == first else []
+    table = np.array([[_angle(word, path, count) for word in words] for count, words in rows], dtype=np.float64)
     if table.shape[1] == 1 and _counts(np.trunc(table[:, 0])) and any("," in line for line in lines):
         raise ValueError(f"{path}: 'a,b' may be a decimal comma or two columns; write decimal points")
     column = _column(table, title, path) if table.shape[1] > 1 else 0
-    return TiltTable(_within([(count, words[column]) for count, words in rows], path))
+    return TiltTable(_within([(count, words[column]) for count, words in rows], path), names)
 
 
 def _words(line: str) -> list[str]:
-    line = _UNIT.sub(" ", line.replace("−", "-")).strip()
+    line = _UNIT.sub(" ", _MARKS.sub(" ", line.replace("−", "-"))).strip()
     line = line.replace(",", " ") if re.search(r",\s", line) else line
     words: list[str] = []
     for word in filter(None, re.split(r"[\s;]+", line)):
@@ -58,8 +68,11 @@ def _words(line: str) -> list[str]:
     return words
 
 
-def _is_title(words: list[str]) -> bool:
-    return not any(re.search(r"\d", word) for word in words) and any(_TITLE.search(word) for word in words)
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(number(word))
+    except ValueError:
+        return False
 
 
 def _angle(word: str, path: Path, count: int) -> float:

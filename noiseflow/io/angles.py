@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,30 +105,45 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
         table = TiltTable(image.tilt_angles)
     else:
         table = read_tilts(file)
-        table = table.rows(_joined(table, image, file, Path(stack)))
+        rows = _joined(table, image, file, Path(stack))
+        absent = [place for place, row in enumerate(rows) if row < 0]
+        table = table.rows([max(row, 0) for row in rows])
+        if absent:
+            named = f"{len(rows) - len(absent)} of {len(rows)} images of {stack}"
+            warnings.warn(f"{file} names {named}; the others are left out", stacklevel=2)
+            table = replace(table, excluded=(*table.excluded, *absent))
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
 
 def _joined(table: TiltTable, image: ImageFile, file: Path, stack: Path) -> list[int]:
-    """The row of the table for every image."""
+    """The row of the table for every image; −1 for sections that it leaves out."""
     count = len(image.data) if image.data.ndim == 3 else 1
     if image.names and table.names and (found := _by_name(table.names, image.names, file, stack)) is not None:
         return found
     if image.names and image.tilt_angles is not None and len(table.angles) >= count:
-        found = _by_angle(table.angles, image.tilt_angles)
+        found = by_angle(table.angles, image.tilt_angles)
         if found is not None:
             if found != list(range(count)):
                 warnings.warn(f"{file} is joined to {stack} by the angles in the names of the images", stacklevel=3)
             return found
-    if table.sections is not None and sorted(table.sections) == list(range(count)):
-        return [int(row) for row in np.argsort(table.sections)]
+    places = {} if table.sections is None else {int(section): row for row, section in enumerate(table.sections)}
+    if places and len(places) == len(table.angles) and 0 <= min(places) <= max(places) < count:
+        return [places.get(section, -1) for section in range(count)]
     if len(table.angles) != count:
         raise ValueError(
-            f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; give the angle file of "
-            "these images"
+            f"{stack} has {count} images, but there are {len(table.angles)} tilt angles in {file}; "
+            f"{advice_on_count(image.data.shape, len(table.angles))}"
         )
     _compare(table.angles, image.tilt_angles, file, stack)
     return list(range(count))
+
+
+def advice_on_count(shape: Sequence[int], num_angles: int) -> str:
+    """What to do about a stack (tilt, y, x) whose number of images is not that of the angles."""
+    if list(shape[1:]).count(num_angles) == 1:
+        axis = "yx"[list(shape[1:]).index(num_angles)]
+        return f"its axis {axis} has {num_angles} entries: save the stack with the tilts first"
+    return "give the angle file of these images"
 
 
 def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path) -> list[int] | None:
@@ -160,7 +176,7 @@ def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path)
     return known
 
 
-def _by_angle(rows: NDArray[np.float64], named: NDArray[np.float64]) -> list[int] | None:
+def by_angle(rows: NDArray[np.float64], named: NDArray[np.float64]) -> list[int] | None:
     """Rows by the angles in names of images; None if any is further from its row than half a step or the stage's error."""
     steps = np.diff(np.unique(named))
     nearest = [int(np.abs(rows - angle).argmin()) for angle in named]

@@ -45,7 +45,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         file.visititems(
             lambda name, item: found.__setitem__(f"/{name}", item) if isinstance(item, h5py.Dataset) else None
         )
-        names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufc"]
+        names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufcb"]
         names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
         name = names[choose_member(names, [found[name].shape for name in names], member)]
         dataset = found[name]

@@ -178,6 +178,7 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
     import gzip
     import shutil
     import tempfile
+    import zlib
 
     opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
     with tempfile.TemporaryDirectory() as folder:
@@ -186,7 +187,9 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
             with opener(path, "rb") as packed, plain.open("wb") as target:
                 shutil.copyfileobj(packed, target)
             image = read(plain, channel=channel)
-        except (EOFError, gzip.BadGzipFile) as error:
+        except (EOFError, OSError, zlib.error) as error:
+            if getattr(error, "errno", None) is not None:  # of the disk
+                raise
             raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
         except SeveralImages as error:
             raise SeveralImages(str(error).replace(str(plain), str(path)), error.names) from error
@@ -211,6 +214,8 @@ def _checked(image: ImageFile, path: Path) -> ImageFile:
     data = image.data
     if data.size == 0:
         raise ValueError(f"{path} holds no pixels (shape {data.shape})")
+    if data.dtype == np.bool_:  # masks
+        return _checked(replace(image, data=data.view(np.uint8)), path)
     if data.dtype.kind not in "iuf":
         raise ValueError(f"{path} holds {data.dtype} values; integers or real floating-point numbers are required")
     if data.ndim == 3 and data.shape[-1] in (3, 4) and data.dtype == np.uint8 and data.shape[0] > 4:

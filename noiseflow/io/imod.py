@@ -16,6 +16,9 @@ from noiseflow.io import angle_text
 from noiseflow.io.checks import number, text_lines
 from noiseflow.io.tilt_table import TiltTable
 
+_COMMANDS = ("tilt.com", "tilta.com", "tiltb.com")
+"""Command files of a series, and of the two of a dual-axis tomogram."""
+_LISTS = ("EXCLUDE", "INCLUDE")
 _FLAT = 0.05
 """Degrees: a rotation about x that moves the edge of a 4096-pixel image by less than two pixels."""
 
@@ -36,10 +39,9 @@ def read(path: Path) -> TiltTable:
 def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
     """A table with what the ``tilt.com`` of a stack adds, if it lies next to it, and a warning that says so.
 
-    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) are not modelled and are named in a warning.
+    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) become the table's `x_tilt`, which levels the volume.
     """
-    path = stack.with_name("tilt.com")
-    if path.is_file() and stack.is_file():
+    for path in (each for name in _COMMANDS if stack.is_file() and (each := stack.with_name(name)).is_file()):
         entries = _entries(path)
         # older files name the stack in a line of its own, without a keyword
         older = next((name for name in entries if name.endswith((".ALI", "_ALI.MRC"))), "")
@@ -48,35 +50,43 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
             return _applied(table, entries, path)
     turned = stack.with_name(f"{stem}.xtilt")
     if turned.is_file() and not stack.is_dir():
-        _warn_of_x(angle_text.read(turned).angles, turned)
+        return replace(table, x_tilt=x_tilt_of(angle_text.read(turned).angles, turned))
     return table
 
 
 def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable:
     count, offset = len(table.angles), _value(entries, "OFFSET", path)
-    lists = ",".join(filter(None, (entries.get("EXCLUDELIST"), entries.get("EXCLUDELIST2"))))
-    excluded = parse_views(lists, count, path)
+    excluded, included = (parse_views(_listed(entries, name), count, path) for name in _LISTS)
+    if included:
+        excluded = sorted({*excluded, *range(count)} - {*included} | {*excluded})
     if excluded or offset:
         views = ", ".join(str(view + 1) for view in excluded[:12]) + (", …" if len(excluded) > 12 else "")
         parts = [f"adds {offset:g}° to the tilt angles"] * bool(offset) + [f"excludes the views {views}"] * bool(
             excluded
         )
         warnings.warn(f"{path} {' and '.join(parts)}", stacklevel=5)
-    turned = [_value(entries, "XAXISTILT", path)]
+    turned = np.full(1, _value(entries, "XAXISTILT", path))
     if "XTILTFILE" in entries and (file := path.with_name(Path(entries["XTILTFILE"]).name)).is_file():
-        turned = list(angle_text.read(file).angles)
-    _warn_of_x(np.array(turned), path)
-    return replace(table, angles=table.angles + offset, excluded=tuple(sorted({*table.excluded, *excluded})))
+        turned = turned + angle_text.read(file).angles
+    rows = tuple(sorted({*table.excluded, *excluded}))
+    return replace(table, angles=table.angles + offset, excluded=rows, x_tilt=x_tilt_of(turned, path))
 
 
-def _warn_of_x(angles: NDArray[np.float64], path: Path) -> None:
-    if np.abs(angles).max(initial=0.0) > _FLAT:
-        varies = "" if np.ptp(angles) <= _FLAT else ", different for each view: the images do not share one axis"
-        warnings.warn(
-            f"{path} turns the specimen by up to {np.abs(angles).max():g}° about x{varies}; this is not applied, and the volume "
-            "is turned by as much: level it afterwards, for example with rotatevol",
-            stacklevel=5,
-        )
+def x_tilt_of(angles: NDArray[np.float64], path: Path) -> float:
+    """The mean rotation of the specimen about x, degrees; a warning names it, and rotations that differ between views."""
+    found = float(angles.mean()) if angles.size else 0.0
+    varies = angles.size > 0 and float(np.ptp(angles)) > _FLAT
+    if abs(found) <= _FLAT and not varies:
+        return 0.0
+    differ = (
+        f"; its views differ by {np.ptp(angles):.2g}°, which is not modelled: they do not share one axis"
+        if varies
+        else ""
+    )
+    warnings.warn(
+        f"{path} turns the specimen by {found:.3g}° about x; the volume is levelled by as much{differ}", stacklevel=6
+    )
+    return found
 
 
 def _value(entries: dict[str, str], name: str, path: Path) -> float:
@@ -93,9 +103,14 @@ def _entries(path: Path) -> dict[str, str]:
         words = line.split("#")[0].split(None, 1)
         if words and not words[0].startswith("$"):
             name, value = words[0].upper(), words[1].strip() if len(words) > 1 else ""
-            joined = name.startswith("EXCLUDE") and name in found
+            joined = name.startswith(_LISTS) and name in found
             found[name] = f"{found[name]},{value}" if joined else value
     return found
+
+
+def _listed(entries: dict[str, str], name: str) -> str:
+    """The views of all keywords that begin with a name, such as EXCLUDELIST and EXCLUDELIST2."""
+    return ",".join(value for keyword, value in entries.items() if keyword.startswith(name))
 
 
 def parse_views(text: str, count: int, source: object = "views") -> list[int]:

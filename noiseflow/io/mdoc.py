@@ -80,6 +80,6 @@ def _seconds(text: str) -> float:
 
 def _number(text: str, path: Path) -> float:
     try:
-        return number(text.split()[0].replace(",", "."))
+        return number(text.split()[0].rstrip("°").replace(",", "."))
     except (ValueError, IndexError):
         raise ValueError(f"{path}: '{text[:40]}' is not an angle in degrees, or not a number") from None

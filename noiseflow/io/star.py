@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
+from noiseflow.io.imod import x_tilt_of
 from noiseflow.io.tilt_table import TiltTable, rotations
 
 _ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
 _NAMES = ("rlnMicrographMovieName", "rlnMicrographName", "wrpMovieName")
 _AXES = ("rlnTomoNominalTiltAxisAngle", "wrpAxisAngle")
 _SIZES = ("rlnTomoTiltSeriesPixelSize", "rlnMicrographPixelSize", "rlnMicrographOriginalPixelSize")
+_DOSES = ("rlnMicrographPreExposure", "wrpDose")
 _ALIGNED = ("rlnTomoZRot", "rlnTomoXShiftAngst", "rlnTomoYShiftAngst")
 
+_MISSING = {"nan", "<na>", "none", "null"}
 _SECTION = re.compile(r"([0-9]{1,9})@")
 Columns = dict[str, list[str]]
 
@@ -42,6 +45,7 @@ def read(path: Path) -> TiltTable:
     sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
     axes = _numbers(table, _AXES, path)
     size = None if sizes is None else float(sizes[0])
+    turned = _numbers(table, ("rlnTomoXTilt",), path)
     names = next((table[name] for name in _NAMES if name in table), [])
     sections = [int(stated[1]) for name in names if (stated := _SECTION.match(name))]
     return TiltTable(
@@ -51,6 +55,8 @@ def read(path: Path) -> TiltTable:
         transforms=None if size is None else _transforms(table, size, path),
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),
+        x_tilt=0.0 if turned is None else x_tilt_of(turned, path),
+        acquired=_numbers(table, _DOSES, path),
     )
 
 
@@ -71,9 +77,11 @@ def _transforms(table: Columns, size: float, path: Path) -> NDArray[np.float64] 
 
 
 def _numbers(table: Columns, names: Sequence[str], path: Path) -> NDArray[np.float64] | None:
-    name = next((name for name in names if name in table), None)
-    if name is None:
+    """The first of some columns, if possible one without missing values."""
+    known = [name for name in names if name in table]
+    if not known:
         return None
+    name = next((name for name in known if not _MISSING & {text.lower() for text in table[name]}), known[0])
     try:
         return np.array([number(text) for text in table[name]], dtype=np.float64)
     except ValueError as error:

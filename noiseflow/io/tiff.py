@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, choose, exactly_as, require_room
+from noiseflow.io.checks import Unsupported, choose_member, exactly_as, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom
@@ -33,15 +33,15 @@ def read(path: Path, *, mapped: bool = False, member: str | None = None) -> Imag
     Args:
         path: the file.
         mapped: memory-map the pixels, or a temporary copy if the file is compressed.
-        member: name or index of the series, if several have the largest size.
+        member: name of a series, or its index if several have the largest size.
     """
     import tifffile
 
     with tifffile.TiffFile(path) as tiff:
         pages = _pages(tiff)
-        compressed = any(getattr(page, "compression", 1) != 1 for page in pages)
+        compressed = any(getattr(page, "compression", 1) != 1 or page.dtype == bool for page in pages)
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
-        series, several = _series(tiff, member)
+        series, named = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
         if series.axes == "SYX":
             warnings.warn(
@@ -56,7 +56,7 @@ def read(path: Path, *, mapped: bool = False, member: str | None = None) -> Imag
             data = _inverted(data, series.pages[0], path)
         voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
         data, channels = _channels_first(data, series.axes, _channel_names(tiff))
-    return ImageFile(data, voxel_size, channels=channels, named=several)
+    return ImageFile(data, voxel_size, channels=channels, named=named)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -93,13 +93,13 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
 
 def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
-    """The chosen series, and whether there were others of its size to choose from."""
-    most = max(one.size for one in tiff.series)
-    largest = [one for one in tiff.series if one.size == most]
-    names = [one.name or str(index) for index, one in enumerate(largest)]
-    names = names if len(set(names)) == len(names) else [str(index) for index in range(len(names))]
-    several = len(largest) > 1
-    return largest[choose(names, member, "positions") if several else 0], several
+    """The chosen series, and whether it was named."""
+    if len(tiff.series) == 1:
+        return tiff.series[0], False
+    names = numbered(len(tiff.series), [one.name for one in tiff.series])
+    chosen = choose_member(names, [one.shape[-4:] for one in tiff.series], member)
+    alone = sum(one.size == tiff.series[chosen].size for one in tiff.series) == 1
+    return tiff.series[chosen], member in names or not alone
 
 
 def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
@@ -119,6 +119,9 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
     Raises:
         Unsupported: white has no value, because the pixels are not unsigned integers.
     """
+    if data.dtype == bool:
+        # tifffile says so of all images of one bit, and stores them as they are
+        return data if page.software.startswith("tifffile") else ~data
     if data.dtype.kind != "u":
         raise Unsupported(
             f"counts {data.dtype} pixels from white (MINISWHITE), which is defined for unsigned integers only"

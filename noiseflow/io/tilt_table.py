@@ -25,6 +25,7 @@ class TiltTable:
         pixel_size: Å, or None if unknown.
         tilt_axis: degrees from y towards −x, or None if unknown.
         excluded: rows to leave out, from 0.
+        x_tilt: degrees by which the specimen is turned about x, as IMOD's ``XAXISTILT``: z of a flat specimen rises with y.
         acquired: (row,) dose before each image, or its time, in any unit; None if unknown.
     """
 
@@ -36,6 +37,7 @@ class TiltTable:
     pixel_size: float | None = None
     tilt_axis: float | None = None
     excluded: tuple[int, ...] = ()
+    x_tilt: float = 0.0
     acquired: NDArray[np.float64] | None = None
 
     def rows(self, chosen: Sequence[int]) -> TiltTable:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from noiseflow.arguments import check_precision, real
 from noiseflow.arrays import floating, is_lazy, unmasked
+from noiseflow.statistics import own_random
 
 MOST_LAZY = 10**7
 """Number of pixels used from Dask arrays: about 50 bytes each, half a GB. The standard error of the mean log-likelihood is then
@@ -35,7 +36,7 @@ def judged_pixels(
             the noise.
     """
     if is_lazy(signal) or is_lazy(observation):
-        return _of_blocks(signal, observation, skip_non_finite, np.random.default_rng(seed), most)
+        return _of_blocks(signal, observation, skip_non_finite, own_random(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
     signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)

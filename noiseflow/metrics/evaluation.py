@@ -23,7 +23,8 @@ from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.metrics.evaluated_pixels import judged_pixels
-from noiseflow.metrics.tails import Tails, tails
+from noiseflow.metrics.tails import Tails, tails_of_bins
+from noiseflow.statistics import own_random
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -123,7 +124,7 @@ def evaluate(
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
-    random = np.random.default_rng(seed)
+    random = own_random(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
     order = torch.argsort(signal)
@@ -143,7 +144,7 @@ def evaluate(
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
         num_outside=_num_outside(noise_model, signal),
-        tails=tuple(tails(noise_model, signal[g], observation[g]) for g in groups),
+        tails=tails_of_bins(noise_model, signal, observation, groups),
     )
 
 

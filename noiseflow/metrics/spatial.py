@@ -77,11 +77,56 @@ def spatial_structure(
         "ScanNoise(model) adds an offset to each row": shared[0] * math.sqrt(z.size * width) / 2,
         'ScanNoise(model, along="column") adds an offset to each column': shared[1] * math.sqrt(z.size * height) / 2,
         "WithMaps(model, gain, offset) gives every pixel its own gain and offset": pattern / error,
-        "no model of the library describes correlated neighbours; bin the image, or fit every second pixel": neighbours
-        / error,
+        "Correlated(model, correlation_kernel(model, signal, observation)) correlates neighbours": neighbours / error,
     }
     remedies = sorted((name for name in excess if excess[name] > 4), key=lambda name: -excess[name])
     return SpatialStructure(rows, columns, horizontal, vertical, pattern, error, not remedies, tuple(remedies))
+
+
+@torch.no_grad()
+def correlation_kernel(
+    noise_model: nn.Module, signal: Tensor | NDArray[Any], observation: Tensor | NDArray[Any], *, reach: int = 2
+) -> Tensor:
+    """The kernel for `noiseflow.Correlated` with the correlations that residuals of images (y, x), or stacks, have.
+
+    Residuals are converted to standard normal ones by the noise model. Their power spectrum is the Fourier transform of their
+    autocorrelation up to `reach`; the kernel is symmetric and has the square root of that spectrum. Correlations within three
+    standard errors of 0 are 0.
+
+    Args:
+        noise_model: the noise model of single pixels.
+        signal, observation: images of equal shape; NaN and infinite pixels are excluded.
+        reach: largest distance of correlated pixels along each axis.
+
+    Returns:
+        (2·reach + 1, 2·reach + 1) with unit sum of squares, a single 1 at its centre if there is no significant correlation;
+        (1, 1) if all residuals are equal.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> blurred = noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(1, 3))
+        >>> signal = torch.zeros(100, 100)
+        >>> image = blurred(signal).sample(generator=torch.Generator().manual_seed(0))
+        >>> from noiseflow.metrics.spatial import correlation_kernel
+        >>> correlation_kernel(noiseflow.Gaussian(), signal, image, reach=1)[1].round(decimals=1)
+        tensor([0.6, 0.6, 0.6])
+    """
+    z = _latent(noise_model, floating(signal), floating(observation))
+    height, width = z.shape[-2:]
+    if not z.any():
+        return torch.ones(1, 1)
+    side = 2 * reach + 1
+    spectrum = np.abs(np.fft.rfft2(z, s=(height + reach, width + reach))) ** 2
+    products = np.fft.irfft2(spectrum.reshape(-1, *spectrum.shape[-2:]).mean(0), s=(height + reach, width + reach))
+    lags = np.arange(-reach, reach + 1)
+    pairs = (height - np.abs(lags))[:, None] * (width - np.abs(lags))
+    found = products[np.ix_(lags, lags)] / pairs
+    found /= found[reach, reach]
+    found[np.abs(found) < 3 / math.sqrt(z.size)] = 0
+    wide = np.zeros((4 * side, 4 * side))  # the root of a spectrum reaches further than the spectrum
+    wide[np.ix_(lags, lags)] = found
+    kernel = np.fft.ifft2(np.sqrt(np.fft.fft2(wide).real.clip(0))).real[np.ix_(lags, lags)]
+    return torch.from_numpy(kernel / np.sqrt((kernel**2).sum())).float()
 
 
 def _shared(z: NDArray[np.float64]) -> float:
@@ -113,4 +158,4 @@ def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDAr
         u[good.cpu().numpy()] = probability_integral_transform(noise_model, signal[good], observation[good], random)
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).numpy()
     z[bad.cpu().numpy()] = 0
-    return np.asarray((z - z.mean()) / z.std())
+    return np.asarray((z - z.mean()) / (z.std() or 1.0))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import stats
+from numpy.typing import NDArray
+from scipy.special import bdtr, bdtrc
 from torch import Tensor, nn
 
 from noiseflow.described import described
@@ -15,8 +17,10 @@ from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 BEYOND = (3.0, 4.0, 5.0)
 """Distances from the mean, standard deviations of the model."""
 
-# Signals that represent a bin; within one, the mean moves by less than a tenth of the bin.
+# Signals that represent all pixels; within one, the mean moves by less than a tenth of the range.
 _LEVELS = 32
+# Signals that represent one of several bins, which are narrow.
+_LEVELS_OF_A_BIN = 8
 
 
 @described(signal="detector units")
@@ -31,7 +35,8 @@ class Tails:
         signal: mean signal of the pixels.
         observed: (3,) shares of the pixels.
         expected: (3,) shares under the model.
-        p_value: (3,) two-sided probabilities, under the model, of counts at least as unlikely as the observed ones.
+        p_value: (3,) two-sided probabilities, under the model, of counts as far from the expected ones as the observed: twice the
+            smaller of those of at most and of at least the observed count.
     """
 
     signal: float
@@ -40,7 +45,6 @@ class Tails:
     p_value: tuple[float, ...]
 
 
-@torch.no_grad()
 def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
     """Compare the tails of (N,) observations with those of a noise model.
 
@@ -53,9 +57,19 @@ def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
         >>> found.observed[1] > 20 * found.expected[1]
         True
     """
-    order = torch.argsort(signal)
-    groups = torch.tensor_split(order, min(_LEVELS, signal.numel()))
-    level = torch.stack([signal[group].double().mean() for group in groups])[:, None]
+    return tails_of_bins(noise_model, signal, observation, [torch.arange(signal.numel(), device=signal.device)])[0]
+
+
+@torch.no_grad()
+def tails_of_bins(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
+) -> tuple[Tails, ...]:
+    """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
+    number = _LEVELS if len(bins) == 1 else _LEVELS_OF_A_BIN
+    parts = [
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(number, one.numel()))] for one in bins
+    ]
+    level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))
     mean, spread = given.mean.double(), given.variance.double().sqrt()
     reach = spread * torch.tensor(BEYOND, dtype=torch.float64, device=spread.device)
@@ -64,17 +78,31 @@ def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
         given.log_interval_prob(low, high).double().exp()
         for low, high in ((-infinity, mean - reach), (mean + reach, infinity))
     )
-    weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64) / signal.numel()
-    expected = (weight @ torch.as_tensor(outside).cpu()).clamp(0, 1).numpy()
-    # within a group, residuals are taken from their own signal, so that only the scale is that of the group
-    moved = [
-        (observation[g].double() - signal[g].double() - (mean - level)[i]) / spread[i] for i, g in enumerate(groups)
-    ]
-    distance = torch.cat(moved).abs().cpu().numpy()
-    counts = np.array([(distance > k).sum() for k in BEYOND])
-    p_values = [
-        float(stats.binomtest(int(c), distance.size, float(p)).pvalue) for c, p in zip(counts, expected, strict=True)
-    ]
-    return Tails(
-        float(signal.double().mean()), tuple(counts / distance.size), tuple(map(float, expected)), tuple(p_values)
-    )
+    found, start = [], 0
+    for one in parts:
+        rows = slice(start, start + len(one))
+        start += len(one)
+        numbers = torch.tensor([part.numel() for part in one], dtype=torch.float64)
+        expected = (numbers @ torch.as_tensor(outside)[rows].cpu() / numbers.sum()).clamp(0, 1).numpy()
+        # within a part, residuals are taken from their own signal, so that only the scale is that of the part
+        off, scale = (mean - level)[rows], spread[rows]
+        moved = [
+            (observation[p].double() - signal[p].double() - o) / s for p, o, s in zip(one, off, scale, strict=True)
+        ]
+        distance = torch.cat(moved).abs().cpu().numpy()
+        counts = np.array([(distance > k).sum() for k in BEYOND])
+        middle = float(torch.cat([signal[part] for part in one]).double().mean())
+        found.append(
+            Tails(
+                middle,
+                tuple(counts / distance.size),
+                tuple(map(float, expected)),
+                tuple(map(float, _two_sided(counts, distance.size, expected))),
+            )
+        )
+    return tuple(found)
+
+
+def _two_sided(counts: NDArray[np.int64], number: int, share: NDArray[np.float64]) -> NDArray[np.float64]:
+    at_least = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), number, share), 1.0)
+    return np.asarray(np.minimum(2 * np.minimum(bdtr(counts, number, share), at_least), 1.0))

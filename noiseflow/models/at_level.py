@@ -81,7 +81,8 @@ def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
     """
     if isinstance(model, Digitised):
         low, high, origin = model.low + level, model.high + level, model.origin + level
-        return Digitised(at_level(model.model, level), model.step, low, high, origin)
+        coded = ((each + level).tolist() for each in (model.levels, model.edges))
+        return Digitised(at_level(model.model, level), model.step, low, high, origin, *coded)
     if isinstance(model, Poisson):
         return Poisson(float(model.log_gain.exp()), float(model.offset) + level, spread=model.spread)
     return AtLevel(model, level)

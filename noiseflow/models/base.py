@@ -184,6 +184,10 @@ class NoiseModelBase(Described, ABC):
         """
         return
 
+    def match_levels(self, signal: Any, observation: Tensor) -> bool:
+        """Adjust the edges of unequal levels to the fitted model, for (N,) pixels. Return whether there are such levels."""
+        return False
+
     @property
     def settles(self) -> bool:
         """Whether `standardise` ends with `settle` and takes ``settle=False`` to leave it out. Default: False."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.electrons.exact import log_density
+from noiseflow.fitting.cells import count
 from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32
@@ -20,13 +21,11 @@ _NUM_CLIMBS = 3
 _SETTLED, _SETTLING_STEPS = 16384, 24
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
-# Levels up to which pixels are counted, and ranges of signals, each a small fraction of a standard deviation of shot noise.
-_MOST_LEVELS, _RANGES = 512, 96
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
 _FLATTEST = 0.04
 
 
-class Detector(NamedTuple):
+class DetectorStart(NamedTuple):
     """Gain (counts per electron), offset (counts) and read noise (electrons)."""
 
     gain: float
@@ -34,7 +33,7 @@ class Detector(NamedTuple):
     read_noise: float
 
 
-def find_detector(signal: Tensor, observation: Tensor) -> Detector:
+def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
     """Maximum-likelihood detector for (N,) signals and observations, from the best of many starting points.
 
     Starting points come from a straight line of variance against signal and, if electrons are resolved, from the strongest
@@ -58,7 +57,7 @@ def find_detector(signal: Tensor, observation: Tensor) -> Detector:
     return max(climbed, key=lambda found: _score(found, signal[many], observation[many]))
 
 
-def likelihood_axes(detector: Detector, signal: Tensor, observation: Tensor) -> Tensor:
+def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor) -> Tensor:
     """(3, 3) steps of (log gain, offset, log read noise), in columns; each changes the likelihood by about half a nat per pixel.
 
     This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units.
@@ -78,7 +77,7 @@ def likelihood_axes(detector: Detector, signal: Tensor, observation: Tensor) -> 
     return axes
 
 
-def _changed(start: Detector, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _changed(start: DetectorStart, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     read_noise = start.read_noise * torch.exp(change[2])
     offset = start.offset + start.gain * start.read_noise * change[1]
     return start.gain * torch.exp(change[0]), offset, read_noise.clamp(min=1e-2)
@@ -113,7 +112,7 @@ def _slope(signal: Tensor, observation: Tensor) -> float:
     return max(slope, 1e-3 * math.sqrt(float(variance.mean())))
 
 
-def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detector]:
+def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:
     mean, low = float(signal.mean()), float(signal.min())
     spread = math.sqrt(variance)
     gains = [slope * factor for factor in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)]
@@ -121,15 +120,15 @@ def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detect
     starts = []
     for gain in gains:
         for read_noise in (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 5.0):
-            starts.append(Detector(gain, mean - variance / gain + gain * read_noise**2, read_noise))
+            starts.append(DetectorStart(gain, mean - variance / gain + gain * read_noise**2, read_noise))
         for offset in (low, low - spread, low - 4 * spread):
             rest = variance - gain * (mean - offset)
             if rest > 0:
-                starts.append(Detector(gain, offset, math.sqrt(rest) / gain))
+                starts.append(DetectorStart(gain, offset, math.sqrt(rest) / gain))
     return starts
 
 
-def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[Detector]:
+def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:
     """Detectors whose electron peaks match the strongest frequencies of the pixel values near one per gain."""
     readings = observation[_part(signal, _COMB)]
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
@@ -148,7 +147,7 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
         phase = float(readings.mean()) + gain * float(wave[index].angle()) / (2 * math.pi)
         expected = float(signal.mean()) - variance / gain + gain * read_noise**2
         nearest = round((expected - phase) / gain)
-        starts += [Detector(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
+        starts += [DetectorStart(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
     return starts
 
 
@@ -188,16 +187,11 @@ def few_pixels(signal: Tensor, observation: Tensor, *, most: int = _SETTLED) -> 
     Returns:
         Signals, observations and weights, (C,) each; the weights sum to 1.
     """
-    levels, level = torch.unique(observation, return_inverse=True)
-    if levels.numel() > _MOST_LEVELS:
-        part = _part(signal, most)
-        return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
-    root = torch.sqrt((signal - signal.min()).double())
-    row = torch.floor(root / root.max().clamp(min=1e-30) * (_RANGES - 1)).long()
-    _, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
-    count = torch.bincount(cell).double()
-    mean, value = (torch.bincount(cell, each.double()) / count for each in (signal, levels[level]))
-    return mean.to(signal.dtype), value.to(observation.dtype), count / count.sum()
+    cells = count(signal, observation)
+    if cells is not None:
+        return cells.signal, cells.values, cells.weight.double()
+    part = _part(signal, most)
+    return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:
@@ -224,9 +218,9 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float
     return first if math.isfinite(first) else math.inf
 
 
-def _distinct(ranked: list[Detector]) -> list[Detector]:
+def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
     """The first few detectors that differ in gain or by half an electron, more than an optimisation would change."""
-    kept: list[Detector] = []
+    kept: list[DetectorStart] = []
     for start in ranked:
         near = any(
             abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain
@@ -243,12 +237,12 @@ def _log_prob(signal: Tensor, observation: Tensor, gain: Tensor, offset: Tensor,
 
 
 @torch.no_grad()
-def _score(detector: Detector, signal: Tensor, observation: Tensor) -> float:
+def _score(detector: DetectorStart, signal: Tensor, observation: Tensor) -> float:
     found = float(_log_prob(signal, observation, *(torch.tensor(each, dtype=torch.float64) for each in detector)))
     return found if math.isfinite(found) else -math.inf
 
 
-def _climb(start: Detector, signal: Tensor, observation: Tensor) -> Detector:
+def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> DetectorStart:
     """Maximum likelihood by a quasi-Newton method from one starting point."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     optimiser = lbfgs([change], max_iter=40, history_size=10)
@@ -261,6 +255,6 @@ def _climb(start: Detector, signal: Tensor, observation: Tensor) -> Detector:
 
     with torch.enable_grad():
         optimiser.step(loss)  # type: ignore[no-untyped-call]
-    found = Detector(*(float(each.detach()) for each in _changed(start, change)))
+    found = DetectorStart(*(float(each.detach()) for each in _changed(start, change)))
     better = all(map(math.isfinite, found)) and _score(found, signal, observation) > _score(start, signal, observation)
     return found if better else start

@@ -12,6 +12,11 @@ from scipy import ndimage, optimize, special
 _SAMPLE = 2**18
 _MOST_LEVELS = 2**16
 _LEAST_PILED = 10
+# Unequal levels: at most so many (more are too fine to matter), each with enough pixels that an empty level beside it would be
+# no chance, for a good share of the pixels.
+_MOST_UNEQUAL, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.2
+# Change of the gap between levels, in logarithms: that of repeated random values has a median of log 3.
+_SMOOTH = 0.5
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 _GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
@@ -28,6 +33,7 @@ class Digitisation(NamedTuple):
         step: rounding step, detector units; 0 if pixel values are not rounded.
         low, high: clipping limits, detector units; infinite if there is none.
         origin: the level nearest to 0, detector units; not used if `low` is finite, which is a level itself.
+        levels: all levels, detector units, if they are not equally spaced; empty otherwise.
 
     Example:
         >>> import noiseflow
@@ -41,14 +47,21 @@ class Digitisation(NamedTuple):
     low: float = -math.inf
     high: float = math.inf
     origin: float = 0.0
+    levels: tuple[float, ...] = ()
+
+    def __repr__(self) -> str:
+        shown = f", {len(self.levels)} unequal levels" if self.levels else ""
+        return f"Digitisation(step={self.step!r}, low={self.low!r}, high={self.high!r}, origin={self.origin!r}{shown})"
 
     @property
     def found(self) -> bool:
-        """Whether there is a rounding step or a clipping limit."""
-        return self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
+        """Whether there are levels or a clipping limit."""
+        return bool(self.levels) or self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
 
     def in_words(self) -> str:
         """A short description."""
+        if self.levels:
+            return f"coded in {len(self.levels)} unequal levels"
         parts = [f"rounded to steps of {self.step:g}"] if self.step > 0 else []
         rails = [f"{rail:g}" for rail in (self.low, self.high) if math.isfinite(rail)]
         return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
@@ -59,6 +72,9 @@ def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) ->
 
     Pixel values are rounded if all of them are integer multiples of a step from the smallest one. Integers always are; other
     numbers must repeat. Rounding by the number format itself is ignored.
+
+    Levels that are not equally spaced, such as decoded square roots, are recognised if they are at most 512 and hold enough
+    pixels to show that those between them do not occur.
 
     A clipping limit is an extreme value with at least ten pixels, and with more than the two levels next to it allow if the
     histogram is log-concave there, as noise tails and electron counts are. The histogram of a whole image does not show a low
@@ -89,6 +105,9 @@ def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) ->
         return Digitisation()
     predicted = None if signal is None else _paired(values, signal)
     step = _step(values[use])
+    unequal = _unequal_levels(values[use], step)
+    if unequal:
+        return Digitisation(step, levels=unequal)
     low, high = (_limit(values, use, predicted, high=which) for which in (False, True))
     return Digitisation(step, low, high, _origin(float(values[use].min()), step) if step and math.isinf(low) else 0.0)
 
@@ -121,6 +140,20 @@ def _step(values: NDArray[Any]) -> float:
     if levels.dtype.kind == "f" and step < _LEAST_ULPS * float(np.spacing(np.abs(levels).max())):
         return 0.0
     return step
+
+
+def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
+    """The levels if they are few, populated, and not one step apart; empty otherwise."""
+    levels, counts = np.unique(values, return_counts=True)
+    if not 2 < levels.size <= min(_MOST_UNEQUAL, values.size // _LEAST_POPULATED):
+        return ()
+    gaps = np.diff(levels.astype(np.float64))
+    populated = np.minimum(counts[1:], counts[:-1]) >= _LEAST_POPULATED
+    if populated.sum() < 2 or np.median(np.abs(np.diff(np.log(gaps[populated])))) > _SMOOTH:
+        return ()
+    wide = populated & (gaps > 1.5 * (step or gaps.min()))
+    share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
+    return tuple(map(float, levels)) if share > _UNEQUAL else ()
 
 
 def _are_whole(levels: NDArray[Any]) -> bool:

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, given_to, values_of
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
+# Groups of pixels by signal that represent all in the adjustment of levels.
+_GROUPS = 256
 
 
 class Digitised(ModelAround):
@@ -27,9 +33,13 @@ class Digitised(ModelAround):
         step: rounding step, detector units; 0 for pixel values that are clipped but not rounded.
         low, high: clipping limits, detector units; infinite if there is none.
         origin: one of the levels, which are whole steps apart; `low` is one if it is finite.
+        levels: the levels, increasing, if they are not equally spaced, as for values that were stored as square roots. The
+            other arguments then have no effect.
+        edges: the values before the converter that separate these levels; midpoints by default. Fits adjust them, so that
+            each level is as frequent as in the data.
 
     Raises:
-        ValueError: the step is negative, the limits are in the wrong order, or the model has row or column offsets.
+        ValueError: the step is negative, limits, levels or edges are in the wrong order, or the model has row or column offsets.
 
     Example:
         >>> import noiseflow, torch
@@ -44,6 +54,8 @@ class Digitised(ModelAround):
     low: float = math.nan
     high: float = math.nan
     origin: float = math.nan
+    levels: Tensor
+    edges: Tensor
 
     def __init__(
         self,
@@ -52,6 +64,8 @@ class Digitised(ModelAround):
         low: float = -math.inf,
         high: float = math.inf,
         origin: float = 0.0,
+        levels: Sequence[float] = (),
+        edges: Sequence[float] = (),
     ) -> None:
         super().__init__(model)
         check(step=step)
@@ -61,30 +75,68 @@ class Digitised(ModelAround):
             raise ValueError("offsets of rows are added before rounding: write ScanNoise(Digitised(model, …)) instead")
         self.step, self.low, self.high = float(step), float(low), float(high)
         self.origin = self.low if math.isfinite(self.low) else float(origin)
+        places = np.asarray(levels, np.float64)
+        between = np.asarray(edges, np.float64) if len(edges) else (places[1:] + places[:-1]) / 2
+        increasing = all((np.diff(each) > 0).all() for each in (places, between))
+        if not increasing or places.size == 1 or between.size != max(0, places.size - 1):
+            raise ValueError("levels and edges must increase, with one edge between two levels; give sorted values")
+        self.register_buffer("levels", torch.tensor(places), persistent=False)
+        self.register_buffer("edges", torch.tensor(between), persistent=False)
 
-    def forward(self, signal: Signal) -> DigitisedDistribution:
-        return DigitisedDistribution(self, self.model(given_to(self.model, signal)), values_of(signal))
+    def _around(self, model: nn.Module) -> Digitised:
+        """The same converter behind another model."""
+        coded = (self.levels.tolist(), self.edges.tolist())
+        return Digitised(model, self.step, self.low, self.high, self.origin, *coded)
 
-    def at_read_noise(self, signal: Signal, read_noise: Tensor) -> DigitisedDistribution:
-        return DigitisedDistribution(self, self.model.at_read_noise(given_to(self.model, signal), read_noise))
+    def _after(self, base: NoiseDistribution, signal: Tensor | None = None) -> NoiseDistribution:
+        if self.levels.numel():
+            return CodedDistribution(self.levels, self.edges, base)
+        return DigitisedDistribution(self, base, signal)
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        return self._after(self.model(given_to(self.model, signal)), values_of(signal))
+
+    def at_read_noise(self, signal: Signal, read_noise: Tensor) -> NoiseDistribution:
+        return self._after(self.model.at_read_noise(given_to(self.model, signal), read_noise))
 
     def without_rails(self) -> Digitised:
         """The same detector and inner model, with rounding but without clipping."""
+        if self.levels.numel():
+            return self
         return Digitised(self.model, step=self.step, origin=self.origin)
 
-    def standardise(self, signal: Signal, observation: Tensor) -> None:
+    @torch.no_grad()
+    def match_levels(self, signal: Signal, observation: Tensor) -> bool:
+        values = values_of(signal)
+        if not self.levels.numel() or self.model.needs_image:
+            return self.model.match_levels(signal, observation)
+        place = torch.bucketize(observation.double(), (self.levels[1:] + self.levels[:-1]) / 2)
+        shares = torch.bincount(place, minlength=self.levels.numel()).double() / place.numel()
+        groups = torch.tensor_split(torch.argsort(values), min(_GROUPS, values.numel()))
+        level = torch.stack([values[group].double().mean() for group in groups])
+        weight = torch.tensor([group.numel() / values.numel() for group in groups], dtype=torch.float64).to(level)
+        first, last = (self.levels[1] - self.levels[0]), (self.levels[-1] - self.levels[-2])
+        ends = self.edges[:1] - first, self.edges[-1:] + last
+        self.edges = matching_edges(self.model(level), weight, shares, torch.cat([ends[0], self.edges, ends[1]]))
+        return True
+
+    @property
+    def settles(self) -> bool:
+        return self.model.settles and not self.model.needs_image
+
+    def standardise(self, signal: Signal, observation: Tensor, *, settle: bool = True) -> None:
         """Standardise the inner model on those of the (N,) pixels that clipping does not affect, if they suffice."""
         values, by_level = values_of(signal), self.model.standardises_by_level
         kept, seen = self._before_rails(values, observation, mirror=by_level)
         if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
             kept, seen = torch.ones_like(kept), observation
         options: dict[str, Any] = {"span": (float(values.min()), float(values.max()))} if by_level else {}
-        options |= {"settle": False} if self.model.settles and not self.model.needs_image else {}
+        options |= {"settle": False} if self.settles else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **options)
-        if not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
-            self.model.settle(
-                values, observation, lambda inner: Digitised(inner, self.step, self.low, self.high, self.origin)
-            )
+        if settle and not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
+            self.model.settle(values, observation, self._around)
+            if self.settles and self.match_levels(values, observation):
+                self.model.settle(values, observation, self._around)
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values.
@@ -110,10 +162,16 @@ class Digitised(ModelAround):
 
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
         """The part of the likelihood of (N,) pixels that training does not change; None if there is none."""
+        if self.levels.numel():
+            place = torch.bucketize(observation.double(), (self.levels[1:] + self.levels[:-1]) / 2)
+            bounds = torch.cat(
+                [torch.full_like(self.edges[:1], -math.inf), self.edges, torch.full_like(self.edges[:1], math.inf)]
+            )
+            return self.model.fixed_interval_part(signal, *(bounds[place + more].to(observation) for more in (0, 1)))
         on_low, on_high = observation <= self.low, observation >= self.high
         below, above = (observation - self.step / 2, observation + self.step / 2)
         # a high limit between two levels gets only values that round to the level above it
-        edge = self.forward(signal[:0]).edges[1]
+        edge = DigitisedDistribution(self, self.model(signal[:0])).edges[1]
         below = torch.where(on_high, edge, below) if math.isfinite(edge) else below
         low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
         if self.step > 0:
@@ -132,7 +190,7 @@ class Digitised(ModelAround):
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
         """Log-likelihood of pixels from their `fixed_part`."""
         found = self.model.log_interval_prob_from(signal, fixed_part[:, :3])
-        if self.step > 0:
+        if self.step > 0 or self.levels.numel():
             return found
         between = self.model.log_prob_from(signal, fixed_part[:, 3:5])
         return torch.where(fixed_part[:, 5] > 0, found, between)
@@ -142,8 +200,11 @@ class Digitised(ModelAround):
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model."""
+        if self.levels.numel():
+            return {"step": self.step, "levels": self.levels.tolist(), "edges": self.edges.tolist()}
         rails = {name: rail for name, rail in (("low", self.low), ("high", self.high)) if math.isfinite(rail)}
         return {"step": self.step} | rails | ({"origin": self.origin} if self.origin and "low" not in rails else {})
 
     def extra_repr(self) -> str:
-        return f"step={self.step:g}, low={self.low:g}, high={self.high:g}"
+        coded = f"{self.levels.numel()} unequal levels"
+        return coded if self.levels.numel() else f"step={self.step:g}, low={self.low:g}, high={self.high:g}"

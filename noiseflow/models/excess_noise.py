@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _NODES, _CELLS = 64, 4096
 # Width of a cell and the first one, in units of the grid, about a standard deviation: 13 of them below the mean, and 38 above
 # it, where the tail is exponential.
@@ -29,6 +28,8 @@ _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
 _FITTED, _ITERATIONS = 8192, 40
+# Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
+_LEAST_GAIN = 1e-3
 
 
 class ExcessNoise(ElectronCounter):
@@ -100,7 +101,7 @@ class ExcessNoise(ElectronCounter):
         third = torch.stack([(residual[group] ** 3).mean() for group in groups])
         product, floor = _line(mean, second, second**2)
         skew, _ = _line(mean, third, second**3)
-        product = max(product, 1e-6 * float(second.mean()) / max(float(s.abs().mean()), 1e-12))
+        product = max(product, _LEAST_GAIN * math.sqrt(float(second.mean())))
         squared = 1 / (2 - min(max(skew / product**2, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product
@@ -207,7 +208,10 @@ class ExcessNoiseDistribution(NoiseDistribution):
         phase = turn / unit
         zero = torch.zeros_like(phase)
         pulse = torch.exp(-torch.log1p(torch.complex(zero, -phase * self.pulse_variance)) / self.pulse_variance)
-        several = torch.exp(-rate[:, None]) * torch.expm1(rate[:, None] * pulse) / -torch.expm1(-rate[:, None])
+        few, many = rate[:, None].clamp(max=_ALIGNED), rate[:, None].clamp(min=_ALIGNED)
+        several = torch.exp(-few) * torch.expm1(few * pulse) / -torch.expm1(-few)
+        # without a pulse there are then fewer than 1e-13 of the pixels, and exponentials of large rates would overflow
+        several = torch.where(rate[:, None] > _ALIGNED, torch.exp(many * (pulse - 1)), several)
         moved = torch.complex(-0.5 * (phase * self.read_noise) ** 2, -(turn * _START + phase * origin))
         density = torch.fft.irfft(torch.conj(several * torch.exp(moved)), n=_CELLS) / _WIDTH
         density = density.clamp(min=_LEAST)
@@ -241,7 +245,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         charge = self._charge(value)
         if not charge.numel():
             return charge
-        dark = -0.5 * (charge / self.read_noise) ** 2 - torch.log(self.read_noise) - _LOG_SQRT_2PI - self.rate
+        dark = -0.5 * (charge / self.read_noise) ** 2 - torch.log(self.read_noise) - LOG_SQRT_2PI - self.rate
         return _added(dark, self._at(charge)[0]) - torch.log(self.gain)
 
     def cdf(self, value: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,12 +11,11 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.monotone_maps import between_rows
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf, normal_quadrature
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _BISECTIONS = 60
 _FEW = 4  # components
 _COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
@@ -169,7 +167,7 @@ class MixtureDistribution(NoiseDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         z = self._standard(value)
-        return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - _LOG_SQRT_2PI
+        return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
         return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1)

@@ -14,6 +14,7 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import (
+    LOG_SQRT_2PI,
     hazard_of,
     log_normal_cdf,
     log_normal_interval,
@@ -22,7 +23,6 @@ from noiseflow.distributions.numerics.normal import (
 )
 from noiseflow.models.flow import _inverse
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _MAX_INVERSION_STEPS = 80
 _SIGNALS_AT_ONCE = 1024
 _CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
@@ -71,7 +71,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
         latent, _ = self.correct(self._detector_latent(value))
-        ladj = self._log_prob(value) + 0.5 * latent**2 + _LOG_SQRT_2PI
+        ladj = self._log_prob(value) + 0.5 * latent**2 + LOG_SQRT_2PI
         return latent.to(value.dtype), ladj.to(value.dtype)
 
     @torch.no_grad()
@@ -207,7 +207,7 @@ def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
         above = latent >= target
         low, high = torch.where(above, low, residual), torch.where(above, residual, high)
         result = result.index_put((left,), residual)
-        log_slope = log_density(residual, rate, read_noise) + 0.5 * latent**2 + _LOG_SQRT_2PI
+        log_slope = log_density(residual, rate, read_noise) + 0.5 * latent**2 + LOG_SQRT_2PI
         newton = residual - (latent - target) * torch.exp(-log_slope)
         residual = torch.where((newton > low) & (newton < high) & (step % 4 != 3), newton, (low + high) / 2)
         going = ((latent - target).abs() > 1e-9) & (high - low > 1e-12 * spread)

@@ -1,8 +1,7 @@
 """Components of the self-contained HTML report: page, figures, interactive images and provenance."""
 
 from noiseflow.report.charts import COLOURS, add_legend, new_chart, new_figure, show_image
-from noiseflow.report.page import Report
-from noiseflow.report.provenance import provenance
+from noiseflow.report.page import Report, provenance
 from noiseflow.report.sprites import Sprites, make_sprites
 
 __all__ = [

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import io
 import json
+import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from noiseflow.commands.console import invocation
 from noiseflow.described import printable
-from noiseflow.io import atomic_path, check_output
+from noiseflow.installation import DISTRIBUTION
+from noiseflow.io import atomic_path, check_output, files_of
 from noiseflow.report.charts import themed_svg
 from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SCRIPTS = ("core.js", "volume.js", "tilts.js", "start.js")
+_SCRIPTS = ("core.js", "volume.js", "tilts.js", "downloads.js", "start.js")
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
@@ -35,10 +41,16 @@ class Report:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
+        self._folded = False
 
-    def heading(self, text: str) -> None:
-        """Start a section."""
-        self._parts.append(f"<h2>{_escape(text)}</h2>")
+    def heading(self, text: str, *, folded: bool = False) -> None:
+        """Start a section; a folded one shows only its heading until the reader opens it."""
+        heading, self._parts = f"<h2>{_escape(text)}</h2>", [self._content()]
+        self._folded = folded
+        self._parts.append(f"<details><summary>{heading}</summary>" if folded else heading)
+
+    def _content(self) -> str:
+        return "".join(self._parts) + ("</details>" if self._folded else "")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
@@ -104,7 +116,8 @@ class Report:
         if not content:
             raise ValueError(f"{path} is not a noiseflow report and has no content to include")
         content = content.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
-        self._parts.append(f'<section class="part"><h2>{title}</h2>{content}</section>')
+        self._parts = [f'{self._content()}<section class="part"><h2>{title}</h2>{content}</section>']
+        self._folded = False
 
     def save(self, path: str | Path) -> Path:
         """Write the page and return its path."""
@@ -117,7 +130,7 @@ class Report:
             '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
             f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'
             f'<p class="note">{lead}</p></header><nav class="contents" aria-label="Contents"></nav>'
-            f"<main>{''.join(self._parts)}</main></div>"
+            f"<main>{self._content()}</main></div>"
             f"<script>'use strict';\n{''.join(map(_asset, _SCRIPTS))}</script></body></html>\n"
         )
         with atomic_path(path) as partial:
@@ -131,3 +144,46 @@ def _escape(text: str) -> str:
 
 def _asset(name: str) -> str:
     return (files("noiseflow.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+_PACKAGES = (DISTRIBUTION, "torch", "numpy", "scipy")
+
+
+def provenance(
+    inputs: Sequence[str | Path] = (), *, seed: int | None = None, more: Mapping[str, str] | None = None
+) -> list[tuple[str, str]]:
+    """Rows (name, value) with the information needed to reproduce a result.
+
+    Args:
+        inputs: input files and image folders; each is listed with its size and SHA-256.
+        seed: seed of the random choices.
+        more: further rows, such as the device.
+    """
+    called = invocation()
+    rows = [("command", called.command_line if called is not None else "called from Python")]
+    rows += [(f"input: {Path(path).name}", text) for path in inputs if (text := _checksum(path)) is not None]
+    rows += [("seed", str(seed))] if seed is not None else []
+    rows += list((more or {}).items())
+    rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *map(_version, _PACKAGES)])))
+    rows.append(("machine", f"{platform.system()} {platform.machine()}"))
+    rows.append(("written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")))
+    return rows
+
+
+def _checksum(path: str | Path) -> str | None:
+    """Size and digest of a file, or of the concatenated images of a folder; None if it does not exist."""
+    files = [file for file in files_of(path) if file.is_file()]
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: digest)
+    count = f"{len(files)} files, " if len(files) > 1 else ""
+    size = sum(file.stat().st_size for file in files)
+    return f"{count}{size:,} bytes, SHA-256 {digest.hexdigest()}" if files else None
+
+
+def _version(package: str) -> str:
+    try:
+        return f"{package} {version(package)}"
+    except PackageNotFoundError:
+        return f"{package} (not installed)"

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, Timeout
 
 from noiseflow.runs.partials import link_target
 
@@ -35,23 +35,37 @@ def locked(output: str | Path) -> Iterator[None]:
         path, timeout=0, is_singleton=True, on_acquired=_sign
     )  # a singleton of each thread counts its blocks
     try:
+        _take(lock, output)
+        yield
+    finally:  # a signal may have come while the lock was taken
+        if lock.lock_counter <= 1 and (lock.is_locked or _is_free(lock)):
+            # removed while the lock is held: other processes notice that the file they lock is gone
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        lock.release()
+
+
+def _take(lock: BaseFileLock, output: str | Path) -> None:
+    try:
         lock.acquire()
     except Timeout:
         raise BlockingIOError(
-            f"{output} is being written by {_holder(path)}; wait until it finishes, stop it, or name another output"
+            f"{output} is being written by {_holder(lock_file(output))}; wait until it finishes, stop it, or name another output"
         ) from None
     except OSError as error:
         if error.errno not in _UNSUPPORTED:
             raise
+
+
+def _is_free(lock: BaseFileLock) -> bool:
+    """Take the lock if no other run holds it; true where locks are not supported."""
     try:
-        yield
-    finally:
-        if (
-            lock.lock_counter <= 1
-        ):  # removed while the lock is held: other processes notice that the file they lock is gone
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
-        lock.release()
+        lock.acquire()
+    except Timeout:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def lock_file(output: str | Path) -> Path:

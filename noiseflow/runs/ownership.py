@@ -1,9 +1,9 @@
 """Marks in output files. Files without the mark of this program are not overwritten without `--overwrite`.
 
 The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` in the attributes of a Zarr group,
-the format name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table. An
-``.npy`` header has no room for text: ours is padded to 1024 bytes, which every reader skips and no other program writes. Angle
-files belong to the stack next to them.
+the format name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table;
+the table of a batch is known by its columns. An ``.npy`` header has no room for text: ours is padded to 1024 bytes, which every
+reader skips and no other program writes. Angle files belong to the stack next to them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from noiseflow.installation import library_version
 MARK = "noiseflow"
 NPY_HEADER_BYTES = 1024
 _PAGE_HEAD = 1000
+_BATCH_COLUMNS = b"series,volume,status,verdict,reason,error,"
 
 
 def signature() -> str:
@@ -69,7 +70,7 @@ def is_own(path: Path) -> bool:
     if kind == ".png":
         return b"tEXtSoftware\0" + MARK.encode() in head
     if kind == ".csv":
-        return head.startswith(f"# {MARK} ".encode())
+        return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
     if kind == ".json":
         return f'"written_by": "{MARK}'.encode() in head
     return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]

@@ -40,30 +40,33 @@ def batch(
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Skip series that the table lists as done; resume those that were interrupted."),
+        typer.Option(
+            "--resume",
+            help="Skip series that are done with the same options; resume those that were interrupted.",
+        ),
     ] = False,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> None:
     """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
     from noiseflow import io
+    from noiseflow.runs.ownership import require_own
     from recon.scale.cluster import client_of
-    from recon.scale.many import jobs_of, left_out, read_table, reconstruct_all, require_own_table, write_table
+    from recon.scale.many import finished, jobs_of, left_out, read_table, reconstruct_all, write_table
 
     io.check_folder(out)
     output, table = Output(json), out / "batch.csv" if table is None else table
     if table.suffix.lower() not in (".csv", ".json"):
         raise ValueError(f"--table {table}: name a .csv or a .json file")
-    require_own_table(table, overwrite=overwrite)
+    require_own(table, overwrite=overwrite)
     io.require_other(table, source, noise_model)
     words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
     jobs, skipped = jobs_of(source, out, words), left_out(source)
     if skipped:
         output.line(f"skipped, because no tilt angles were found in or next to them: {', '.join(skipped)}")
     with io.output_folder(out), io.locked(table):
-        rows = [row for row in read_table(table) if row["status"] == "done"] if resume else []
-        known = {row["volume"] for row in rows if Path(row["volume"]).exists()}
-        rows = [row for row in rows if row["volume"] in known]
+        rows = finished(read_table(table), jobs) if resume else []
+        known = {row["volume"] for row in rows}
         left = [job for job in jobs if str(job.out) not in known]
         if known:
             output.line(f"{len(known)} of {len(jobs)} series are already done")

@@ -84,7 +84,7 @@ def _find_checkout() -> None:
 
 
 def _check_method(method: str | None, names: list[str]) -> None:
-    from recon.methods._names import method_names
+    from recon.names import method_names
 
     if method is None:
         return

@@ -7,9 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.progress import Progress
@@ -51,7 +48,7 @@ def load_tilt_series(
         path,
         angles=angles,
         mode="transmission" if automatic else parse_mode(mode),
-        mask=None if mask is None else _read_mask(mask),
+        mask=mask,
         mask_nan=mask_nan,
         mapped=mapped,
         channel=channel,
@@ -59,7 +56,7 @@ def load_tilt_series(
         exclude_views=exclude_views,
     )
     if invert_tilt:
-        series = replace(series, tilt_angles=-series.tilt_angles)
+        series = replace(series, tilt_angles=-series.tilt_angles, x_tilt=-series.x_tilt)
     if invert_contrast:
         series = inverted(series)
     if automatic:
@@ -117,9 +114,3 @@ def check_alignment_file(path: Path, *inputs: Path | None, overwrite: bool) -> N
     """Check that `--save-alignment` can be written. Raises as `noiseflow.io.check_output` and `noiseflow.io.require_other`."""
     io.check_output(path, suffixes=ALIGNMENT_SUFFIXES, overwrite=overwrite)
     io.require_other(path, *inputs)
-
-
-def _read_mask(path: Path) -> NDArray[Any]:
-    mask = io.read(path).data
-    io.require_finite(mask, path)
-    return np.asarray(mask != 0)

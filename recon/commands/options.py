@@ -30,7 +30,7 @@ def method_of(method: str, preset: str | None) -> str:
     Raises:
         ValueError: the preset is unknown, or `--method` is given too.
     """
-    from recon.methods._names import method_names
+    from recon.names import method_names
 
     method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:

@@ -21,13 +21,9 @@ from noiseflow.commands.option_files import option_groups
 from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, method_of
 from recon.commands.running import (
-    require_blocks,
     warnings_as_lines,
 )
-from recon.fields._names import DEFAULT as FIELD
-from recon.fields._names import field_names
-from recon.fields.regularisers._names import DEFAULT, regulariser_names
-from recon.methods._names import method_names
+from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 
 @option_groups(
@@ -119,13 +115,15 @@ def reconstruct(
     ] = None,
     regulariser: Annotated[
         str | None,
-        typer.Option(help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {DEFAULT} by default."),
+        typer.Option(
+            help=f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default."
+        ),
     ] = None,
     field: Annotated[
         str | None,
         typer.Option(
             help=f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
-            f"{FIELD} by default."
+            f"{FIELDS.first} by default."
         ),
     ] = None,
     uncertainty: Annotated[
@@ -259,7 +257,7 @@ def reconstruct(
     from recon.commands.inputs import check_alignment_file, files_read, load_tilt_series, prepare
     from recon.commands.results import Targets
     from recon.commands.volume_run import VolumeRun
-    from recon.methods import find_method, settings_of
+    from recon.methods import settings_of
     from recon.methods._registry import require_setting, require_two_axes
     from recon.uncertainty.result import error_bar_paths, shell_band_path
 
@@ -303,16 +301,16 @@ def reconstruct(
         require_setting(method, "voxel-size" if save_field is None else "save-field")
     if second_axis is not None:
         blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
-        require_two_axes(find_method(method), blocks=blocks)
+        require_two_axes(method, blocks=blocks)
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler provides the workers; remove --workers")
     if workers is not None or scheduler is not None:
-        require_blocks(method, "--workers" if scheduler is None else "--scheduler")
+        require_setting(method, "workers" if scheduler is None else "scheduler")
     if fsc and report is None:
         raise ValueError("--fsc needs a report; name its folder with --report")
-    if save_noise_model is not None and not find_method(method).learns_noise:
-        raise ValueError(f"--save-noise-model: method {method} does not fit a noise model; use --method joint")
-    with ExitStack() as locks, warnings_as_lines(output) as warned:
+    if save_noise_model is not None:
+        require_setting(method, "save-noise-model")
+    with ExitStack() as locks, warnings_as_lines() as warned:
         for target in targets.values():
             locks.enter_context(locked(target.volume))
         fixed = load_noise_model(noise_model)

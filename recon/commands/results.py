@@ -103,16 +103,20 @@ class Targets:
     ) -> dict[str, Any]:
         """Write the requested files, print the results, and return those for programs. A volume that is already `filled`, in a
         file of the same format next to its target, is renamed to it."""
-        outcome = replace(outcome, choices=outcome.choices | prepared.choices)
+        given, turn = outcome, tilt_series.x_tilt
+        outcome = replace(outcome, choices=outcome.choices | prepared.choices).levelled(turn)
+        halves = None if halves is None else (halves[0].levelled(turn), halves[1].levelled(turn))
         rows = _figures(tilt_series, outcome, seconds)
-        if filled is not None and filled.suffix == self.volume.suffix:
+        if filled is not None and filled.suffix == self.volume.suffix and not turn:
             put_in_place(filled, self.volume)
         else:
-            (outcome.volume if self.voxel_size is None else outcome.sampled(self.voxel_size)).write(self.volume)
+            (outcome.volume if self.voxel_size is None else outcome.sampled(self.voxel_size).levelled(turn)).write(
+                self.volume
+            )
         bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
         self._remove_former(bars, output)
         verdict = judge(
-            tilt_series, outcome, screening=prepared.screening, alignment=prepared.alignment, guard=prepared.guard
+            tilt_series, given, screening=prepared.screening, alignment=prepared.alignment, guard=prepared.guard
         )
         if self.noise_model is not None:
             _save_noise_model(outcome, self.noise_model, inputs[0])

@@ -96,7 +96,7 @@ def resume_command(context: typer.Context) -> str:
 
 
 @contextlib.contextmanager
-def warnings_as_lines(output: Output) -> Iterator[list[str]]:
+def warnings_as_lines() -> Iterator[list[str]]:
     """Show each warning once, as one line; yield the list that collects them."""
     told: list[str] = []
 
@@ -167,21 +167,6 @@ def chosen_slices(
             f"--workers and --scheduler, or remove --resume to start over ({journal.folder})"
         )
     return found
-
-
-def require_blocks(method: str, option: str) -> None:
-    """Check that a method reconstructs in blocks, as an option requires.
-
-    Raises:
-        ValueError: it does not.
-    """
-    from recon.methods import find_method, method_names
-
-    if find_method(method).blockwise is None:
-        able = [name for name in method_names() if find_method(name).blockwise is not None]
-        raise ValueError(
-            f"{option}: method {method} does not reconstruct in blocks; use --method {', '.join(able)}, or remove {option}"
-        )
 
 
 def _slices_for(

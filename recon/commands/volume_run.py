@@ -22,7 +22,7 @@ from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import fitted_slices
 from recon.scale.cluster import client_of
-from recon.scale.cost import expected_seconds
+from recon.scale.memory import expected_seconds
 from recon.series.tilt_series import VolumeGrid
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ _BELOW = 3  # standard deviations; a clipped pixel with a signal further below t
 
 
 @dataclass(frozen=True)
-class Readings:
+class PixelValues:
     """What the pixel values of a whole series show without their signals.
 
     Attributes:
@@ -47,10 +47,10 @@ class Readings:
     saturated: float
 
     @staticmethod
-    def of(images: NDArray[Any]) -> Readings:
+    def of(images: NDArray[Any]) -> PixelValues:
         """The pixel values of images of any shape."""
         found = detect_digitisation(images)
-        return Readings(found, float(images.min()), float((images >= found.high).mean()))
+        return PixelValues(found, float(images.min()), float((images >= found.high).mean()))
 
     def given(self, observation: Tensor, signal: Tensor, use: Tensor | None) -> Digitisation:
         """The digitisation with the lower clipping limit that pixels with predicted signals show, (tilt, u, y)."""
@@ -67,8 +67,9 @@ class Readings:
         model = as_noise_model(noise_model)
         if not math.isfinite(model.low):
             return self.lowest + _DARK * model.step
-        at_limit = model.one_pixel(torch.full((1,), model.low, device=model.device))
-        return model.low - _BELOW * float(at_limit.stddev)
+        with torch.no_grad():
+            at_limit = model.one_pixel(torch.full((1,), model.low, device=model.device))
+            return model.low - _BELOW * float(at_limit.stddev)
 
 
 def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool = False) -> list[nn.Module]:

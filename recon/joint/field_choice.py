@@ -10,11 +10,11 @@ from functools import partial
 from torch import nn
 
 from noiseflow.progress import Progress
-from recon.fields._names import AUTO
 from recon.fields._registry import field_kinds
 from recon.fields.fields import Field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
+from recon.names import AUTO
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
@@ -83,8 +83,4 @@ def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:
     if field != AUTO:
         return []
     steps = fit.schedule.whole if fit.num_steps is None else fit.num_steps
-    return [
-        FitStage(
-            "choose field", "fields", "slab", "chosen", steps, rate=fit.schedule.rate, fits=len(field_kinds(field))
-        )
-    ]
+    return [FitStage("choose field", "fields", "slab", "chosen", steps, fits=len(field_kinds(field)))]

@@ -20,9 +20,8 @@ from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
-from recon.fields.regularisers._names import DEFAULT
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import Readings, first_noise, learns, noise_candidates
+from recon.joint.candidates import PixelValues, first_noise, learns, noise_candidates
 from recon.joint.coarse_start import Start, coarse_start, learning_rate
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
@@ -31,6 +30,7 @@ from recon.joint.settled import PlannedRun, Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask, noise_share
 from recon.joint.vacuum import stays_empty
+from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
@@ -50,6 +50,8 @@ _SLAB, _SLAB_VOXELS = 24, 16 * 96**2
 # For slices of 256²: the raw needle gets weight 6.8; with 24 slices 5.7, better by 0.0001 nats on these
 _QUIET_SLAB = 12
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
+OTHERS = ("second-order",)
+"""Regularisers that win by much on some scenes, and are compared with the usual one."""
 # Largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
 _WORTHWHILE = 0.4
 
@@ -58,15 +60,16 @@ _WORTHWHILE = 0.4
 class JointReconstructor:
     """Reconstruct a volume jointly with the noise model of its images. With a `Gaussian`, this is least squares.
 
-    Noise model and regularisation weight are chosen by the likelihood of held-out pixels on a slab of a few slices. Then the
-    whole volume is fitted once. `recon.joint.plan.plan` defines the stages.
+    Noise model, regularisation weight and regulariser are chosen by the likelihood of held-out pixels on a slab. Then the whole
+    volume is fitted once. `recon.joint.plan.plan` defines the stages.
 
     Attributes:
         weight: weight of the regulariser, see `TomographySignal`; None to choose it automatically.
         noise_model: function that creates the noise model, trainable or not; None to choose a mean-preserving one, wrapped in
             the detected rounding and clipping.
         make_field: function that creates the field from shape and scale.
-        regulariser: regulariser of the volume; directional total variation if None.
+        regulariser: regulariser of the volume; if None, directional total variation, or the second order where that predicts
+            held-out pixels significantly better.
         num_steps: signal steps of the whole volume; None for the number in the schedule.
         estimate_response: whether to fit incident intensity or offset.
         skip_vacuum: whether to skip voxels of vacuum (only without defocus).
@@ -77,7 +80,7 @@ class JointReconstructor:
         defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
             `recon.projection.defocused_projector.ImageDefocusedProjector`.
         slab: number of slices of the slab; by default 24, or more if slices are small.
-        schedule: numbers of steps and learning rates.
+        schedule: numbers of steps.
         seed: seed of all random choices.
         device: torch device.
         run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` also stores states and results.
@@ -237,11 +240,12 @@ class JointReconstructor:
         rough = start.rough.to(self.device)
         scale = attenuation_scale(rough)
         weight = _first_weight(grid.width) if self.weight is None else self.weight
+        regulariser = find_regulariser(REGULARISERS.first) if self.regulariser is None else self.regulariser
         response = copy.deepcopy(start.response)
         if settled is not None:
             response.load_state_dict(settled.response)
             response.requires_grad_(False)
-            scale, weight = settled.scale, settled.weight
+            scale, weight, regulariser = settled.scale, settled.weight, settled.regulariser
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             made = self.make_field(grid.shape, scale=scale).to(self.device)
@@ -258,7 +262,7 @@ class JointReconstructor:
         formation = response.to(self.device)
         kept: dict[str, Any] = {
             "weight": weight,
-            "regulariser": find_regulariser(DEFAULT) if self.regulariser is None else self.regulariser,
+            "regulariser": regulariser,
             "learning_rate": rate,
             "occupancy": occupancy,
         }
@@ -280,6 +284,7 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
+            first_order=not whole.field.quasi_newton,
             halvings=0 if given is not None and needs_image(given) else self._halvings(whole),
         )
         return facts, rows, given
@@ -293,7 +298,7 @@ class JointReconstructor:
     ) -> PlannedRun:
         """A run that has made its choices."""
         facts, rows, given = self._facts(tilt_series, whole, noise)
-        readings = Readings.of(tilt_series.images)
+        readings = PixelValues.of(tilt_series.images)
         found, saturated = readings.digitisation, readings.saturated
         simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
 
@@ -311,6 +316,9 @@ class JointReconstructor:
             )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
+        if not facts.simple_is_final:
+            # a noise model learnt at a weight that the data contradict would describe what that weight smooths away
+            part.weight = _first_weight(whole.field.width)
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
@@ -334,6 +342,7 @@ class JointReconstructor:
             models,
             candidates=candidates,
             least_signal=least_signal,
+            regularisers=[find_regulariser(name) for name in OTHERS] if self.regulariser is None else [],
             first_weight=_QUIET_FIRST if facts.quiet else _first_weight(tasks["whole"].signal_model.field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,

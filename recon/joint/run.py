@@ -13,26 +13,32 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.fitting.contest import mean_and_error
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
+from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
+from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
 from recon.joint.plan import FitStage
 from recon.joint.task import Task
-from recon.joint.weight import WeightChoice, choose_weight
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
 _BATCH = 4096  # pixels per noise-model step
-_WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _TABULATED = 0.05  # nats per pixel
+# Standard errors by which another regulariser must predict better: on most scenes, the difference is about one.
+_SIGNIFICANT = 3
+_BLOCK = 4  # pixels
 
 
 @dataclass(frozen=True)
-class _Tried:
+class _TriedModel:
     """A candidate and its held-out negative log-likelihood relative to the best, nats per pixel."""
 
     model: nn.Module
@@ -64,6 +70,7 @@ class Runner:
         models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_signal: the lowest signal that a noise model allows, detector units.
+        regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         first_weight: initial weight of the search.
         generator: source of the random choices.
         run_fit: runs every fit.
@@ -83,6 +90,7 @@ class Runner:
         *,
         candidates: MakeCandidates | None = None,
         least_signal: Callable[[nn.Module], float] | None = None,
+        regularisers: Sequence[Regulariser] = (),
         first_weight: float,
         generator: torch.Generator,
         run_fit: RunFit = run_fit,
@@ -92,6 +100,7 @@ class Runner:
     ) -> None:
         self.tasks, self.models = tasks, models
         self.candidates, self.least_signal = candidates, least_signal
+        self.regularisers = regularisers
         self.first_weight, self.generator, self.run_fit = first_weight, generator, run_fit
         self.prefix, self.progress = prefix, progress
         self.weight_choice: WeightChoice | None = None
@@ -108,8 +117,6 @@ class Runner:
             "finalists": self._finalists,
             "weights": self._weights,
         }
-        for where in {stage.where for stage in stages if stage.afresh}:
-            self.tasks[where].remember()  # needs as much memory as the field, so only if required
         for stage in stages:
             before = self._done
             carry_out[stage.kind](stage, self.tasks[stage.where])
@@ -117,8 +124,6 @@ class Runner:
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
-        if stage.afresh:
-            task.restart()
         with ExitStack() as stack:
             for _ in range(stage.halvings):
                 task = stack.enter_context(task.halved())
@@ -138,7 +143,7 @@ class Runner:
         """
         if self.candidates is None:
             raise ValueError("a plan that chooses a noise model needs candidates")
-        signal, tried = task.signal(), list[_Tried]()
+        signal, tried = task.signal(), list[_TriedModel]()
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
         if self.least_signal is not None:
             signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
@@ -149,10 +154,10 @@ class Runner:
             return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
 
         lowest = nll(richest)
-        tried.append(_Tried(richest, 0.0))
+        tried.append(_TriedModel(richest, 0.0))
         for place, model in enumerate(simpler):
             excess = nll(model) - lowest
-            tried.insert(place, _Tried(model, excess))
+            tried.insert(place, _TriedModel(model, excess))
             if excess <= _TOLERATED:
                 break
         chosen = _simplest(tried, task)
@@ -170,13 +175,13 @@ class Runner:
         """
         model, richest = task.signal_model, self.models["chosen"]
         start = copy.deepcopy(model.state_dict()) if self._simpler else {}
-        tried, fits = list[_Tried](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
+        tried, fits = list[_TriedModel](), dict[nn.Module, tuple[FitResult, dict[str, Tensor]]]()
         for number, noise_model in enumerate([richest, *self._simpler], 1):
             if tried:
                 model.load_state_dict(start)
             self.models["chosen"] = noise_model
             result = self._fit_signal(stage, task, stage.name if number == 1 else f"{stage.name} {number}")
-            tried.append(_Tried(noise_model, _last_nll(result)))
+            tried.append(_TriedModel(noise_model, result.last_nll))
             fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
         chosen = _simplest([*tried[1:], tried[0]], task).model
         self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
@@ -184,25 +189,48 @@ class Runner:
             model.load_state_dict(adapted)
 
     def _weights(self, stage: FitStage, task: Task) -> None:
-        """Compare weights by fits from the same state, so that they are independent of each other. The task is left in the most
-        likely state."""
+        """Compare weights by fits, each from the state of the nearest weight before: few steps then suffice. The task is left in
+        the most likely state."""
         model = task.signal_model
-        start = likeliest = copy.deepcopy(model.state_dict())
-        lowest = math.inf
+        states = dict[float, tuple[float, dict[str, Tensor]]]()
 
         def held_out_nll(weight: float) -> float:
-            nonlocal likeliest, lowest
-            model.load_state_dict(start)
+            if states:
+                nearest = min(states, key=lambda tried: abs(math.log(tried / weight)))
+                model.load_state_dict(states[nearest][1])
             model.weight = weight
-            nll = _last_nll(self._fit_signal(stage, task, f"{stage.name} {weight:.4g}"))
-            if nll < lowest:
-                lowest, likeliest = nll, copy.deepcopy(model.state_dict())
+            nll = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").last_nll
+            states[weight] = nll, copy.deepcopy(model.state_dict())
             return nll
 
         self.weight_choice = choose_weight(held_out_nll, self.first_weight)
-        model.load_state_dict(likeliest)
+        model.load_state_dict(min(states.values(), key=lambda tried: tried[0])[1])
+        model.weight = self.weight_choice.weight
+        self._priors(stage, task)
         for each in self.tasks.values():
-            each.signal_model.weight = self.weight_choice.weight
+            each.signal_model.weight, each.signal_model.regulariser = model.weight, model.regulariser
+
+    def _priors(self, stage: FitStage, task: Task) -> None:
+        """Compare the other regularisers with the usual one at its weight, and take one that predicts held-out pixels
+        significantly better. The task is left in that state.
+
+        On smooth blobs with 100 counts, the second order gains 2.7 dB; half the weight loses against the usual regulariser there.
+        """
+        model, noise_model = task.signal_model, self.models[stage.noise]
+        if needs_image(noise_model):
+            return
+        usual = _held_out(task, noise_model)
+        for regulariser in self.regularisers:
+            before, state = model.regulariser, copy.deepcopy(model.state_dict())
+            model.regulariser = regulariser
+            self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
+            found = _held_out(task, noise_model)
+            gain, error = mean_and_error(found - usual, _blocks(task))
+            if gain > _SIGNIFICANT * error:
+                usual = found
+            else:
+                model.load_state_dict(state)
+                model.regulariser = before
 
     def _fit_signal(self, stage: FitStage, task: Task, name: str) -> FitResult:
         """Fit volume and response with a fixed noise model."""
@@ -218,8 +246,8 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
-                parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
-                warm_up=_WARM_UP if stage.warm_up else 0.0,
+                parameter_groups=model.parameter_groups(hold_response=stage.hold_offset),
+                optimiser=model.optimiser,
                 tables=task.tables(noise_model),
             )
         finally:
@@ -251,7 +279,7 @@ class Runner:
         return result
 
 
-def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
+def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     """The simplest model that predicts held-out pixels nearly as well as the best."""
     best = min(each.excess for each in tried)
     judged = [replace(each, excess=each.excess - best) for each in tried]
@@ -259,10 +287,22 @@ def _simplest(tried: Sequence[_Tried], task: Task) -> _Tried:
     return tried[judged.index(found)]
 
 
-def _last_nll(result: FitResult) -> float:
-    """Held-out NLL after the last step, nats per pixel; infinite if it is NaN."""
-    nll = list(result.history.values())[-1]
-    return nll if math.isfinite(nll) else math.inf
+@torch.no_grad()
+def _held_out(task: Task, noise_model: nn.Module) -> Tensor:
+    """Log-likelihoods of the held-out pixels, (P,)."""
+    judged = _judged(task)
+    log_prob: Tensor = noise_model(task.signal()[judged]).log_prob(task.observation[judged])
+    return log_prob.double()
+
+
+def _judged(task: Task) -> Tensor:
+    return task.held_out if task.use is None else task.held_out & task.use
+
+
+def _blocks(task: Task) -> Tensor:
+    """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
+    tilt, u, y = torch.nonzero(_judged(task), as_tuple=True)
+    return (tilt * task.observation.shape[1] + u // _BLOCK) * task.observation.shape[2] + y // _BLOCK
 
 
 @torch.no_grad()

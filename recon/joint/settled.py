@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from noiseflow import FitResult
+from noiseflow.fitting.result import WeightChoice
+from recon.fields.regularisers.base import Regulariser
 from recon.joint.coarse_start import Start
 from recon.joint.plan import Facts, FitStage
 from recon.joint.run import Runner
 from recon.joint.signal_model import TomographySignal
-from recon.joint.weight import WeightChoice
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class Settled:
     Attributes:
         simple: simple noise model of the first fits.
         noise_model: the chosen noise model.
-        weight: weight of the regulariser.
+        regulariser: the regulariser.
+        weight: its weight.
         weight_choice: the evidence for the weight, if it was chosen.
         response: state of the image formation.
         scale: scale of the field.
@@ -34,6 +36,7 @@ class Settled:
 
     simple: nn.Module
     noise_model: nn.Module
+    regulariser: Regulariser
     weight: float
     weight_choice: WeightChoice | None
     response: dict[str, Tensor]
@@ -86,6 +89,7 @@ class PlannedRun:
         return Settled(
             simple=self.runner.models["simple"],
             noise_model=self.noise_model,
+            regulariser=model.regulariser,
             weight=model.weight,
             weight_choice=self.weight_choice,
             response=copy.deepcopy(model.image_formation.state_dict()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 from noiseflow.fitting.observation_table import TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
-from recon.series.views import Directions
+from recon.series.holdout import Holdout
 
 
 @dataclass
@@ -36,23 +35,6 @@ class Task:
     use: Tensor | None
     held_out: Tensor
     _tables: dict[nn.Module, TableKeeper] = field(default_factory=dict)
-    _rough: dict[str, Any] | None = None
-
-    def remember(self) -> None:
-        """Store the current volume for `restart`."""
-        self._rough = copy.deepcopy(self.signal_model.state_dict())
-
-    def restart(self) -> None:
-        """Restore the stored volume; the detector response is not changed.
-
-        Raises:
-            ValueError: no volume was stored.
-        """
-        if self._rough is None:
-            raise ValueError("there is no stored volume to restore; call remember() first")
-        response = copy.deepcopy(self.signal_model.image_formation.state_dict())
-        self.signal_model.load_state_dict(self._rough)
-        self.signal_model.image_formation.load_state_dict(response)
 
     def tables(self, noise_model: nn.Module) -> TableKeeper:
         """The table of the pixels under a noise model, stored until `forget`."""
@@ -77,15 +59,9 @@ class Task:
 
 
 def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
-    """Mask of pixels (tilt, u, y) to hold out: two contiguous gaps of tilts, a third of the range apart, each at least a tenth of
-    the range and three tilts wide. Single tilts would be predicted by their neighbours."""
-    directions = Directions.of(tilt_angles)
-    held_out = torch.zeros_like(like)
-    for part in (1 / 3, 2 / 3):
-        distance = np.abs(directions.angles - directions.angles.min() - part * directions.span)
-        near = distance <= max(directions.span / 20, float(np.sort(distance)[min(2, len(distance) - 1)]))
-        held_out[torch.from_numpy(near).to(like.device)] = True
-    return held_out
+    """Mask of pixels (tilt, u, y) to hold out: two gaps of tilts. Single tilts would be predicted by their neighbours."""
+    out = torch.from_numpy(Holdout.two_gaps(tilt_angles).groups > 0).to(like.device)
+    return out[:, None, None].expand(like.shape).clone()
 
 
 def noise_share(images: NDArray[Any]) -> float:

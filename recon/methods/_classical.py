@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import RunStage, run_stage
+from recon.methods._registry import Method, Settings
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
@@ -21,12 +22,15 @@ from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, Blockwise, Images
 from recon.series.first_guess import contrast_slab, estimate_response
 from recon.series.holdout import Holdout
+from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import level_of, view_numbers, without_level
 
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
-_ITERATIONS = (1, 2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256)
+_ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 _SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
+# iterations of the volume whose projections fill masked pixels: as many as for a first guess of a fit
+_FILLING = 30
 
 
 @dataclass(frozen=True)
@@ -38,22 +42,41 @@ class LineIntegralProblem:
         projector: the operator.
         response: converts line integrals to pixel values above `level`.
         level: constant level of linear images, detector units; separate to preserve float32 precision.
+        used: (tilt, y, u), 1 for rays to use and 0 for others; None for all.
     """
 
     line_integrals: Tensor
     projector: Projector
     response: Transmission | Linear
     level: float = 0.0
+    used: Tensor | None = None
 
     @classmethod
     def of(cls, tilt_series: TiltSeries, grid: VolumeGrid, device: torch.device | str = "cpu") -> LineIntegralProblem:
         """The problem of reconstructing `tilt_series` on `grid`."""
         tilt_series, level = without_level(tilt_series)
         response = estimate_response(tilt_series).to(device)
-        projector = projector_of(tilt_series, grid, device)
-        images = torch.from_numpy(tilt_series.images).to(device)
+        return cls.seen_by(response, projector_of(tilt_series, grid, device), tilt_series, level)
+
+    @classmethod
+    def seen_by(
+        cls, response: Transmission | Linear, projector: Projector, tilt_series: TiltSeries, level: float
+    ) -> LineIntegralProblem:
+        """The problem of images in float32 above `level`, for a known response and operator."""
+        images, used = torch.from_numpy(tilt_series.images).to(projector.device), weights_of_rays(tilt_series)
         with torch.no_grad():
-            return cls(response.invert(images).contiguous(), projector, response, level)
+            lines = response.invert(images).contiguous()
+        return cls(lines, projector, response, level, None if used is None else torch.from_numpy(used).to(lines))
+
+    def sirt(self, num_iterations: int, start: Tensor | None = None) -> Tensor:
+        """The volume after some iterations of SIRT on the used rays."""
+        return sirt(self.line_integrals, self.projector, num_iterations=num_iterations, start=start, used=self.used)
+
+    def filled(self) -> Tensor:
+        """Line integrals for methods that need all rays: those of masked pixels are projections of a volume of the others."""
+        if self.used is None:
+            return self.line_integrals
+        return torch.where(self.used > 0, self.line_integrals, self.projector(self.sirt(_FILLING)))
 
     def predict(self, volume: Tensor) -> NDArray[np.float32]:
         """The images (tilt, y, u) that a volume (z, y, x) predicts, detector units."""
@@ -62,38 +85,44 @@ class LineIntegralProblem:
             return np.asarray(images.contiguous().cpu().numpy() + np.float32(self.level))
 
 
-def classical(
-    name: str, problem: LineIntegralProblem, volume: Tensor, grid: VolumeGrid, choices: dict[str, float | str]
-) -> Reconstruction:
-    """The result of a method without a fitted noise model."""
-    result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
-    return Reconstruction(result, problem.predict(volume), name, choices=choices)
+Solve = Callable[[LineIntegralProblem, RunStage | None], Tensor]
+Settle = Callable[[TiltSeries, VolumeGrid, Settings], tuple[Solve, dict[str, float | str]]]
 
 
-def in_blocks(
-    name: str,
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    device: torch.device | str,
-    solve_problem: Callable[[LineIntegralProblem], Tensor],
-    choices: dict[str, float | str],
-) -> Blockwise:
-    """Block-wise reconstruction by a method with independent slices, with the response of the whole series."""
-    level = level_of(tilt_series)
-    response = estimate_response(tilt_series, level=level).to(device)
-    projector = projector_of(tilt_series, grid, device)
+def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str, ...]) -> Method:
+    """A method with independent slices and without a fitted noise model.
 
-    def solve(part: TiltSeries, block: Block) -> tuple[Images, Images]:
-        lowered = np.asarray(part.images - np.float64(level), dtype=np.float32)
-        images = torch.from_numpy(lowered).to(device)
-        problem = LineIntegralProblem(response.invert(images).contiguous().detach(), projector, response, level)
-        volume = solve_problem(problem)
-        return volume.cpu().numpy(), problem.predict(volume)
+    Args:
+        name, description, refuses: as for `Method`.
+        settle: makes the choices for a series; returns how to solve a problem, with stages or at once, and the choices.
+    """
 
-    def finish(volume: Volume, projections: Images) -> Reconstruction:
-        return Reconstruction(volume, projections, name, choices=choices)
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        solve, choices = settle(tilt_series, grid, settings)
+        problem = LineIntegralProblem.of(tilt_series, grid, settings.device)
+        volume = solve(problem, settings.run_stage)
+        result = Volume(volume.contiguous().cpu().numpy(), grid.voxel_size)
+        return Reconstruction(result, problem.predict(volume), name, choices=choices)
 
-    return Blockwise(solve, finish)
+    def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
+        """All blocks have the response of the whole series."""
+        solve, choices = settle(tilt_series, grid, settings)
+        level = level_of(tilt_series)
+        response = estimate_response(tilt_series, level=level).to(settings.device)
+        projector = projector_of(tilt_series, grid, settings.device)
+
+        def solve_block(part: TiltSeries, block: Block) -> tuple[Images, Images]:
+            lowered = part.with_images(np.asarray(part.images - np.float64(level), dtype=np.float32), part.mask)
+            problem = LineIntegralProblem.seen_by(response, projector, lowered, level)
+            volume = solve(problem, None)
+            return volume.cpu().numpy(), problem.predict(volume)
+
+        def finish(volume: Volume, projections: Images) -> Reconstruction:
+            return Reconstruction(volume, projections, name, choices=choices)
+
+        return Blockwise(solve_block, finish)
+
+    return Method(name, description, run, refuses=refuses, blockwise=blockwise)
 
 
 def best_window(
@@ -103,8 +132,9 @@ def best_window(
     if _num_views(tilt_series) < _FEWEST:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
+    lines = rest.filled()
     tried = {
-        (window, cutoff): score(wbp(rest.line_integrals, rest.projector, window=window, cutoff=cutoff))
+        (window, cutoff): score(wbp(lines, rest.projector, window=window, cutoff=cutoff))
         for window in windows
         for cutoff in _CUTOFFS
     }
@@ -140,8 +170,7 @@ class _IterationChoice:
     def step(self) -> str:
         """Try the next number."""
         count, before = _ITERATIONS[self.done], max(self.tried, default=0)
-        lines = self.rest.line_integrals
-        self.volume = sirt(lines, self.rest.projector, num_iterations=count - before, start=self.volume)
+        self.volume = self.rest.sirt(count - before, self.volume)
         self.tried[count] = self.score(self.volume)
         self.done += 1
         if len([number for number in self.tried if number > self.best]) >= _PATIENCE:
@@ -174,11 +203,11 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
     left = part_of(tilt_series, out, rows)
     judge = projector_of(left, slab)
-    measured = left.images.astype(np.float64).ravel()
+    measured = used_values(left).astype(np.float64)
     unseen = replace(rest, projector=judge, response=estimate_response(left))
 
     def score(volume: Tensor) -> float:
-        predicted = unseen.predict(volume).astype(np.float64).ravel()
+        predicted = used_values(left, unseen.predict(volume)).astype(np.float64)
         return float(np.corrcoef(predicted, measured)[0, 1]) if min(np.ptp(predicted), np.ptp(measured)) > 0 else -1.0
 
     return rest, score

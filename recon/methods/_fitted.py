@@ -14,17 +14,17 @@ from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.at_level import at_level
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
-from recon.fields._names import AUTO
 from recon.fields._registry import field_kinds
-from recon.fields.regularisers._registry import find_regulariser
+from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
-from recon.joint.joint import JointReconstructor
+from recon.joint.joint import OTHERS, JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.run import run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
+from recon.names import AUTO
 from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
@@ -219,8 +219,9 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
-    if settings.regulariser is not None:
-        choices["regulariser"] = settings.regulariser
+    chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
+    if settings.regulariser is not None or chosen:
+        choices["regulariser"] = settings.regulariser or chosen[0]
     return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
 
 
@@ -237,5 +238,6 @@ def _describe(noise_model: nn.Module) -> str:
         return _describe(noise_model.model)
     if not isinstance(noise_model, Digitised):
         return type(noise_model).__name__
-    found = Digitisation(noise_model.step, noise_model.low, noise_model.high, noise_model.origin)
+    limits = (noise_model.low, noise_model.high, noise_model.origin)
+    found = Digitisation(noise_model.step, *limits, tuple(noise_model.levels.tolist()))
     return f"{_describe(noise_model.model)}, {found.in_words()}"

@@ -76,7 +76,7 @@ def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
 
 
 @dataclass(frozen=True)
-class Line:
+class LinearMap:
     """The linear map (values − centre)·gain + level."""
 
     centre: float
@@ -88,13 +88,13 @@ class Line:
         return values if changes_nothing else np.asarray((values - self.centre) * self.gain + self.level)
 
 
-def matching_line(result: Array, reference: Array, scaling: Scaling) -> Line:
+def matching_line(result: Array, reference: Array, scaling: Scaling) -> LinearMap:
     """The linear map from a result to the scale of its reference; volumes are processed section by section."""
     if scaling == "raw":
-        return Line(0.0, 1.0, 0.0)
+        return LinearMap(0.0, 1.0, 0.0)
     if scaling == "min-max":
         (low, high), (least, most) = ((float(a.min()), float(a.max())) for a in (result, reference))
-        return Line(low, (most - least) / (high - low) if high > low else 0.0, least)
+        return LinearMap(low, (most - least) / (high - low) if high > low else 0.0, least)
     if scaling != "affine":
         raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
     means = [sum(float(part.sum(dtype=np.float64)) for part in a) / a.size for a in (result, reference)]
@@ -103,7 +103,7 @@ def matching_line(result: Array, reference: Array, scaling: Scaling) -> Line:
         centred = one - means[0]
         power += float(np.sum(centred**2))
         product += float(np.sum(centred * (other - means[1])))
-    return Line(means[0], product / power if power > 0 else 0.0, means[1])
+    return LinearMap(means[0], product / power if power > 0 else 0.0, means[1])
 
 
 def _sections(*arrays: Array) -> Iterator[tuple[Array, ...]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow import io
-from recon.fields._names import DEFAULT, field_names
+from recon.names import FIELDS, field_names
 from recon.napari.files import LayerData, axes_of, error_bar_layer
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def reconstruct_layers(
     angles: Path | None = None,
     mode: str = "transmission",
     method: str = "auto",
-    field: str = DEFAULT,
+    field: str = FIELDS.first,
     thickness: int = 0,
     num_steps: int = _STEPS,
     invert_tilt: bool = False,
@@ -72,7 +72,7 @@ def reconstruct_layers(
     series = prepare(series).tilt_series
     grid = VolumeGrid.of(series, thickness or None)
     options: dict[str, Any] = {"num_steps": num_steps or None, "uncertainty": uncertainty, "progress": progress}
-    options["field"] = None if field == DEFAULT else field
+    options["field"] = None if field == FIELDS.first else field
     outcome = reconstruct(series, grid, method=method, **options)
     voxel_size = None if pixel_size is None else (pixel_size,) * 3
     result = {} if voxel_size is None else {"voxel_size": voxel_size}
@@ -99,7 +99,7 @@ def reconstruct_widget() -> Any:
         angles: Path | None = None,
         mode: str = "transmission",
         method: str = "auto",
-        field: str = DEFAULT,
+        field: str = FIELDS.first,
         thickness: int = 0,
         num_steps: int = _STEPS,
         invert_tilt: bool = False,

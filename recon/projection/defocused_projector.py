@@ -1,18 +1,15 @@
-"""Blur of a convergent beam: by depth, exact layer by layer or by jittered rays, or by the distance from the tilt axis."""
+"""Blur of a convergent beam: by depth, exact layer by layer, or by the distance from the tilt axis."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector
 from recon.projection.projector import SliceProjector
-from recon.projection.rays import march, view_matrices, view_rays
 
 _SUBPIXEL = 0.25
 _MOST_LAYERS = 12
@@ -165,38 +162,6 @@ def _blurred(images: Tensor, blur: float) -> Tensor:
 def _require_convergence(convergence: float) -> None:
     if not 0 <= convergence < math.inf:
         raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
-
-
-def jittered_projection(
-    volume: Tensor,
-    tilt_angles: Sequence[float] | NDArray[np.floating],
-    convergence: float,
-    *,
-    num_rays: int,
-    generator: torch.Generator,
-) -> Tensor:
-    """The same images by Monte Carlo: the mean over rays with random slopes through each pixel's position in the focal plane.
-
-    The standard error decreases with the square root of the number of rays; one ray per pixel and step suffices for stochastic
-    gradients.
-
-    Args:
-        volume: (z, y, x) attenuation per voxel.
-        tilt_angles: (tilts,) degrees.
-        convergence: as for `DefocusedProjector`.
-        num_rays: number of rays through every pixel.
-        generator: source of the slopes.
-
-    Returns:
-        (tilt, y, u) line integrals.
-    """
-    views = view_matrices(tilt_angles)
-    _, height, width = volume.shape
-    total = volume.new_zeros(len(views), height, width)
-    for _ in range(num_rays):
-        slopes = convergence * torch.randn(*total.shape, 2, generator=generator, dtype=torch.float64)
-        total = total + march(volume, *view_rays(views, height=height, width=width, spread=slopes))
-    return total / num_rays
 
 
 def _reach(deviation: float) -> int:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from recon.projection.base import Projector
 from recon.projection.defocused_projector import with_defocus
+from recon.projection.gradients import linear
 from recon.projection.projector import SliceProjector
 from recon.projection.sparse import PanelledMatrix
 
@@ -91,13 +92,14 @@ class DualAxisProjector(Projector):
 
     def project(self, columns: Tensor) -> Tensor:
         """(depth * width, height) -> line integrals (tilts * width, height), differentiable."""
-        result: Tensor = _Product.apply(columns, self, False)  # type: ignore[no-untyped-call]
-        return result
+        return linear(columns, self._times)
 
     def backproject(self, rays: Tensor) -> Tensor:
         """The adjoint of `project`."""
-        result: Tensor = _Product.apply(rays, self, True)  # type: ignore[no-untyped-call]
-        return result
+        return linear(rays, self._times, transposed=True)
+
+    def _times(self, dense: Tensor, transposed: bool) -> Tensor:
+        return self._backward(dense) if transposed else self._forward(dense)
 
     def _forward(self, columns: Tensor) -> Tensor:
         size = (-1, self.width, self.height)
@@ -118,18 +120,6 @@ class DualAxisProjector(Projector):
         if self._back is not None:
             layers = (self._back @ layers.reshape(self.depth, -1).T.contiguous()).T.reshape(layers.shape)
         return columns + layers.reshape(columns.shape)
-
-
-class _Product(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, dense: Tensor, projector: DualAxisProjector, transposed: bool) -> Tensor:
-        ctx.of = projector, transposed
-        return projector._backward(dense) if transposed else projector._forward(dense)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        projector, transposed = ctx.of
-        return _Product.apply(gradient, projector, not transposed), None, None  # type: ignore[no-untyped-call]
 
 
 def projector_of(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector, from_columns, from_rays, to_columns, to_rays
+from recon.projection.gradients import linear
 from recon.projection.sparse import PanelledMatrix, panelled_by_groups
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
@@ -128,13 +129,14 @@ class SliceProjector(Projector):
 
     def project(self, columns: Tensor) -> Tensor:
         """Native layout without copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
-        result: Tensor = _Product.apply(columns, self, False)  # type: ignore[no-untyped-call]
-        return result
+        return linear(columns, self._times)
 
     def backproject(self, rays: Tensor) -> Tensor:
         """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
-        result: Tensor = _Product.apply(rays, self, True)  # type: ignore[no-untyped-call]
-        return result
+        return linear(rays, self._times, transposed=True)
+
+    def _times(self, dense: Tensor, transposed: bool) -> Tensor:
+        return (self.transposed if transposed else self.matrix) @ dense
 
     def layers(self, layer_of: Callable[[NDArray[np.float64]], NDArray[np.int64]]) -> list[SliceProjector]:
         """Operators of layers perpendicular to the beam, whose sum is this operator.
@@ -178,20 +180,6 @@ class SliceProjector(Projector):
                 device=self.device,
             )
         return self._halves[key]
-
-
-class _Product(torch.autograd.Function):
-    """Sparse times dense product; its gradient is the product with the transpose, and vice versa."""
-
-    @staticmethod
-    def forward(ctx: Any, dense: Tensor, projector: SliceProjector, transposed: bool) -> Tensor:
-        ctx.of = projector, transposed
-        return (projector.transposed if transposed else projector.matrix) @ dense
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        projector, transposed = ctx.of
-        return _Product.apply(gradient, projector, not transposed), None, None  # type: ignore[no-untyped-call]
 
 
 def joseph(

@@ -15,8 +15,7 @@ from torch import Tensor
 from recon.fields.upsampling import upsampling_matrix
 from recon.projection.base import Projector
 from recon.projection.sparse import csr_tensor
-from recon.projection.tile import Tile, neighbours_of
-from recon.projection.tile_variation import TileVariation
+from recon.projection.tile import Tile, TileVariation, neighbours_of
 
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
@@ -102,7 +101,7 @@ class Tiles:
 
     def upsampled(self, grid: Tensor) -> Tensor:
         """The list (N,) of a grid (z, x, y) with half the resolution, interpolated as in `recon.fields.upsampling`."""
-        values: Tensor = _Upsampling.apply(grid, self)  # type: ignore[no-untyped-call]
+        values: Tensor = _UpsampledTiles.apply(grid, self)  # type: ignore[no-untyped-call]
         return values
 
     def upsampling(self, size: tuple[int, ...]) -> list[_TileUpsampling]:
@@ -202,7 +201,7 @@ class _Spreading(torch.autograd.Function):
         return ctx.tiles.gathered(gradient), None
 
 
-class _Upsampling(torch.autograd.Function):
+class _UpsampledTiles(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Tensor, tiles: Tiles) -> Tensor:
         ctx.tiles, ctx.size = tiles, tuple(grid.shape)

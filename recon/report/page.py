@@ -11,16 +11,17 @@ import torch
 
 from noiseflow import io
 from noiseflow.arrays import strided
-from noiseflow.checks import Finding, Guard, Verdict
+from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
+from recon.report.methods import methods_paragraph
 from recon.report.noise import noise_charts
 from recon.report.uncertainty import add_error_bars
-from recon.report.verdict import add_verdict
+from recon.report.verdict import add_differences, add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -47,7 +48,7 @@ def reconstruction_report(
     seed: int | None = None,
     halves: tuple[Volume, Volume] | None = None,
     reference: Volume | None = None,
-    verdict: Verdict[Finding] | None = None,
+    verdict: Verdict | None = None,
     guard: Guard | None = None,
 ) -> Report:
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
@@ -70,21 +71,23 @@ def reconstruction_report(
         "volume": lambda: _add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
         "error bars": lambda: _add_uncertainty(report, tilt_series, outcome),
         "tilt series": lambda: _add_tilts(report, tilt_series, outcome),
+        "differences of each image": lambda: add_differences(report, tilt_series, outcome),
         "beam and detector": lambda: _add_response(report, tilt_series, outcome),
         "noise": lambda: _add_noise(report, tilt_series, outcome),
         "convergence": lambda: _add_course(report, outcome),
         "resolution": lambda: _add_resolution(report, outcome.volume, halves, reference),
         "settings": lambda: _add_settings(report, tilt_series, outcome),
+        "methods": lambda: _add_methods(report, tilt_series, outcome, verdict),
     }
     if (told := verdict) is not None:
-        guard("report: verdict", lambda: add_verdict(report, told, tilt_series, outcome), otherwise=None)
+        guard("report: verdict", lambda: add_verdict(report, told), otherwise=None)
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
     left_out = guard.in_words()
     if left_out is not None:
         report.text(f"{left_out[0].upper()}{left_out[1:]}.")
-    report.heading("Provenance")
+    report.heading("Provenance", folded=True)
     report.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
     return report
 
@@ -97,8 +100,13 @@ def _add_uncertainty(report: Report, tilt_series: TiltSeries, outcome: Reconstru
 
 
 def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
-    report.heading("Settings and choices")
-    report.table(("setting", "value", "evidence"), settings(tilt_series, outcome), prose=True)
+    report.heading("Settings and choices", folded=True)
+    report.table(("setting", "value", "evidence"), settings(outcome), prose=True)
+
+
+def _add_methods(report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None) -> None:
+    report.heading("Methods, to paste into a paper", folded=True)
+    report.text(methods_paragraph(tilt_series, outcome, verdict))
 
 
 def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
@@ -126,7 +134,7 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
     return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
 
 
-def settings(tilt_series: TiltSeries, outcome: Reconstruction) -> list[tuple[str, str, str]]:
+def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [
@@ -222,7 +230,7 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
             )
             charts.append(figure)
     if charts:
-        report.heading("Beam and detector")
+        report.heading("Beam and detector", folded=True)
         report.charts(charts, caption="Estimated from the images, then refined in the fit.")
 
 
@@ -233,7 +241,7 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
         strided(stack, _PREVIEW).astype(np.float32) for stack in (tilt_series.images, outcome.projections)
     )
     use = slice(None) if tilt_series.mask is None else strided(tilt_series.mask, _PREVIEW)
-    report.heading("Noise")
+    report.heading("Noise", folded=True)
     caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
     device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
@@ -274,7 +282,7 @@ def _add_course(report: Report, outcome: Reconstruction) -> None:
         axis.axvline(float(outcome.choices["weight"]), color=COLOURS["warm"], linewidth=1.5)
         charts.append(figure)
     if charts:
-        report.heading("Convergence")
+        report.heading("Convergence", folded=True)
         report.charts(charts, caption="Negative log-likelihood of held-out pixels; lower is better.")
 
 

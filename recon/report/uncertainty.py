@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from noiseflow.report.charts import COLOURS, new_chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.unseen import in_words
+from recon.uncertainty.unseen import in_words, unseen_part
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +27,9 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
     report.text(in_words(tilt_series.tilt_angles))
+    unseen = Volume(unseen_part(volume.attenuation, tilt_series.tilt_angles), volume.voxel_size)
+    words = f"The part of the volume along these directions, {unit}, which rests on the regulariser alone."
+    report.figure(unseen_figure(unseen, unit), caption=words)
     if bars.shells is not None:
         _add_shells(report, bars.shells, volume.voxel_size)
 
@@ -61,6 +64,17 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
             axis.set_ylabel(f"{down}, {length}", fontsize=8)
             axis.tick_params(labelsize=7)
     figure.colorbar(drawn, ax=list(axes[:, 1:].ravel()), shrink=0.8, label=unit)
+    return figure
+
+
+def unseen_figure(unseen: Volume, unit: str) -> Figure:
+    """Middle slices (z, x) and (y, x) of the part of a volume that no tilt has seen."""
+    figure, axes = new_figure(1, 2, width=7, height=2.8)
+    reach = float(np.percentile(np.abs(unseen.attenuation), _REACH)) or 1.0
+    for axis, name, pick in zip(axes.ravel(), ("across y", "across z"), (_across_y, _across_z), strict=True):
+        drawn = axis.imshow(pick(unseen.attenuation), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
+        axis.set(title=f"unseen part, slice {name}", xlabel="x, voxels", ylabel=f"{'zy'[name == 'across z']}, voxels")
+    figure.colorbar(drawn, ax=list(axes.ravel()), shrink=0.8, label=unit)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""The verdict at the top of a report: grade, reasons and charts."""
+"""The verdict at the top of a report: grade, reasons and effects; and the differences that it is made of."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import Finding, Verdict
+from noiseflow.checks import Verdict
 from noiseflow.report import COLOURS, Report, add_legend, new_chart
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
@@ -22,26 +22,37 @@ _WORDS = {
 
 # tolerances: larger effects are drawn here
 _MOST = 4.0
+_SHOWN = 12
 _EFFECTS = (
-    "Each check with two standard errors. Right of the dashed line an effect exceeds its tolerance; it gives a reason if it is "
-    "also significant."
+    "The {shown} largest of {all} effects, with two standard errors. Right of the dashed line an effect exceeds its tolerance; "
+    "it gives a reason if it is also significant."
 )
 
 
-def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeries, result: Result) -> None:
-    """Add heading, grade, reasons and charts of a verdict to a report.
+def add_verdict(report: Report, verdict: Verdict) -> None:
+    """Add heading, grade, reasons and effects of a verdict to a report.
 
     Args:
         report: the page.
         verdict: the verdict.
-        tilt_series: the data.
-        result: the reconstruction, whose projections are compared with the data.
     """
     report.heading("Verdict")
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
-    report.figure(effects_chart(verdict), caption=_EFFECTS)
+    count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())
+    report.charts([effects_chart(verdict)], caption=_EFFECTS.format(shown=min(count, _SHOWN), all=count))
+
+
+def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
+    """Add a folded section with the differences of each image from the projection of the volume.
+
+    Args:
+        report: the page.
+        tilt_series: the data.
+        result: the reconstruction, whose projections are compared with the data.
+    """
+    report.heading("Differences of each image", folded=True)
     residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)
     angles = residuals.tilt_angles
@@ -59,15 +70,21 @@ def add_verdict(report: Report, verdict: Verdict[Finding], tilt_series: TiltSeri
     report.charts(charts, caption=caption)
 
 
-def effects_chart(verdict: Verdict[Any]) -> Any:
-    """All effects of a verdict with two standard errors, in their tolerances."""
-    effects = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
-    figure, axis = new_chart("Effects and their tolerances", x="size of the effect, tolerances", y="")
-    figure.set_size_inches(7, 0.16 * len(effects) + 0.8)
-    places = np.arange(len(effects))[::-1]
-    sizes, errors = (
-        np.array([abs(each[part]) / each["tolerance"] for _, each in effects]) for part in ("value", "error")
+def _size(effect: dict[str, Any]) -> float:
+    """The size of an effect in tolerances."""
+    return float(abs(effect["value"]) / effect["tolerance"])
+
+
+def effects_chart(verdict: Verdict) -> Any:
+    """The largest effects of a verdict with two standard errors, in their tolerances."""
+    every = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
+    effects = sorted(every, key=lambda pair: -_size(pair[1]))[:_SHOWN]
+    figure, axis = new_chart(
+        "Effects and their tolerances", x="size of the effect, tolerances", y="", width=5.6, height=3.2
     )
+    places = np.arange(len(effects))[::-1]
+    sizes = np.array([_size(each) for _, each in effects])
+    errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
     fired = np.array([each["cost"] >= 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
         axis.errorbar(
@@ -75,6 +92,7 @@ def effects_chart(verdict: Verdict[Any]) -> Any:
             places[which],
             xerr=np.minimum(2 * errors, _MOST)[which],
             fmt="o",
+            markersize=4,
             color=colour,
         )
     axis.axvline(1, color=COLOURS["warm"], linewidth=1, linestyle="--")

@@ -7,6 +7,7 @@ import csv
 import ctypes
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,12 +24,11 @@ from noiseflow.runs.ownership import signature
 from recon.scale.cluster import all_threads_of_worker, usable_cores
 
 Row = dict[str, Any]
-COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "seconds")
+COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "options", "seconds")
 """First columns of the table of results, followed by the values of `noiseflow reconstruct`."""
 _NOT_OPTIONS = ("tilts", "out")
 _PARENT_DEATH_SIGNAL = 1  # of prctl(2)
 _OUTPUT = ("-o", "--out", "--output")
-_JSON_START = '{\n "written_by": "noiseflow'
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class Job:
     def command(self) -> list[str]:
         """The command that reconstructs the series."""
         return ["reconstruct", str(self.tilts), "-o", str(self.out), *self.words]
+
+    @property
+    def options(self) -> str:
+        """The options that determine the volume."""
+        return shlex.join(word for word in self.words if word not in ("--resume", "--overwrite"))
 
 
 def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
@@ -147,21 +152,11 @@ def read_table(path: Path) -> list[Row]:
     return _rows(path)
 
 
-def require_own_table(path: Path, *, overwrite: bool) -> None:
-    """Check that a table does not replace a file that `write_table` did not write.
-
-    Raises:
-        FileExistsError: it would replace such a file.
-    """
-    if overwrite or not path.exists() or path.stat().st_size == 0:
-        return
-    with path.open("rb") as stream:
-        head = stream.read(200)
-    # CSV has no room for a mark; our files are recognised by their columns
-    if not head.startswith((_JSON_START.encode(), ",".join(COLUMNS).encode()[:200])):
-        raise FileExistsError(
-            f"{path} exists and was not written by noiseflow; name another --table, or replace it with --overwrite"
-        )
+def finished(rows: Sequence[Row], jobs: Sequence[Job]) -> list[Row]:
+    """The rows of volumes that exist and, if they are still to be made, were made with the same options."""
+    options = {str(job.out): job.options for job in jobs}
+    done = (row for row in rows if row["status"] == "done" and Path(row["volume"]).exists())
+    return [row for row in done if options.get(row["volume"], row.get("options")) == row.get("options")]
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
@@ -281,7 +276,7 @@ def _ending_with_this() -> Callable[[], None] | None:
 
 
 def _row(job: Job, answer: Row | None, last: str) -> Row:
-    row: Row = {"series": str(job.tilts), "volume": str(job.out)}
+    row: Row = {"series": str(job.tilts), "volume": str(job.out), "options": job.options}
     if answer is None:
         return row | {"status": "failed", "error": last}
     verdict = answer["verdict"]

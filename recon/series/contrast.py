@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
@@ -21,6 +22,10 @@ _COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
 # times the contrast, and by 0.003 in one series with shifted images.
 _MARGIN = 0.05
 _BRIGHTER = 1.5
+# Where neither is explained better, as in raw images whose shifts are not known: the place of the median in the range of the
+# values, below which most pixels are background. That of symmetric noise is 0.5.
+_DARK = 0.3
+_SAMPLE = 128
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
@@ -55,11 +60,23 @@ def check_contrast(tilt_series: TiltSeries) -> None:
 
 def likely_mode(tilt_series: TiltSeries) -> Mode | None:
     """``linear`` if a coarse non-negative volume on a dark background explains the images better than their inverse,
-    ``transmission`` if it is the other way round, None if they are explained alike. Both shares are those of the linear model,
-    whose volume follows noise alike in both."""
+    ``transmission`` if it is the other way round; if they are explained alike, the median of the values decides, or nothing
+    (None).
+
+    Both shares are those of the linear model, whose volume follows noise alike in both. Counts that are zero in most pixels have
+    a dark background.
+    """
+    images, used = strided(tilt_series.images, _SAMPLE), strided(tilt_series.used, _SAMPLE)
+    values = images[used]
+    if (values == values.min()).mean() > 0.5:
+        return "linear"
     series = replace(coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH), mode="linear")
     dark, bright = explained(series), explained(invert_contrast(series))
-    return None if abs(dark - bright) <= _MARGIN else "linear" if dark > bright else "transmission"
+    if abs(dark - bright) > _MARGIN:
+        return "linear" if dark > bright else "transmission"
+    low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
+    place = (usual - low) / max(high - low, 1e-30)
+    return "linear" if place < _DARK else "transmission" if place > 1 - _DARK else None
 
 
 def explained(tilt_series: TiltSeries) -> float:

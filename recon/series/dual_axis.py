@@ -65,7 +65,14 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
     axes = np.r_[np.zeros(first.num_tilts), np.full(second.num_tilts, axis)]
     angles = np.r_[first.tilt_angles, second.tilt_angles]
     return TiltSeries(
-        both(first.images, second.images), angles, first.pixel_size, first.mode, mask=mask, beam=beam, axes=axes
+        both(first.images, second.images),
+        angles,
+        first.pixel_size,
+        first.mode,
+        mask=mask,
+        beam=beam,
+        axes=axes,
+        x_tilt=first.x_tilt,
     )
 
 

@@ -61,3 +61,13 @@ def used_values(tilt_series: TiltSeries, images: NDArray[Any] | None = None) -> 
     """The used pixels of the images, or of other arrays of their shape, in one dimension."""
     images = tilt_series.images if images is None else images
     return images.reshape(-1) if tilt_series.mask is None else images[tilt_series.mask]
+
+
+def weights_of_rays(tilt_series: TiltSeries) -> NDArray[np.bool_] | None:
+    """(tilt, y, u) True for rays that a method without a prior uses; None for all.
+
+    Rows that are masked in all images, such as dead rows of a detector, would leave slices empty. They take the values of the
+    neighbouring rows.
+    """
+    mask = tilt_series.mask
+    return None if mask is None else mask | ~np.asarray(mask.any((0, 2)))[:, None]

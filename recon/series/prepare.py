@@ -21,7 +21,7 @@ from recon.series.contrast import check_contrast
 from recon.series.dual_axis import stacked
 from recon.series.masks import plausible
 from recon.series.orientation import Orientation
-from recon.series.registration import Registration, register
+from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.shrinkage import FEWEST_TILTS, Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
@@ -58,7 +58,7 @@ class Prepared:
     alignment: Alignment | None
     guard: Guard = field(default_factory=Guard)
     second: Prepared | None = None
-    registration: Registration | None = None
+    registration: AxisRegistration | None = None
 
     @property
     def choices(self) -> dict[str, float | str]:

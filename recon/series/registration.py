@@ -36,7 +36,7 @@ _LEAST = 0.4
 
 @described(axis="°", first_offset="°", second_offset="°", shift="px")
 @dataclass(frozen=True)
-class Registration:
+class AxisRegistration:
     """The position of a second tilt axis relative to the first, and what it explains.
 
     The specimen is tilted about the first axis with its angles minus `first_offset`. Turned in its plane, it is tilted about the
@@ -102,7 +102,7 @@ class Registration:
 
 def register(
     first: TiltSeries, second: TiltSeries, *, device: torch.device | str = "cpu", progress: Progress | None = None
-) -> Registration:
+) -> AxisRegistration:
     """Find the rotation and shift between two aligned series of one specimen.
 
     Coarse volumes of both series are compared for directions of the second axis within 40° of ±90° and both signs of its tilt
@@ -136,7 +136,7 @@ def register(
                 f"the two series do not show one specimen about axes near 90° apart: the volume of each explains {share:.0%} of "
                 "the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
             )
-        return _registration(pair.settled(found[0]), pair)
+        return _registration(pair.settled(found[0]))
 
 
 def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
@@ -316,7 +316,7 @@ def _correlated(one: Tensor, other: Tensor) -> tuple[float, Tensor]:
     return float(found.max() / norm), place.flip(0).to(one)
 
 
-def _registration(pose: _Pose, pair: _Pair) -> Registration:
+def _registration(pose: _Pose) -> AxisRegistration:
     """The rotation as one about the first axis, one in the plane of the specimen, and one about the second axis."""
     rotation, shift = pose.rotation.double().cpu().numpy(), pose.shift.double().cpu().numpy()
     sign = 1.0 if rotation[0, 1] > 0 else -1.0
@@ -326,6 +326,6 @@ def _registration(pose: _Pose, pair: _Pair) -> Registration:
     cosine, sine = math.cos(first), math.sin(first)
     x, y, z = shift
     common = (-x * sine + z * cosine, y, x * cosine + z * sine)
-    return Registration(
+    return AxisRegistration(
         math.degrees(axis), math.degrees(first), math.degrees(second), common, pose.inverted, pose.explained
     )

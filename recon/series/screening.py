@@ -102,7 +102,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
     """Compare every tilt with a coarse volume of the others; if there are few tilts, all are good.
 
     SIRT iterations alternate with fits of the intensity of each tilt. The tilts whose residual likelihood deviates most from that
-    of their neighbours are removed, and the procedure is repeated until none deviates.
+    of their neighbours are removed, and the procedure is repeated until none deviates. The volume includes the tilts that it is
+    compared with: volumes without them find the same tilts (see the architecture page).
     """
     count = tilt_series.num_tilts
     if count < _FEWEST:

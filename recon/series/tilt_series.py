@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from noiseflow import io, statistics
 from noiseflow.described import described, size_of
 from noiseflow.io import mapped
+from noiseflow.io.angles import advice_on_count
 from noiseflow.io.mapped import is_mapped
 
 Mode = Literal["transmission", "linear"]
 _SAME_SIZE = 0.01
 """Relative difference of pixel sizes that rounding in headers explains."""
+_TOUCHED = 0.01
+"""Masked share of the area of a pixel that changes its value by less than the noise."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +34,15 @@ class TiltSeries:
         tilt_angles: (tilt,) degrees.
         pixel_size: Å, or None if unknown.
         mode: ``transmission`` (bright field: I0·exp(−line integral)) or ``linear`` (HAADF, EDX: gain·line integral).
-        mask: (tilt, y, u), True for pixels to use; None for all. Fits exclude the other pixels; classical methods use their
-            values in `images`, which should be plausible.
+        mask: (tilt, y, u), True for pixels to use; None for all. Methods exclude the other pixels; WBP replaces them by
+            projections of a volume of the used ones.
         beam: (tilt,) incident intensity relative to the median if the beam drifts; the initial value of a fit.
         axes: (tilt,) direction of each tilt axis in the specimen, degrees from y towards −x, if there are two: 0, or a number
             near 90 for images whose axis is along x; None if all are along y. All images show the specimen in the same
             orientation at zero tilt. See `recon.DualAxisProjector`.
         dose: (tilt,) dose before each image, or its time, in any unit; None if unknown. Used for shrinkage only.
+        x_tilt: degrees by which the specimen is turned about x according to its files; commands level their volumes by it, see
+            `Volume.levelled`.
         tilt_axis: direction of the tilt axis in raw images according to their file, degrees from y towards −x, or None; used
             only as the initial value of an alignment.
         views: (tilt,) index of each image among the `num_views` of its file, if some of these were left out; else None.
@@ -65,6 +70,7 @@ class TiltSeries:
     views: NDArray[np.int64] | None = None
     num_views: int | None = None
     dose: NDArray[np.float64] | None = None
+    x_tilt: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "images", io.as_array(self.images))
@@ -76,7 +82,7 @@ class TiltSeries:
         if len(self.images) != len(self.tilt_angles):
             raise ValueError(
                 f"the stack has {len(self.images)} images, but there are {len(self.tilt_angles)} tilt angles; "
-                "give the angle file of this stack"
+                f"{advice_on_count(self.images.shape, len(self.tilt_angles))}"
             )
         if len(self.images) < 2:
             raise ValueError("a tilt series needs at least two tilts")
@@ -228,6 +234,29 @@ class Volume:
         size = "unknown voxel size" if self.voxel_size is None else f"{self.voxel_size:.4g} Å per voxel"
         return f"Volume({size_of(self.attenuation)}, {size})"
 
+    def levelled(self, x_tilt: float) -> Volume:
+        """The volume of a specimen that is turned about x, turned back about its centre by cubic interpolation.
+
+        Args:
+            x_tilt: degrees; positive if z of a flat specimen rises with y, as IMOD's ``XAXISTILT``.
+
+        Example:
+            >>> import numpy as np, recon
+            >>> recon.Volume(np.ones((8, 8, 8), np.float32)).levelled(5.0).attenuation.shape
+            (8, 8, 8)
+        """
+        from scipy.ndimage import affine_transform
+
+        if not x_tilt:
+            return self
+        cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
+        turn = np.array([[cosine, sine], [-sine, cosine]])  # (z, y) of the given volume from those of the level one
+        middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
+        level = mapped.temporary_map(self.attenuation.shape, np.float32, in_memory=mapped.IN_MEMORY)
+        for x in range(level.shape[2]):
+            level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
+        return Volume(level, self.voxel_size)
+
     def write(self, path: str | Path) -> None:
         """Write to an MRC, TIFF, ``.npy`` or OME-Zarr file with the voxel size. Raises as `noiseflow.io.write`."""
         size = self.voxel_size
@@ -239,7 +268,7 @@ def read_tilt_series(
     *,
     angles: str | Path | None = None,
     mode: Mode = "transmission",
-    mask: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | str | Path | None = None,
     mask_nan: bool = False,
     mapped: bool = False,
     channel: str | int | None = None,
@@ -253,7 +282,8 @@ def read_tilt_series(
         angles: a file that `noiseflow.io.read_tilts` reads; by default the ``.rawtlt``, ``.tlt`` or ``.mdoc`` next to the
             stack, or else the angles in the stack file. For the rules that join images and angles, see `noiseflow.io.tilts_of`.
         mode: image formation.
-        mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts.
+        mask: True for pixels to use, (tilt, y, u), or (y, u) for all tilts; or an image file or folder with 0 for the others,
+            joined to the images by tilt angle if it has angles, else by order.
         mask_nan: mask NaN and infinite pixels instead of raising an error.
         mapped: memory-map the images, see `noiseflow.io.read`; not with a mask or NaNs.
         channel: name, or index from zero, of the channel of a hyperstack, or of the image of a file that holds several.
@@ -277,29 +307,39 @@ def read_tilt_series(
             f"{path} holds one image of shape {image_file.data.shape}; a tilt series (tilt, y, x) is required"
         )
     table, count = io.tilts_of(path, image_file, angles), len(image_file.data)
-    size = _pixel_size(pixel_size, image_file, table, path)
+    height, width = _pixel_size(pixel_size, image_file, table, path) or (None, None)
     excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
     views = np.setdiff1d(np.arange(count), sorted(excluded))
     if excluded and len(views) < 2:
         raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
-    if mask is not None and mask.shape == image_file.data.shape:
-        mask = mask[views]
+    use = _mask_in(mask, table.angles) if isinstance(mask, str | Path) else mask
+    if use is not None and use.shape == image_file.data.shape:
+        use = use[views]
     images = _sections(image_file.data, evenly(views, count))
-    images, mask = _masked(flat_fielded(images, image_file, path), mask, mask_nan, str(path))
+    images, use = _masked(flat_fielded(images, image_file, path), use, mask_nan, str(path))
+    if height and width and abs(height / width - 1) > _SAME_SIZE:
+        images, use = squared(images, use, height / width)
+        warnings.warn(
+            f"{path} has pixels of {width:.5g} x {height:.5g} Å (x, y), which are averaged to {max(height, width):.5g} Å; if the "
+            "header is wrong, give the size with --pixel-size",
+            stacklevel=2,
+        )
     io.require_contrast(images, path)
     tilt_axis = io.tilt_axis_of(path, image_file)
+    square = None if height is None or width is None else max(height, width)
     series = TiltSeries(
         images,
         table.angles[views],
-        size,
+        square,
         mode,
-        mask,
+        use,
         tilt_axis=table.tilt_axis if tilt_axis is None else tilt_axis,
         views=views if excluded else None,
         num_views=count if excluded else None,
         dose=None if table.acquired is None else table.acquired[views],
+        x_tilt=table.x_tilt,
     )
-    empty = np.zeros(len(images), np.bool_) if mask is None else ~mask.any((1, 2))
+    empty = np.zeros(len(images), np.bool_) if use is None else ~use.any((1, 2))
     if not empty.any():
         return series
     named = ", ".join(f"{angle:g}°" for angle in series.tilt_angles[empty][:8])
@@ -307,33 +347,30 @@ def read_tilt_series(
     return series.select(np.flatnonzero(~empty))
 
 
-def _pixel_size(given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path) -> float | None:
-    """Å: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
+def _pixel_size(
+    given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path
+) -> tuple[float, float] | None:
+    """Å along y and x: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
 
     Raises:
-        ValueError: pixels are not square, or the given size is not positive.
+        ValueError: the given size is not positive.
     """
     if given is not None:
         if not 0 < given < np.inf:
             raise ValueError(f"--pixel-size {given:g}: give a positive number of Å")
-        return given
+        return given, given
     if image.voxel_size is None:
-        return table.pixel_size
+        return None if table.pixel_size is None else (table.pixel_size, table.pixel_size)
     y, x = image.voxel_size[1:]
-    if abs(y / x - 1) > _SAME_SIZE:
-        raise ValueError(
-            f"{path} has pixels of {x:.5g} x {y:.5g} Å (x, y); square pixels are required: resample the images, or give the "
-            "correct size with --pixel-size if the header is wrong"
-        )
-    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= _SAME_SIZE:
-        return x
+    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= _SAME_SIZE or abs(y / x - 1) > _SAME_SIZE:
+        return y, x
     chosen = table.pixel_size if x == 1 else x
     warnings.warn(
         f"{path} states pixels of {x:.5g} Å, and the file of its angles {table.pixel_size:.5g} Å; {chosen:.5g} Å are used: "
         "give --pixel-size if this is wrong",
         stacklevel=3,
     )
-    return chosen
+    return chosen, chosen
 
 
 def flat_fielded(images: NDArray[Any], image_file: io.ImageFile, path: str | Path) -> NDArray[Any]:
@@ -353,6 +390,17 @@ def flat_fielded(images: NDArray[Any], image_file: io.ImageFile, path: str | Pat
     warnings.warn(f"the {' and '.join(names)} fields of {path} are applied to its images", stacklevel=3)
     parts = (((image - black) / scale).astype(np.float32) for image in images)
     return mapped.mapped_copy(parts, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+
+
+def _mask_in(path: str | Path, tilt_angles: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The mask in a file, in the order of the tilts, or one for all of them."""
+    file = io.read(path)
+    io.require_finite(file.data, path)
+    use: NDArray[np.bool_] = np.asarray(file.data != 0)
+    if file.tilt_angles is not None and len(use) == len(tilt_angles):
+        rows = io.angles.by_angle(file.tilt_angles, tilt_angles)
+        return use if rows is None else use[rows]
+    return use[0] if use.ndim == 3 and len(use) == 1 else use
 
 
 def _masked(
@@ -401,6 +449,47 @@ def block_mean(image: NDArray[Any], down: int, across: int) -> NDArray[np.float3
     """Means of blocks of pixels of an image (y, u); incomplete blocks are dropped, evenly at both edges."""
     inner = image[image.shape[0] % down // 2 :, image.shape[1] % across // 2 :].astype(np.float64)
     return statistics.block_means(inner, down, across).astype(np.float32)
+
+
+def squared(
+    images: NDArray[Any], mask: NDArray[np.bool_] | None, ratio: float
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Images and their mask with square pixels of the larger edge; the centre stays in place.
+
+    Pixels are averaged by the areas that they share with the new ones; whole numbers of integers are added, because sums of
+    counts are counts. Pixels that a mask touches are masked.
+
+    Args:
+        images: (tilt, y, u).
+        mask: of their shape, or None.
+        ratio: height of a pixel over its width.
+    """
+    axis, factor = (2, ratio) if ratio > 1 else (1, 1 / ratio)
+    factor = float(round(factor)) if abs(factor / round(factor) - 1) <= _SAME_SIZE else factor
+    shared = _shared(images.shape[axis], factor)
+    counts = factor.is_integer() and images.dtype.kind in "iu"
+    kind = np.int32 if counts else np.float32
+    shape = list(images.shape)
+    shape[axis] = len(shared)
+    weights = shared if counts else shared / factor
+
+    def moved(stack: NDArray[Any], by: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+        return (by @ image if axis == 1 else image @ by.T for image in stack)
+
+    whole = mapped.mapped_copy(moved(images, weights), shape, kind, in_memory=mapped.IN_MEMORY)
+    if mask is None:
+        return whole, None
+    used = (share > 1 - _TOUCHED for share in moved(mask, shared / factor))
+    return whole, mapped.mapped_copy(used, shape, np.bool_, in_memory=mapped.IN_MEMORY)
+
+
+def _shared(count: int, factor: float) -> NDArray[np.float64]:
+    """(new, old) overlap of old pixels and of `factor` times larger ones around the same centre, in old pixels."""
+    number = int(count / factor + 1e-9)
+    start = (count - number * factor) / 2 + factor * np.arange(number)[:, None]
+    left, right = np.maximum(start, np.arange(count)), np.minimum(start + factor, np.arange(count) + 1)
+    overlap: NDArray[np.float64] = np.maximum(right - left, 0.0)
+    return overlap
 
 
 def write_tilt_series(path: str | Path, tilt_series: TiltSeries) -> Path:

@@ -11,10 +11,8 @@ from torch import Tensor
 
 from noiseflow.distributions.laws.latent import LatentDistribution
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_quadrature
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
 class KnownNoise(NoiseModelBase, ABC):
@@ -138,7 +136,7 @@ class GaussianMixture(NoiseDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         latent = (value - self.centres) / self.scales
-        return torch.logsumexp(self.log_weights - 0.5 * latent**2 - torch.log(self.scales) - _LOG_SQRT_2PI, 0)
+        return torch.logsumexp(self.log_weights - 0.5 * latent**2 - torch.log(self.scales) - LOG_SQRT_2PI, 0)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         bounds = ((bound - self.centres) / self.scales for bound in (low, high))

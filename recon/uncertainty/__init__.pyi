@@ -10,5 +10,6 @@ from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
 from .result import Uncertainty as Uncertainty
 from .shell_band import ShellBand as ShellBand
+from .unseen import unseen_part as unseen_part
 from .unseen import unseen_range as unseen_range
 from .unseen import unseen_share as unseen_share

@@ -16,6 +16,7 @@ from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import view_numbers
 from recon.uncertainty.posterior import Posterior
 from recon.uncertainty.result import Uncertainty
 
@@ -70,18 +71,20 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
 
     Args:
         tilt_series: a series with one detector response for all tilts.
-        every: one of this many tilts is held out, but neither end.
+        every: one of this many directions is held out, with all its duplicates, but not those beside the missing wedge.
         num_samples: number of posterior samples.
         **settings: settings of `recon.reconstruct`.
 
     Raises:
         ValueError: there are too few tilts, the response differs between tilts, or the method does not fit a volume.
     """
-    order = np.argsort(tilt_series.tilt_angles, kind="stable")
-    left = order[every // 2 : -1 : every]
-    if every < 2 or not left.size:
-        raise ValueError(f"{len(order)} tilts are too few to hold out one of {every}; give a smaller number")
-    kept, judged = tilt_series.select(np.setdiff1d(order, left)), tilt_series.select(left)
+    numbers = view_numbers(tilt_series.tilt_angles)
+    left = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
+    if every < 2 or not left.any():
+        raise ValueError(
+            f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number"
+        )
+    kept, judged = tilt_series.select(np.flatnonzero(~left)), tilt_series.select(np.flatnonzero(left))
     orientation = Orientation.of(kept)  # that of the signal model
     kept, judged = orientation.series(kept), orientation.series(judged)
     kept = kept.select(np.argsort(kept.tilt_angles, kind="stable"))
@@ -103,7 +106,7 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     pixels = judged.images.shape[2]
     A = SliceProjector(tilt_angles=judged.tilt_angles, depth=depth, width=width, detector_width=pixels)
     with torch.no_grad():
-        rays = [from_rays(A.project(to_columns(volume.cpu() + moved)), len(left)) for volume in volumes]
+        rays = [from_rays(A.project(to_columns(volume.cpu() + moved)), judged.num_tilts) for volume in volumes]
         signals = torch.stack([formation.cpu()(each) for each in rays])
     ranks = predictive_ranks(outcome.noise_model.cpu(), signals, observation)
     use = np.ones(ranks.shape, np.bool_) if judged.mask is None else judged.mask

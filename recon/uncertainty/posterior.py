@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from noiseflow import Correlated
+from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
 from recon.joint.task import block_mask
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.energy import Energy
-from recon.uncertainty.moments import Moments
 from recon.uncertainty.result import Uncertainty
 from recon.uncertainty.shell_band import ShellSums
 
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 _STEPS = 30  # between two samples
 _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
 _EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
+# pixels whose residuals are enough to measure how neighbours correlate, to 0.001
+_CORRELATED = 2**20
+_REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
 _SHARE = 0.1  # share of the pixels, held out as in the fit, so that the posterior uses the same data
 
 
@@ -31,7 +36,8 @@ class Posterior:
     """A Markov chain of posterior volumes as a stage; one step of the stage gives one sample.
 
     Langevin steps follow the negative gradient of `Energy` with added Gaussian noise; negative values are reflected. Noise model,
-    weight and detector response are fixed.
+    weight and detector response are fixed. If residuals of neighbouring pixels correlate, the likelihood counts each of them as
+    too many; the chain then runs at the temperature 1 / `noiseflow.Correlated.effective_share`, which leaves the mode in place.
 
     Args:
         outcome: a fitted reconstruction.
@@ -78,6 +84,8 @@ class Posterior:
         self.step_size = 1 / (
             self.energy.stiffness() or 1.0
         )  # the stiffness of a block of vacuum is zero, and nothing changes
+        seen = torch.where(train, observation, torch.nan)
+        self.temperature = 1 / _effective_share(noise_model, model.signal().detach().view_as(observation), seen)
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
@@ -105,7 +113,7 @@ class Posterior:
     def _move(self) -> None:
         noise = torch.randn(self.units.shape, generator=self.generator, device=self.units.device)
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
-        self.units.add_(noise, alpha=(2 * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
+        self.units.add_(noise, alpha=(2 * self.temperature * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
 
     def _volume(self, units: Tensor) -> np.ndarray:
         return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
@@ -159,6 +167,47 @@ def error_bars(
     return posterior.result()
 
 
+def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> float:
+    """How many independent pixels each pixel (tilt, u, y) is worth, from the residuals of some tilts."""
+    if needs_image(noise_model) or min(observation.shape[1:]) <= 2 * _REACH:
+        return 1.0
+    some = slice(None, None, -(-observation.numel() // _CORRELATED))
+    kernel = correlation_kernel(noise_model, signal[some], observation[some], reach=_REACH)
+    return Correlated(noise_model, kernel).effective_share
+
+
 def _native(images: np.ndarray) -> Tensor:
     """Convert (tilt, y, u) to the projector's order (tilt, u, y)."""
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1)))
+
+
+class Moments:
+    """Running mean and sum of squared deviations (Welford 1962, doi:10.1080/00401706.1962.10490022).
+
+    Args:
+        like: a tensor of the same shape.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        self.count, self.mean, self.squares = 0, torch.zeros_like(like), torch.zeros_like(like)
+
+    def add(self, value: Tensor) -> None:
+        """Add a value."""
+        self.count += 1
+        before = value - self.mean
+        self.mean.add_(before, alpha=1 / self.count)
+        self.squares.addcmul_(before, value - self.mean)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation; zero for fewer than two values."""
+        return (self.squares / max(1, self.count - 1)).sqrt()
+
+    def state(self) -> dict[str, Any]:
+        """The state for `load_state`."""
+        return {"count": self.count, "mean": self.mean, "squares": self.squares}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore a state."""
+        self.count = state["count"]
+        self.mean, self.squares = (state[name].to(self.mean).clone() for name in ("mean", "squares"))

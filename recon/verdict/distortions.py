@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import Effect
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import robust_deviation, white_regression
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -66,7 +66,7 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         residuals: images and what is left of them.
         pixel: size of their pixels, detector pixels.
     """
-    found = [_of_tilt(*pair) for pair in _fields(residuals)]
+    found = [white_regression(*pair, ridge=1e-6, clusters=tiles) for *pair, tiles in _fields(residuals)]
     estimates, errors = zip(*found, strict=True)
     units = _units(residuals, pixel)
     return {
@@ -105,18 +105,6 @@ def _slope_over_tilts(residuals: Residuals) -> Array:
     if len(angles) < 2:
         return np.zeros_like(residuals.projections)
     return np.asarray(np.gradient(residuals.projections[first], np.deg2rad(angles), axis=0)[back])
-
-
-def _of_tilt(columns: Array, residual: Array, tiles: Array) -> tuple[Array, Array]:
-    """Coefficients and their standard errors; undetermined coefficients have infinite errors."""
-    scale = np.sqrt((columns**2).sum(0)) + 1e-30
-    scaled = columns / scale
-    inverse = np.linalg.inv(scaled.T @ scaled + 1e-6 * np.eye(columns.shape[1]))
-    found = inverse @ (scaled.T @ residual)
-    left = scaled * (residual - scaled @ found)[:, None]
-    sums = np.stack([np.bincount(tiles, each) for each in left.T], 1)
-    variance: Array = np.diag(inverse @ (sums.T @ sums) @ inverse)
-    return found / scale, np.sqrt(np.maximum(variance, 1e-30)) / scale
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distortion:

@@ -49,7 +49,7 @@ def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.flo
 
 def _unrounded(model: nn.Module, levels: Tensor) -> nn.Module:
     """The model without rounding that is too fine to affect the mean, because summing over many levels is slow."""
-    if not isinstance(model, Digitised):
+    if not isinstance(model, Digitised) or model.levels.numel():
         return model
     fine = model.step < float(levels[1] - levels[0]) or model.step**2 < float(model.model(levels).variance.median())
     return Digitised(model.model, 0.0, model.low, model.high) if fine else model

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from noiseflow.checks import Finding, Guard, Verdict, run, verdict_of
+from noiseflow.checks import Guard, Verdict, run, verdict_of
 from recon.series.alignment import Alignment
 from recon.series.dual_axis import about, own_images
 from recon.series.screening import Screening
@@ -27,7 +27,7 @@ def judge(
     screening: Screening | None = None,
     alignment: Alignment | None = None,
     guard: Guard | None = None,
-) -> Verdict[Finding]:
+) -> Verdict:
     """Assess a volume by the residuals of its projections, and by held-out contiguous gaps of tilts.
 
     A check that fails or cannot be applied is listed in `Verdict.not_tested`; it does not stop the others.
@@ -56,9 +56,9 @@ def judge(
     return verdict_of(found.values(), evidence, good=good, guard=guard)
 
 
-def _of_both_axes(case: Case, guard: Guard) -> Verdict[Finding]:
+def _of_both_axes(case: Case, guard: Guard) -> Verdict:
     """The verdicts of both axes as one; each judges the tilts about it with the geometry of one axis."""
-    result, verdicts = case.result, list[Verdict[Finding]]()
+    result, verdicts = case.result, list[Verdict]()
     assert case.tilt_series.axes is not None
     for second in (False, True):
         images, volume = result.projections[(case.tilt_series.axes != 0) == second], result.volume.attenuation

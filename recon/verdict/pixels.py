@@ -19,7 +19,7 @@ _STEP = 0.1
 _BLOCK = 8
 # equally populated bins of the signal: finer than smooth misfit
 _SIGNALS = 16
-# probability of a line of equal counts
+# probability of a line, or of a pixel in all tilts, of equal counts
 _CHANCE = 1e-3
 # pixels below a cliff: fewer are no histogram
 _FEWEST = 60
@@ -104,6 +104,9 @@ def dead_pixels(residuals: Residuals) -> Effect:
         for number in range(1, count + 1):
             inside = regions == number
             around = ndimage.binary_dilation(inside) & ~constant
+            alike = float((images[:, around] == end).mean()) if around.any() else 0.0
+            if alike ** (len(images) * int(inside.sum())) * mean.size > _CHANCE:  # counts that are mostly zero
+                continue
             beside = float(np.median(mean[around])) if around.any() else end
             if min(abs(beside - end), abs(float(np.median(expected[inside])) - end)) > _STEP * span:
                 dead |= inside

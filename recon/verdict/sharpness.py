@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Effect, NotTested
+from noiseflow.statistics import white_regression
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import inverted
@@ -79,16 +80,8 @@ def blurs(images: Array) -> tuple[Array, Array]:
     mean = masses.mean(0)
     slope = np.gradient(mean)
     columns = np.stack([np.ones_like(mean), mean, slope, np.gradient(slope)], 1)[1:-1]
-    rows, fitted = columns.shape
-    scale = np.sqrt((columns**2).sum(0)) + 1e-30
-    scaled = columns / scale
-    inverse = np.linalg.pinv(scaled.T @ scaled)
-    away = (masses - mean)[:, 1:-1]
-    found = away @ scaled @ inverse
-    left = away - found @ scaled.T
-    spread = (scaled @ inverse)[:, 3]
-    errors = np.sqrt((left**2) @ spread**2 * rows / max(1, rows - fitted))
-    return found[:, 3] / scale[3], np.maximum(errors, 1e-30) / scale[3]
+    found, errors = white_regression(columns, (masses - mean)[:, 1:-1])
+    return found[:, 3], errors[:, 3]
 
 
 def _growth(values: Array, errors: Array, angles: Array) -> tuple[float, float]:

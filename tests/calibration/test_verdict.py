@@ -32,7 +32,7 @@ def measured(case):
 
 def test_a_clean_pair_is_good_and_right():
     found = measured(CASES["clean, ratio known"](11))
-    assert (found.verdict.grade, found.verdict.reasons) == ("good", ())
+    assert (found.verdict.grade, found.verdict.subjects) == ("good", ())
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.04)
 
 
@@ -57,7 +57,7 @@ def test_a_clean_pair_is_good_and_right():
 def test_what_is_wrong_is_flagged_and_modelled_where_it_can_be(name, reason, tolerance):
     found = measured(CASES[name](12))
     assert found.verdict.grade != "good"
-    assert reason in [one.name for one in found.verdict.findings]
+    assert reason in [one.reason for one in found.verdict.findings]
     if tolerance is not None:
         assert found.figures.gain.median == pytest.approx(2.0, rel=tolerance)
 
@@ -97,7 +97,7 @@ def test_every_case_is_right_or_flagged(name, seed):
     if found.verdict.grade == "good":
         assert found.figures.gain.median == pytest.approx(case.gain, rel=0.04)  # 2 % and its own error
     else:
-        serious = {one.name for one in found.verdict.findings}
+        serious = {one.reason for one in found.verdict.findings}
         assert not (case.clean and serious)
 
 
@@ -133,20 +133,20 @@ def test_a_comb_of_codes_is_flagged_as_such_and_does_not_make_the_figures_bad():
     short, long = sim.clean(generator, scene / 10)
     move = (short % 2 == 1) & (generator.random(short.shape) < 0.3)
     found = measure_exposures([ExposurePair(short + np.where(move, generator.choice([-1, 1], short.shape), 0), long)])
-    assert "uneven codes" in [one.name for one in found.verdict.findings]
+    assert "uneven codes" in [one.reason for one in found.verdict.findings]
     assert found.verdict.grade == "doubtful"
     assert found.detector.misfit < 1.3
     even = measure_exposures([ExposurePair(short, long)])
-    assert "uneven codes" not in [one.name for one in even.verdict.findings]
+    assert "uneven codes" not in [one.reason for one in even.verdict.findings]
 
 
 def test_uneven_pixels_are_seen_in_a_burst():
     generator = np.random.default_rng(3)
     scene = sim.random_scene(generator, 128)
     uneven = measure_exposures(Burst(sim.scmos(generator, scene, 6)))
-    assert "uneven pixels" in [one.name for one in uneven.verdict.findings]
+    assert "uneven pixels" in [one.reason for one in uneven.verdict.findings]
     even = measure_exposures(Burst(np.stack([sim.exposed(generator, scene) for _ in range(6)])))
-    assert "uneven pixels" not in [one.name for one in even.verdict.findings]
+    assert "uneven pixels" not in [one.reason for one in even.verdict.findings]
 
 
 def test_darks_brighter_than_the_exposures_are_refused_in_one_line():
@@ -163,10 +163,11 @@ def test_frames_that_follow_one_another_are_flagged_and_independent_ones_are_not
     lagging = 0.9 * electrons[1:] + 0.1 * electrons[:-1]
     lagging, free = (np.round(100 + 2 * one + generator.normal(0, 4, one.shape)) for one in (lagging, electrons))
     found = measure_exposures(Burst(lagging))
-    assert ("frames correlated", "bad") in [(one.name, one.grade) for one in found.verdict.findings]
+    assert ("frames correlated", True) in [(one.reason, one.bad) for one in found.verdict.findings]
     lag = 0.09 * 80 / (0.82 * 80 + 4)  # of 80 electrons: shot noise and a read noise of 2 electrons
-    assert correlation_in_time(found.pairs) == pytest.approx(lag, rel=0.1)
-    assert correlation_in_time(align_burst(Burst(free))[0]) == 0
+    assert correlation_in_time(found.pairs)[0] == pytest.approx(lag, rel=0.1)
+    value, error = correlation_in_time(align_burst(Burst(free))[0])
+    assert abs(value) < 4 * error
 
 
 def test_a_long_exposure_that_contains_the_short_one_is_flagged():
@@ -175,7 +176,7 @@ def test_a_long_exposure_that_contains_the_short_one_is_flagged():
     frames = [sim.exposed(generator, scene) for _ in range(9)]
     for long in (np.sum(frames[:8], axis=0), np.mean(frames[:8], axis=0)):
         found = measure_exposures([ExposurePair(frames[0], long)])
-        assert ("short contained", "bad") in [(one.name, one.grade) for one in found.verdict.findings]
+        assert ("short contained", True) in [(one.reason, one.bad) for one in found.verdict.findings]
         assert contained_share(found.pairs[0]) == pytest.approx(1 / 8, rel=0.1)
         assert contained_share(align_pair(ExposurePair(frames[8], long))) == 0
 
@@ -196,12 +197,12 @@ def test_compression_of_the_long_exposure_alone_is_flagged():
     long = sim.exposed(generator, 16 * scene, gain=0.1, offset=10.0).clip(0, 255).astype(np.uint8)
     stored = cv2.imdecode(cv2.imencode(".jpg", long, [cv2.IMWRITE_JPEG_QUALITY, 80])[1], cv2.IMREAD_GRAYSCALE)
     reasons = measure_exposures([ExposurePair(sim.exposed(generator, scene), stored)]).verdict.findings
-    assert ["the long exposure was" in one.text for one in reasons if one.name == "compressed"] == [True]
+    assert [one.name for one in reasons if one.reason == "compressed"] == ["compression of the long exposure"]
 
 
 def test_single_electrons_tell_the_gain_to_a_thousandth():
     found = measured(CASES["single electrons resolved"](32))
-    assert found.verdict.reasons == ()
+    assert found.verdict.subjects == ()
     assert found.detector.electrons
     found = found.figures
     assert found.gain.median == pytest.approx(8.0, rel=2e-3)
@@ -211,7 +212,7 @@ def test_single_electrons_tell_the_gain_to_a_thousandth():
 
 def test_a_burst_of_single_electrons_is_good():  # it has only residuals, which blur them
     found = measured(CASES["burst of 8, single electrons resolved"](31))
-    assert (found.verdict.reasons, found.detector.electrons) == ((), False)
+    assert (found.verdict.subjects, found.detector.electrons) == ((), False)
 
 
 def test_the_peaks_of_ordinary_noise_are_not_single_electrons():
@@ -223,7 +224,7 @@ def test_the_peaks_of_ordinary_noise_are_not_single_electrons():
 )
 def test_skewed_or_coarse_noise_is_neither_correlated_nor_uneven(name, gain):
     found = measured(CASES[name](34))
-    assert {one.name for one in found.verdict.findings} == set()
+    assert {one.reason for one in found.verdict.findings} == set()
     assert found.figures.gain.median == pytest.approx(gain, rel=0.06)
 
 
@@ -247,10 +248,10 @@ def test_skewed_noise_of_independent_pixels_has_no_correlation():
 
 def test_converters_joined_in_one_frame_are_found_and_the_darker_pixels_measured():
     found = measured(CASES["two converters joined at 800 counts"](37))
-    assert "joined converters" in [one.name for one in found.verdict.findings]
+    assert "joined converters" in [one.reason for one in found.verdict.findings]
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.06)
     most = measured(CASES["two converters joined at 300 counts"](37))
-    assert [one.grade for one in most.verdict.findings if one.name == "joined converters"] == ["bad"]
+    assert [one.bad for one in most.verdict.findings if one.reason == "joined converters"] == [True]
 
 
 def test_codes_are_coarser_only_where_they_are():
@@ -298,8 +299,8 @@ def test_a_given_ratio_that_the_exposures_contradict_is_flagged():
     case = CASES["clean, ratio known"](41)
     right = measured(case)
     wrong = measured(replace(case, options={"exposure_ratio": 24.0}))
-    assert "exposure ratio" not in [one.name for one in right.verdict.findings]
-    assert "exposure ratio" in [one.name for one in wrong.verdict.findings]
+    assert "exposure ratio" not in [one.reason for one in right.verdict.findings]
+    assert "exposure ratio" in [one.reason for one in wrong.verdict.findings]
     assert wrong.figures.gain.median == pytest.approx(2.0, rel=0.06)
 
 
@@ -307,7 +308,7 @@ def test_the_period_of_a_scene_is_none_of_the_noise():
     generator = np.random.default_rng(42)
     mosaic = sim.random_scene(generator) * np.tile([[1.0, 0.6], [0.6, 0.35]], (128, 128))  # of a colour camera
     found = measured(sim.Case(*(sim.exposed(generator, times * mosaic) for times in (1, sim.RATIO))))
-    assert {one.name for one in found.verdict.findings} == set()
+    assert {one.reason for one in found.verdict.findings} == set()
 
 
 def small_pair(size, seed):
@@ -318,12 +319,12 @@ def small_pair(size, seed):
 
 def test_a_pair_of_64_pixels_is_measured_and_only_uncertain():
     found = measured(small_pair(64, 43))
-    assert [one.name for one in found.verdict.findings] == []
+    assert [one.reason for one in found.verdict.findings] == []
     assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
 
 
 def test_histograms_of_a_few_hundred_pixels_are_not_too_even():
-    assert [one.name for one in measured(small_pair(40, 7)).verdict.findings] == []
+    assert [one.reason for one in measured(small_pair(40, 7)).verdict.findings] == []
 
 
 @pytest.mark.parametrize("burst", [True, False])
@@ -337,11 +338,11 @@ def test_saturation_and_compression_are_seen_behind_the_pattern_of_dark_frames(b
     long = None if burst else sim.exposed(generator, sim.RATIO * scene, offset=offset)
     case = sim.Case(shorts if burst else shorts[0], long, {"dark": dark})
     found = measured(case)
-    assert {one.name for one in found.verdict.findings} == set()
+    assert {one.reason for one in found.verdict.findings} == set()
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.05)
     coded = np.stack([jpeg2000(one, 300) for one in shorts])
     found = measured(replace(case, short=coded if burst else coded[0]))
-    assert "compressed" in [one.name for one in found.verdict.findings]
+    assert "compressed" in [one.reason for one in found.verdict.findings]
 
 
 def test_an_offset_that_is_an_electron_off_is_moved_to_the_peak():

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from calibration import verdict
 from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
+from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.outliers import without_outliers
 from calibration.pipeline import measure_exposures
@@ -13,7 +15,7 @@ from . import simulators as sim
 
 
 def reasons(found):
-    return {one.name for one in found.verdict.findings}
+    return {one.reason for one in found.verdict.findings}
 
 
 def calibration_burst(frames):
@@ -40,6 +42,31 @@ def test_dark_frames_tell_the_exponent_of_the_response(power):
     assert reasons(found) == {"nonlinear response"}
     assert found.detector.response.exponent == pytest.approx(power, abs=4 * found.detector.response.error)
     assert found.figures.gain.median == pytest.approx(2 * power, rel=0.06)
+
+
+@pytest.mark.parametrize("power", [0.8, 0.9, 1.0, 1.2])
+def test_variances_at_many_signals_restrict_the_exponent_of_the_response(power):
+    generator = np.random.default_rng(9)
+    electrons = np.linspace(20, 400, 16)
+    signal = 100 + 2 * 80 * (electrons / 80) ** power
+    variance = (power * (signal - 100) / electrons) ** 2 * electrons + 36
+    error = 0.01 * variance
+    found = response_of(signal, variance + error * generator.standard_normal(16), error)
+    assert abs(found.exponent - power) < 3 * found.error
+    assert found.error < 0.1
+    assert not (power == 1.0 and found.bent)
+
+
+def test_a_check_that_fails_loses_no_verdict(monkeypatch):
+    generator = np.random.default_rng(10)
+    frames = calibration_burst([sim.exposed(generator, np.full((64, 64), e)) for e in (100.0, 100.0)])
+    bright = calibration_burst([sim.exposed(generator, np.full((64, 64), e)) for e in (900.0, 900.0)])
+    names = [check.name for check in (*verdict.SCENES, *verdict.COMMON)]
+    assert len(set(names)) == len(names)
+    monkeypatch.setattr(verdict.CalibrationCase, "pattern", property(lambda case: 1 / 0))
+    found = calibrate_camera([frames, bright]).verdict
+    assert {"noise across the field", "classes of pixels"} <= set(found.not_tested)
+    assert set(found.subjects) == {"no dark frames", "few levels"}
 
 
 def test_a_linear_response_with_dark_frames_leaves_the_interval_narrow():

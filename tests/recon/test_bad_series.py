@@ -41,7 +41,7 @@ def at(images, value, count=7):
         (lambda i, a: (at(i, np.nan), a), [], "--mask-nan"),
         (lambda i, a: (at(i, np.inf), a), [], "--mask-nan"),
         (lambda i, a: (np.full_like(i, np.nan), a), ["--mask-nan"], "no usable pixel"),
-        (lambda i, a: (-1 - i, a), [], "linear"),
+        (lambda i, a: (-1 - i, a), ["--mode", "transmission"], "linear"),
         (lambda i, a: (i, a), ["--thickness", -3], "thickness"),
         (lambda i, a: (i, a), ["--thickness", 33], "more than twice"),
         (lambda i, a: (i, a), ["--angles", "none.tlt"], "none.tlt"),
@@ -59,7 +59,7 @@ def test_impossible_series_gives_one_line_and_no_volume(images, tmp_path, refuse
         (lambda i, a: (i, np.deg2rad(a)), [], "radians"),
         (lambda i, a: (np.concatenate([i, i[:1]]), np.append(a, a[0])), [], "more than once"),
         (lambda i, a: (i[::-1][[3, 1, 2, 0, *range(4, 13)]], a[::-1][[3, 1, 2, 0, *range(4, 13)]]), [], "not sorted"),
-        (lambda i, a: (1 - i, a), [], "--invert-contrast"),
+        (lambda i, a: (1 - i, a), ["--mode", "transmission"], "--invert-contrast"),
         (lambda i, a: (at(i, 1e5, 1), a), [], "deviate a hundred times"),
         (lambda i, a: (i, a), ["--mode", "linear"], "--mode transmission"),
         (

@@ -39,9 +39,8 @@ from noiseflow.distributions.electrons.narrow_cells import (
 )
 from noiseflow.distributions.electrons.peaks import is_near_peak, peaks_and_slopes
 from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
-from noiseflow.distributions.numerics.normal import log_normal_cdf, log_normal_interval
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
@@ -238,7 +237,7 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
         above = above * up * decay * ((mode + 1) / (mode + 1 + step))
         below = below * down * decay * ((safe_mode - step) / safe_mode)
         total = total + above + below
-    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - _LOG_SQRT_2PI
+    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
     return at_mode + torch.log(total)
 
 

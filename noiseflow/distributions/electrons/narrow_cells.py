@@ -21,8 +21,8 @@ from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import positive_rate
 from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷
 STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
 # Electrons: exponents overflow below, the contour integral is cheaper above
@@ -75,7 +75,7 @@ def cell_and_slopes(
     scale = torch.exp(-offset * (2 * gap + offset) / (2 * variance))
     weight = half.new_tensor(weights)[:, None]
     mass = (weight * scale[:inner] * total[:inner]).sum(0)
-    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - _LOG_SQRT_2PI
+    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
     value = at_mode + torch.log(mass * (2 * half))
     if not slopes:
         return value, ()

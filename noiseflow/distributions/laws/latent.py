@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -10,9 +9,8 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.distributions.numerics.normal import log_normal_interval, normal_cdf, normal_quadrature
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf, normal_quadrature
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _ROUNDINGS = 8
 _TOGETHER = 2**16  # pixel values
 
@@ -30,7 +28,7 @@ class LatentDistribution(NoiseDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         latent, ladj = self.to_latent(value)
-        return ladj - 0.5 * latent * latent - _LOG_SQRT_2PI
+        return ladj - 0.5 * latent * latent - LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
         return normal_cdf(self.to_latent(value)[0])
@@ -47,7 +45,7 @@ class LatentDistribution(NoiseDistribution):
         zero = torch.zeros_like(middle)
         width = torch.where(narrow, high - low, zero + 1)
         middle, slope = torch.where(narrow, middle, zero), torch.where(narrow, (slope_below + slope_above) / 2, zero)
-        return torch.where(narrow, torch.log(width) + slope - 0.5 * middle * middle - _LOG_SQRT_2PI, mass)
+        return torch.where(narrow, torch.log(width) + slope - 0.5 * middle * middle - LOG_SQRT_2PI, mass)
 
     def _latent_bound(self, value: Tensor) -> tuple[Tensor, Tensor]:
         finite = torch.isfinite(value)

@@ -184,7 +184,8 @@ class PoissonDistribution(NoiseDistribution):
     @property
     def support(self) -> constraints.Constraint:
         """Offset plus integer multiples of the gain."""
-        return DiscreteLevels(float(self.gain), float(self.offset), float(self.offset), math.inf)
+        gain, offset = float(self.gain.detach()), float(self.offset.detach())
+        return DiscreteLevels(gain, offset, offset, math.inf)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         rate = self.rate.detach()

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
 def normal_quadrature(
@@ -38,7 +38,7 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     zero = torch.zeros_like(low)
     # narrow intervals: mean of the normal density over the interval, to fourth order in its width
     w, m = torch.where(narrow, width, zero + 1), torch.where(narrow, middle, zero)
-    log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - _LOG_SQRT_2PI
+    log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - LOG_SQRT_2PI
     log_narrow = log_narrow + torch.log1p(w * w * (m * m - 1) / 24)
     return torch.where(
         narrow,
@@ -78,7 +78,7 @@ def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Tensor:
 def normal_hazard(x: Tensor) -> Tensor:
     """φ(x)/Φ(x), the derivative of log Φ(x)."""
     left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
-    right = torch.exp(-0.5 * x * x - _LOG_SQRT_2PI) / normal_cdf(x.clamp(min=0))
+    right = torch.exp(-0.5 * x * x - LOG_SQRT_2PI) / normal_cdf(x.clamp(min=0))
     return torch.where(x <= 0, left, right)
 
 

@@ -124,6 +124,12 @@ class DigitisedDistribution(NoiseDistribution):
 
     def _clipped(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> Tensor:
         result = self.base.log_prob(inside)
+        if inside.shape == self.batch_shape and self.base.independent and self.base.splits and not is_traced(inside):
+            place = torch.nonzero((on_low | on_high).reshape(-1)).squeeze(1)
+            base = self.base.mapped(lambda each, rest: each.reshape(-1, *rest)[place], torch.Size([place.numel()]))
+            below, ends = on_low.reshape(-1)[place], inside.new_tensor([-math.inf, self.low, self.high, math.inf])
+            mass = base.log_interval_prob(torch.where(below, ends[0], ends[2]), torch.where(below, ends[1], ends[3]))
+            return result.reshape(-1).index_put((place,), mass.to(result)).reshape(self.batch_shape)
         if inside.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
             low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
             high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)

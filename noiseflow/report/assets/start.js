@@ -3,7 +3,10 @@
   const contents = document.querySelector(".contents");
   for (const [number, heading] of [...document.querySelectorAll("main h2")].entries()) {
     heading.id = `part-${number + 1}`;
-    contents.append(element("a", { href: `#${heading.id}`, textContent: heading.textContent }));
+    const fold = heading.closest("details");
+    const link = element("a", { href: `#${heading.id}`, textContent: heading.textContent });
+    if (fold) link.addEventListener("click", () => { fold.open = true; });
+    contents.append(link);
   }
   const start = async () => {
     for (const root of document.querySelectorAll("figure[data-widget]")) {
@@ -18,5 +21,6 @@
     }
     document.documentElement.dataset.ready = "true";
   };
+  addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((fold) => { fold.open = true; }));
   start();
 })();

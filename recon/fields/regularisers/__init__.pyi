@@ -1,6 +1,6 @@
-from ._names import regulariser_names as regulariser_names
-from ._registry import find_regulariser as find_regulariser
 from .base import Regulariser as Regulariser
+from .base import find_regulariser as find_regulariser
+from .base import regulariser_names as regulariser_names
 from .directional import DirectionalVariation as DirectionalVariation
 from .second_order import SecondOrderVariation as SecondOrderVariation
 from .total_variation import TotalVariation as TotalVariation

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor
 
+from recon.names import REGULARISERS
+from recon.names import regulariser_names as regulariser_names
 from recon.projection.tiles import Tiles
 
 
@@ -37,3 +40,48 @@ class Regulariser(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
+
+
+def find_regulariser(name: str) -> Regulariser:
+    """Create the regulariser with a given name, with its default settings.
+
+    Raises:
+        ValueError: the name is unknown.
+        TypeError: the entry point with that name does not create a regulariser.
+    """
+    made = REGULARISERS.find(name)()
+    if not isinstance(made, Regulariser):
+        raise TypeError(
+            f"regulariser {name} is a {type(made).__name__}; derive it from recon.fields.regularisers.Regulariser"
+        )
+    return made
+
+
+_CACHED = 1 << 17  # voxels: arrays of this size fit in the cache, and the overhead of calls is small
+_FEWEST = 8  # layers: each part also needs neighbouring layers
+
+
+def layers(volume: Tensor) -> int:
+    """Number of layers along z to compute at a time."""
+    return max(_FEWEST, _CACHED // volume[0].numel())
+
+
+def difference(array: Tensor, axis: int) -> Tensor:
+    """Difference to the next element along an axis; zero at the end."""
+    found = torch.zeros_like(array)
+    within = inner(found, axis)
+    torch.sub(array.narrow(axis, 1, within.shape[axis]), inner(array, axis), out=within)
+    return found
+
+
+def add_adjoint(found: Tensor, flow: Tensor, axis: int) -> None:
+    """Add the adjoint of `difference`, for a flow that is zero at the end of the axis."""
+    found.sub_(flow)
+    within = inner(flow, axis)
+    found.narrow(axis, 1, within.shape[axis]).add_(within)
+
+
+def inner(array: Tensor, axis: int, *, last: bool = False) -> Tensor:
+    """All elements along an axis but the last, or only the last."""
+    size = array.shape[axis]
+    return array.narrow(axis, size - 1, 1) if last else array.narrow(axis, 0, size - 1)

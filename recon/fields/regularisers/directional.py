@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.fields.regularisers._differences import layers
-from recon.fields.regularisers.base import Regulariser
+from recon.fields.regularisers.base import Regulariser, layers
 from recon.fields.regularisers.total_variation import TotalVariation
-from recon.projection.saved_gradient import SavedGradient
+from recon.projection.gradients import SavedGradient
 
 
 class DirectionalVariation(Regulariser):

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.fields.regularisers._differences import add_adjoint, difference, inner, layers
-from recon.fields.regularisers.base import Regulariser
-from recon.projection.saved_gradient import SavedGradient
+from recon.fields.regularisers.base import Regulariser, add_adjoint, difference, inner, layers
+from recon.projection.gradients import SavedGradient
 
 
 class SecondOrderVariation(Regulariser):

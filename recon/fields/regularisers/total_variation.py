@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.fields.regularisers._differences import inner
-from recon.fields.regularisers.base import Regulariser
-from recon.projection.saved_gradient import SavedGradient
+from recon.fields.regularisers.base import Regulariser, inner
+from recon.projection.gradients import SavedGradient
 from recon.projection.tiles import Tiles
 
 

@@ -37,7 +37,7 @@ def preset_method(name: str, description: str) -> Method:
         learns_noise=True,
         memory=PRESETS[name].memory,
         continuous=True,
-        refuses=("second axis",),
+        refuses=("second-axis",),
     )
 
 

@@ -43,7 +43,7 @@ def test_no_counter_is_tried_on_values_that_do_not_scatter_as_its_counts():
 
 def test_shot_noise_finer_than_the_codes_is_rounded_to_them_and_needs_no_flexible_models():
     scores = fit_models(eight_bit(), detector=(0.2, 20.0, 2.0))
-    assert [score.name for score in scores] == ["gaussian", "poisson", "poisson-gaussian", "signal-gaussian"]
+    assert [score.name for score in scores] == ["gaussian", "poisson", "poisson-gaussian"]
     shot = next(score for score in scores if score.name == "poisson")
     drawn = shot.model(torch.full((1000,), 100.0)).sample()
     assert torch.equal(drawn, drawn.round())

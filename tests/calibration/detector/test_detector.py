@@ -382,3 +382,13 @@ def test_a_few_pixels_beside_many_that_fill_no_level_are_left_out():
     few = replace(readings(generator, electrons[:60], step=1.0), scale=Scale(0, 1.0, 0.0, 300.0))
     with pytest.raises(NotMeasurable, match="too few pixels of each brightness"):
         collect_cells([few], guess=(GAIN, OFFSET, READ_NOISE))
+
+
+def test_levels_chosen_by_noisy_signals_have_the_line_of_the_detector():
+    generator = np.random.default_rng(117)
+    scene = random_scene(generator, 200, mean=8.0, contrast=0.3)
+    setting = {"gain": 8.0, "offset": 400.0, "read_noise": 1.5}
+    pair = ExposurePair(*(exposed(generator, times * scene, **setting) for times in (1, 4)))
+    line = measure_detector([align_pair(pair)]).line
+    assert abs(line.gain - 8.0) < 3 * line.gain_error
+    assert line.gain_error < 0.6

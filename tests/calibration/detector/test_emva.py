@@ -76,7 +76,7 @@ def test_binned_flats_are_flagged_or_clean_and_filtered_ones_corrected():
     flats, darks, *_ = camera(2, change=lambda image: 0.75 * image + 0.25 * np.roll(image, 1, axis=1))
     found = calibrate_camera(flats[:4], darks[:1])
     assert found.verdict.grade == "doubtful"
-    assert "correlated pixels" in [one.name for one in found.verdict.findings]
+    assert "correlated pixels" in [one.reason for one in found.verdict.findings]
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.03)
 
 
@@ -222,7 +222,7 @@ def test_a_few_codes_of_a_low_gain_are_no_saturation():
     found = calibrate_camera([frames(level) for level in (100.0, 400.0, 1200.0, 3000.0)], [frames(0.0)])
     assert not found.figures.saturated
     assert found.figures.gain.median == pytest.approx(0.05, rel=0.03)
-    assert "coarse codes" in [one.name for one in found.verdict.findings]  # the read noise is 0.15 counts
+    assert "coarse codes" in [one.reason for one in found.verdict.findings]  # the read noise is 0.15 counts
 
 
 def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
@@ -233,7 +233,7 @@ def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
         return Burst(np.stack(made), calibration=True)
 
     found = calibrate_camera([frames(level) for level in (100.0, 400.0, 1200.0)], [frames(0.0)])
-    assert "clipped darkness" in [one.name for one in found.verdict.findings]
+    assert "clipped darkness" in [one.reason for one in found.verdict.findings]
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.03)
 
 
@@ -244,4 +244,4 @@ def test_image_lag_shows_in_flats_of_three_frames():
     for flat in flats:
         kept = np.concatenate([flat.frames[:1], flat.frames[:-1]])
         lagging.append(Burst(np.round(0.94 * flat.frames + 0.06 * kept), calibration=True))
-    assert "frames correlated" in [one.name for one in judge_camera(measure_camera(lagging, darks)).findings]
+    assert "frames correlated" in [one.reason for one in judge_camera(measure_camera(lagging, darks)).findings]

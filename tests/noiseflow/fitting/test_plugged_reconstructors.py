@@ -1,4 +1,4 @@
-"""Joint fits of signal models that users write, from a cold start and without options."""
+"""Joint fits of a signal model that a user writes, from a cold start and without options: many outliers."""
 
 from __future__ import annotations
 

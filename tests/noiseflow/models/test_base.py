@@ -28,7 +28,9 @@ MODELS = {
     "columns": lambda: noiseflow.ScanNoise(noiseflow.Gaussian(), along="column"),
     "maps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)),
     "rounded maps": lambda: noiseflow.Digitised(noiseflow.WithMaps(noiseflow.Gaussian(), torch.ones(5, 6)), 0.1),
+    "conditioned": lambda: noiseflow.Conditioned(noiseflow.Mixture(), {"gain": [1.0, 2.0]}).at({"gain": 1.5}),
     "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
+    "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }

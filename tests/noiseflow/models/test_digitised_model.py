@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -103,3 +105,51 @@ def test_a_model_that_keeps_only_half_of_its_likelihood_keeps_none_behind_limits
     setattr(inner, kept, lambda signal, *bounds: torch.zeros(len(signal), 2))
     model = noiseflow.Digitised(inner, 0.0, 0.0, 1.0)
     assert model.fixed_part(torch.full((3,), 0.5), torch.tensor([0.0, 0.4, 1.0])) is None
+
+
+def test_unequal_levels_are_recognised_matched_and_saved(tmp_path: Path) -> None:
+    """Counts stored as square roots: the levels hold four to twenty counts each, and midpoints miss how many."""
+    random = np.random.default_rng(3)
+    signal = random.uniform(20, 400, 30_000)
+    stored = np.round(2 * np.sqrt(random.poisson(signal))) ** 2 / 4
+    result = noiseflow.fit(noiseflow.SignalDependentGaussian(), signal.astype(np.float32), stored.astype(np.float32))
+    model = result.noise_model
+    assert len(result.digitisation.levels) == len(np.unique(stored))
+    level, counts = np.unique(stored, return_counts=True)
+    midpoints = noiseflow.Digitised(model.model, levels=level.tolist())
+    even = torch.from_numpy(np.sort(signal)[10::20])
+    matched, evenly = (
+        float((each(even).quadrature()[1].detach().mean(1) - torch.tensor(counts / 30_000)).abs().max())
+        for each in (model, midpoints)
+    )
+    assert matched < 0.001 < 0.002 < evenly
+    at = torch.tensor(60.0)
+    found = model(at)
+    mass = found.quadrature()[1].detach()
+    assert float(mass.sum()) == pytest.approx(1, abs=1e-6)
+    again = noiseflow.load(noiseflow.save(model, tmp_path / "coded.safetensors"))
+    assert torch.equal(again(at).quadrature()[1].detach(), mass)
+    drawn = found.sample((1000,), generator=torch.Generator().manual_seed(0))
+    assert set(drawn.tolist()) <= set(level.tolist())
+    assert float(found.cdf(torch.tensor(stored.max()))) == 1
+    equal = noiseflow.Digitised(noiseflow.Gaussian(3.0), 2.0)
+    coded = noiseflow.Digitised(noiseflow.Gaussian(3.0), levels=[2.0 * k for k in range(60)])
+    values, signals = torch.tensor([50.0, 52.0, 70.0]), torch.full((3,), 51.0)
+    for method in ("log_prob", "cdf", "cdf_below"):
+        assert torch.allclose(
+            getattr(coded(signals), method)(values), getattr(equal(signals), method)(values), atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("levels", [[1.0], [1.0, 3.0, 2.0]])
+def test_levels_that_do_not_increase_are_refused(levels: list[float]) -> None:
+    with pytest.raises(ValueError, match="levels"):
+        noiseflow.Digitised(noiseflow.Gaussian(), levels=levels)
+
+
+def test_a_level_that_the_fitted_pixels_lack_is_not_impossible() -> None:
+    signal = torch.rand(4000, generator=torch.Generator().manual_seed(0)) * 6 + 2
+    model = noiseflow.Digitised(noiseflow.Gaussian(1.0), levels=[float(k * k) for k in range(6)])
+    observation = model(signal).sample(generator=torch.Generator().manual_seed(1)).clamp(max=9.0)
+    assert model.match_levels(signal, observation)
+    assert torch.isfinite(model(signal[:5]).log_prob(torch.tensor([0.0, 4.0, 9.0, 16.0, 25.0]))).all()

@@ -76,3 +76,13 @@ def test_saved_and_loaded_it_is_the_same(tmp_path):
     model = noiseflow.ExcessNoise(3.0, 10.0, 1.5, excess_factor=1.6)
     loaded = noiseflow.load(noiseflow.save(model, tmp_path / "m.safetensors"))
     assert repr(loaded) == repr(model)
+
+
+@pytest.mark.parametrize("rate", [29.0, 31.0, 720.0, 1e5])
+def test_density_of_many_electrons_is_a_density(rate: float) -> None:
+    law = noiseflow.ExcessNoise(gain=1.0, read_noise=0.5, excess_factor=1.5)(torch.tensor(rate, dtype=torch.float64))
+    width = law.variance.detach().sqrt()
+    value = rate + width * torch.linspace(-8, 8, 2001, dtype=torch.float64)
+    density = law.log_prob(value).detach().exp()
+    assert float(torch.trapezoid(density, value)) == pytest.approx(1, abs=1e-6)
+    assert float(torch.trapezoid(density * (value - rate) ** 2, value)) == pytest.approx(float(width**2), rel=1e-5)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from recon.fields.regularisers import DirectionalVariation, TotalVariation, _differences, find_regulariser
+from recon.fields.regularisers import DirectionalVariation, TotalVariation, base, find_regulariser
 from recon.projection.projector import SliceProjector
 from recon.projection.tiles import Tiles
 
@@ -33,8 +33,8 @@ def by_formula(volume, discount, certain, smoothing):
 @pytest.fixture(params=[1, 3, 8], autouse=True)
 def layers(request, monkeypatch):
     """How many are computed at a time."""
-    monkeypatch.setattr(_differences, "_FEWEST", request.param)
-    monkeypatch.setattr(_differences, "_CACHED", 1)
+    monkeypatch.setattr(base, "_FEWEST", request.param)
+    monkeypatch.setattr(base, "_CACHED", 1)
 
 
 @pytest.mark.parametrize("depth", [1, 2, 9, 18])

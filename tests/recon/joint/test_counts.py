@@ -41,3 +41,15 @@ def test_the_joint_fit_of_counts_has_the_true_mass_and_is_not_below_least_square
     found = joint.signal_model.response()["offset"][0]
     assert found == pytest.approx(offset, abs=0.25 if noise is _clipped else 0.05)
     assert _psnr(volume, made.truth) > _psnr(least_squares.volume.attenuation, made.truth) - 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "gain"), [("smooth_blobs", 0.5), ("tilted_slab", None)])
+def test_the_regulariser_is_chosen_where_held_out_pixels_show_one(scene: str, gain: float | None) -> None:
+    made = independent_series(scene, poisson(10), "±60°/2°")
+    chosen = recon.reconstruct(made.series)
+    assert chosen.choices.get("regulariser") == (None if gain is None else "second-order")
+    if gain is not None:
+        usual = recon.reconstruct(made.series, regulariser="directional")
+        reached = [_psnr(each.volume.attenuation, made.truth) for each in (chosen, usual)]
+        assert reached[0] > reached[1] + gain

@@ -9,7 +9,7 @@ import torch
 import noiseflow
 from benchmarks import needle as benchmark_needle
 from recon.fields.kinds.voxels import VoxelField
-from recon.joint.candidates import Readings, noise_candidates
+from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import total_steps
 from recon.joint.signal_model import TomographySignal
@@ -65,7 +65,7 @@ def test_signal_without_gradients_follows_every_step():
         optimiser.step()
         with torch.no_grad():
             torch.testing.assert_close(model(everything), model.signal())
-            model.field.values.add_(0.1)
+            model.field.grids[0].add_(0.1)
             torch.testing.assert_close(model(everything), model.signal())
 
 
@@ -107,7 +107,7 @@ def test_a_step_after_any_change_sees_it():
     model.image_formation.requires_grad_(False)
     with torch.no_grad():
         before = model(torch.arange(model.num_pixels))
-        model.field.values += 1
+        model.field.grids[0] += 1
     assert (model.signal() < before).any()
     with torch.no_grad():
         model(torch.tensor([0]))  # after a step: its gradient is kept
@@ -120,15 +120,17 @@ def test_penalty_does_not_depend_on_the_unit_of_attenuation():
     small, large = small_signal_model(), small_signal_model()
     with torch.no_grad():
         large.field.scale.mul_(7.0)
-        small.field.values.add_(torch.rand(5, 6, 4, generator=torch.Generator().manual_seed(0)))
-        large.field.values.copy_(small.field.values)
+        small.field.grids[0].add_(torch.rand(5, 6, 4, generator=torch.Generator().manual_seed(0)))
+        large.field.grids[0].copy_(small.field.grids[0])
     torch.testing.assert_close(small.penalty(), large.penalty())
     torch.testing.assert_close(small_signal_model(weight=0.0).penalty(), torch.tensor(0.0))
 
 
 def _candidates(images: np.ndarray, signal: np.ndarray | float = 0.5) -> list[torch.nn.Module]:
     observation = torch.from_numpy(images.astype(np.float32))
-    found = Readings.of(images).given(observation, torch.from_numpy(np.broadcast_to(signal, images.shape).copy()), None)
+    found = PixelValues.of(images).given(
+        observation, torch.from_numpy(np.broadcast_to(signal, images.shape).copy()), None
+    )
     return noise_candidates(found, float((images <= found.low).mean()))
 
 
@@ -153,7 +155,7 @@ def test_counts_are_a_candidate_unless_the_lower_limit_clips():
 
 def test_no_signal_lies_below_what_the_pixel_values_allow():
     counts = np.random.default_rng(0).poisson(np.repeat([[0.0] * 20 + [30.0] * 20], 40, 0), (9, 40, 40)) + 7
-    readings = Readings.of(counts)
+    readings = PixelValues.of(counts)
     rounded, clipped = (noiseflow.Digitised(noiseflow.Gaussian(2.0), 1.0, low=low) for low in (-np.inf, 7.0))
     assert readings.least_signal(noiseflow.Gaussian(2.0)) == 7
     assert readings.least_signal(rounded) == pytest.approx(7, abs=0.01)
@@ -162,7 +164,7 @@ def test_no_signal_lies_below_what_the_pixel_values_allow():
 
 def test_where_there_is_little_noise_no_shape_is_learnt():
     images = np.random.default_rng(0).normal(0.5, 0.3, (3, 40, 40))
-    (only,) = noise_candidates(Readings.of(images).digitisation, 0.0, quiet=True)
+    (only,) = noise_candidates(PixelValues.of(images).digitisation, 0.0, quiet=True)
     assert isinstance(only, noiseflow.SignalDependentGaussian)
 
 

@@ -1,6 +1,7 @@
 """The plan as data: what will be done for six kinds of series, and that what is done is what was planned."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import noiseflow
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
+from recon.joint.run import run_fit
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import shells
@@ -20,102 +22,99 @@ PLANS = {
         Facts(),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      30  simple
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   adapt                        finalists   12  chosen
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
-        slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   choose weight                weights     24 x 4  chosen
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      15  simple
+        whole  fit                          signal      45  chosen
         """,
     ),
     "least squares, weight given": (
         Facts(choose_noise=False, simple_is_final=True, choose_weight=False),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      30  simple
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      20  simple, rate 0.6, warm-up
+        slab   adapt                        signal      12  simple
         slab   refine noise                 noise       20  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  simple, rate 0.6
+        whole  begin                        signal      15  simple
+        whole  fit                          signal      45  simple
         """,
     ),
     "everything chosen, large": (
         Facts(halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      30  simple
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   adapt                        finalists   12  chosen
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
-        slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   choose weight                weights     24 x 4  chosen
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      15  simple, half the resolution
+        whole  go on                        signal      15  chosen, half the resolution
+        whole  fit                          signal      30  chosen
         """,
     ),
     "wide": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=2),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, a quarter of the resolution
-        whole  go on                        signal      222  chosen, rate 0.6, a quarter of the resolution
-        whole  go on at half                signal      148  chosen, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      30  simple, a quarter of the resolution
+        whole  go on                        signal      90  chosen, a quarter of the resolution
+        whole  go on at half                signal      60  chosen, half the resolution
+        whole  fit                          signal      30  chosen
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      15  simple, half the resolution
+        whole  go on                        signal      15  chosen, half the resolution
+        whole  fit                          signal      30  chosen
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      15  simple
+        whole  fit                          signal      45  chosen
         """,
     ),
     "quiet, noise model given": (
         Facts(choose_noise=False, choose_weight=False, quiet=True, hold_offset=True),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   settle                       signal      30  simple, offset held
         slab   measure noise                noise       10  simple
         slab   learn noise                  noise       20  chosen
-        slab   adapt                        signal      20  chosen, rate 0.6, offset held, warm-up
+        slab   adapt                        signal      12  chosen, offset held
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      60  simple, rate 0.6, offset held
-        whole  go on                        signal      120  simple, rate 0.6, offset held
+        whole  begin                        signal      20  simple, offset held
+        whole  go on                        signal      40  simple, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, offset held
+        whole  fit                          signal      20  chosen, offset held
         """,
     ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   settle                       signal      30  simple, offset held
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
+        slab   adapt                        signal      12  simple, offset held
         slab   refine noise                 noise       20  simple
-        slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
-        slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
+        slab   choose weight                weights     40 x 4  simple, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      60  simple, rate 0.6, offset held, half the resolution
-        whole  go on                        signal      60  simple, rate 0.6, offset held, half the resolution
-        whole  fit                          signal      120  simple, rate 0.6, offset held
+        whole  begin                        signal      20  simple, offset held, half the resolution
+        whole  go on                        signal      20  simple, offset held, half the resolution
+        whole  fit                          signal      40  simple, offset held
         whole  describe noise               noise       600  chosen
         """,
     ),
@@ -202,3 +201,22 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
 def test_stages_are_values():
     assert FitStage("a", "signal", "whole", "simple", 3) == FitStage("a", "signal", "whole", "simple", 3)
     assert total_steps([FitStage("a", "weights", "slab", "simple", 3, fits=5)]) == 15
+
+
+def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None:
+    clean, _ = clean_tilt_series(
+        shells(16, generator=np.random.default_rng(1), count=4),
+        np.arange(-60, 61, 10.0),
+        acquisition=ACQUISITIONS["skewed"],
+    )
+    weights: dict[str, float] = {}
+
+    def watched(name: str, noise_model: Any, signal: Any, observation: Any, **options: Any) -> noiseflow.FitResult:
+        weights[name] = getattr(signal, "weight", np.nan)
+        return run_fit(name, noise_model, signal, observation, **options)
+
+    once = Schedule(settle=1, candidate=1, adapt=1, refine=1, learn=1, describe=1, whole=4)
+    noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=1)
+    JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
+    assert weights["settle"] == weights["adapt"] < 1
+    assert weights["begin"] == weights["fit"] == 16

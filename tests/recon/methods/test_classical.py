@@ -12,6 +12,7 @@ from recon.metrics.metrics import compare, fourier_shell_correlation, match
 from recon.projection.projector import SliceProjector
 from recon.projection.sirt import sirt
 from recon.projection.wbp import wbp
+from recon.series.masks import plausible
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import make_phantom, shells
@@ -137,3 +138,29 @@ def test_tilt_range_includes_both_ends():
     for text in ("1:2", "a:b:c", "0:10:-1", "0:10:0"):
         with pytest.raises(ValueError, match="tilts"):
             tilt_range(text)
+
+
+@pytest.mark.parametrize(("method", "most"), [("sirt", 0.6), ("wbp", 0.6)])
+def test_masked_pixels_cost_little_and_are_never_read(method, most):
+    density = make_phantom("particles", 24, generator=np.random.default_rng(0))
+    series, unit = clean_tilt_series(density, np.arange(-90, 90, 5.0))
+    noisy = add_noise(series, SkewedNoise(0.02), seed=1)
+    mask, grid = np.ones(noisy.images.shape, bool), VolumeGrid.of(noisy)
+    for tilt in range(len(mask)):
+        mask[tilt, 4 + tilt % 12 : 10 + tilt % 12, 6 + tilt % 9 : 12 + tilt % 9] = False
+    spoilt = [plausible(replace(noisy, images=np.where(mask, noisy.images, bad), mask=mask)) for bad in (0, 1e6)]
+    whole, low, high = (reconstruct(each, grid, method=method).volume.attenuation for each in (noisy, *spoilt))
+    np.testing.assert_array_equal(low, high)
+    truth = density * unit
+    assert compare(low, truth).psnr > compare(whole, truth).psnr - most
+
+
+def test_rows_that_no_image_shows_take_the_values_beside_them():
+    density = np.zeros((16, 12, 16))
+    density[5:11, :, 4:9] = 1.0
+    series, _ = clean_tilt_series(density, np.arange(-90, 90, 10.0))
+    mask = np.ones(series.images.shape, bool)
+    mask[:, 5:7] = False
+    dead = plausible(replace(series, images=np.where(mask, series.images, 0), mask=mask))
+    volume = reconstruct(dead, VolumeGrid.of(dead), method="sirt", num_steps=20).volume.attenuation
+    np.testing.assert_allclose(volume[:, 5], volume[:, 4], atol=1e-5)

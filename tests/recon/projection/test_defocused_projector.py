@@ -15,10 +15,10 @@ from recon.projection.defocused_projector import (
     KERNELS,
     DefocusedProjector,
     ImageDefocusedProjector,
-    jittered_projection,
     with_defocus,
 )
 from recon.projection.projector import SliceProjector
+from recon.projection.rays import march, view_matrices, view_rays
 from recon.projection.sirt import sirt
 from recon.series.tilt_series import VolumeGrid
 
@@ -79,6 +79,17 @@ def test_both_kernels_agree_on_a_thin_specimen():
     # both round widths, to the quarter of a pixel or its middle: 0.125 of 1 to 2 pixels
     assert float((depth - image).square().mean()) < 0.05 * float(depth.square().mean())
     assert float((sharp(volume) - image).square().mean()) > 0.2 * float(depth.square().mean())
+
+
+def jittered_projection(volume, tilt_angles, convergence, *, num_rays, generator):
+    """The same images by Monte Carlo: the mean over rays with random slopes through each pixel's place in the focal plane."""
+    views = view_matrices(tilt_angles)
+    _, height, width = volume.shape
+    total = volume.new_zeros(len(views), height, width)
+    for _ in range(num_rays):
+        slopes = convergence * torch.randn(*total.shape, 2, generator=generator, dtype=torch.float64)
+        total = total + march(volume, *view_rays(views, height=height, width=width, spread=slopes))
+    return total / num_rays
 
 
 def test_exact_and_jittered_blur_agree():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from noiseflow import io
-from recon.scale.many import jobs_of, read_table
+from noiseflow.runs.ownership import is_own
+from recon.scale.many import Job, finished, jobs_of, read_table, write_table
 from recon.series.tilt_series import write_tilt_series
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -45,6 +46,18 @@ def test_a_series_that_fails_stops_no_other_and_is_tried_again(folder, tmp_path)
     assert [row["status"] for row in found["series"]] == ["done"] * 3
     assert found["left_out"] == ["truth.mrc"]
     assert (tmp_path / "out" / "a.mrc").stat().st_mtime_ns == written
+
+
+def test_volumes_made_with_other_options_are_not_finished(tmp_path):
+    volume, words = tmp_path / "a.mrc", ("--method", "sirt", "--resume")
+    volume.touch()
+    write_table(tmp_path / "t.csv", [{"volume": str(volume), "status": "done", "options": "--method sirt"}])
+    rows = read_table(tmp_path / "t.csv")
+    assert finished(rows, [Job(tmp_path / "tilts.mrc", volume, words)]) == rows == finished(rows, [])
+    assert finished(rows, [Job(tmp_path / "tilts.mrc", volume, ("--method", "wbp"))]) == []
+    assert is_own(tmp_path / "t.csv")
+    volume.unlink()
+    assert finished(rows, []) == []
 
 
 @pytest.mark.usefixtures("folder")

@@ -12,6 +12,8 @@ from noiseflow import io
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # the transforms of the files are meant
+
 ANGLES = np.array([-40.0, 0.0, 40.0])
 IMAGES = np.random.default_rng(0).random((3, 9, 9)).astype(np.float32)
 

@@ -16,6 +16,8 @@ from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.verdict.judge import judge
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant
+
 GOLDEN = 180 * (np.sqrt(5) - 1) / 2
 ORDERS = {
     "±60°": np.arange(-60, 61, 3.0),

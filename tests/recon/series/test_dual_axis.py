@@ -14,6 +14,8 @@ from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom
 from recon.verdict.judge import judge
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # frames turned by 90° are cut
+
 ANGLES = np.arange(-60, 61, 5.0)
 
 

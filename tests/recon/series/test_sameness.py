@@ -25,6 +25,8 @@ from recon.series.views import dark_level, in_order, view_numbers, without_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant
+
 ANGLES = np.arange(-60, 61, 3.0)
 Array = np.ndarray
 
@@ -269,7 +271,7 @@ def test_order_is_restored_and_a_level_taken_off_exactly() -> None:
     assert without_level(replace(given, mode="transmission"))[1] == 0
 
 
-@pytest.mark.parametrize("flips", itertools.product((False, True), repeat=3))
+@pytest.mark.parametrize("flips", list(itertools.product((False, True), repeat=3)))
 def test_a_volume_in_a_file_is_flipped_there_as_one_in_memory_is(tmp_path, flips):
     volume = np.random.default_rng(0).random((5, 3, 4), np.float32)
     in_file = np.lib.format.open_memmap(tmp_path / "volume.npy", "w+", np.float32, volume.shape)

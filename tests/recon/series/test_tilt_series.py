@@ -105,3 +105,8 @@ def test_tensors_are_taken_and_the_value_tells_what_it_holds():
     assert isinstance(series.images, np.ndarray)
     assert repr(series) == "TiltSeries(3 x 6 x 8 float32, -40° to 40°, 4.5 Å per pixel, linear)"
     assert repr(Volume(images())) == "Volume(3 x 6 x 8 float32, unknown voxel size)"
+
+
+def test_a_transposed_stack_is_answered_by_its_axis() -> None:
+    with pytest.raises(ValueError, match="axis x has 7 entries"):
+        TiltSeries(np.random.default_rng(0).random((5, 6, 7)), np.arange(7.0))

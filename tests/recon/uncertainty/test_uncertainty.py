@@ -38,6 +38,7 @@ from recon.uncertainty import (
     mean_of_region,
     predictive_ranks,
     share_within,
+    unseen_part,
     unseen_range,
     unseen_share,
     volume_above,
@@ -155,7 +156,9 @@ def test_waves_that_no_tilt_saw_are_told_from_those_that_one_did():
     for degrees, share in ((90, 1), (75, 1), (0, 0), (50, 0), (-35, 0), (130, 1)):
         towards = 6 * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
         wave = np.cos(2 * np.pi / 32 * (x * round(towards[0]) + z * round(towards[1])))
-        assert unseen_share(np.repeat(wave[:, None], 4, 1), angles) == pytest.approx(share, abs=1e-9)
+        volume = np.repeat(wave[:, None], 4, 1)
+        assert unseen_share(volume, angles) == pytest.approx(share, abs=1e-9)
+        np.testing.assert_allclose(unseen_part(1 + volume, angles), share * volume, atol=1e-5)
 
 
 def test_figures_of_a_volume_carry_intervals(tmp_path):

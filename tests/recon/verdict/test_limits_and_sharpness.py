@@ -14,9 +14,10 @@ from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
 from noiseflow.checks import Finding, Guard, run
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.verdict import tilts
+from recon.verdict import pixels, tilts
 from recon.verdict.case import Case
 from recon.verdict.coarse import coarse_series
+from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import blurs
 from recon.verdict.table import CHECKS
 
@@ -158,3 +159,14 @@ def test_images_scaled_one_by_one_are_named() -> None:
     assert tilts.normalised(TiltSeries(images, np.arange(-60.0, 61, 3), mode="linear")).value == 0
     scaled = (images - images.mean((1, 2), keepdims=True)) / images.std((1, 2), keepdims=True)
     assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1
+
+
+@pytest.mark.parametrize("mean", [0.05, 10.0])
+def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float) -> None:
+    place = np.linspace(-1, 1, 32)
+    signal = np.broadcast_to(6 * mean * np.exp(-8 * (place**2 + place[:, None] ** 2)), (31, 32, 32))
+    counts = np.random.default_rng(0).poisson(signal).astype(np.float32)
+    angles = np.linspace(-60, 60, 31)
+    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value == 0
+    counts[:, 12:20, 12:20] = 0
+    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value > 0

@@ -13,7 +13,7 @@ from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import make_scene
-from noiseflow.checks import Finding, Verdict
+from noiseflow.checks import Verdict
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
@@ -52,7 +52,7 @@ def larger(seed: int = 0) -> Any:
     return make_scene(48, phantom="particles", noise="low-dose", tilts=TILTS, seed=seed)
 
 
-def judged(series: TiltSeries, thickness: int | None = None, method: str = "l2") -> Verdict[Finding]:
+def judged(series: TiltSeries, thickness: int | None = None, method: str = "l2") -> Verdict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         screening = screen(series)

@@ -1,0 +1,169 @@
+"""The default fit on series that nobody tuned it for, against other methods that are tuned against the ground truth.
+
+    python -m benchmarks.pages.independent run [--half judge] [--only beads] [--most 20]    # cells that are there are kept
+    python -m benchmarks.pages.independent page                                             # independent.md from the JSON
+
+Scenes, projector and noise are those of tests/independent_scenes.py, which share no code with the library. Each cell is saved
+when it is done, in results/independent.json. The order of cells covers scenes, noises and tilt ranges evenly from the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.pages import FOLDER
+from benchmarks.pages.joint_page import table
+from benchmarks.provenance import measured_on
+from benchmarks.scenes import Results
+from noiseflow.commands.console import Output
+from noiseflow.io import atomic_path
+from recon import VolumeGrid, reconstruct, sirt
+from recon.methods._classical import LineIntegralProblem
+from tests.independent_scenes import NOISES, RANGES, SCENES, IndependentSeries, independent_series
+
+HALVES = {"learn": list(SCENES)[::2], "judge": list(SCENES)[1::2]}
+"""Scenes that were looked at while the fit was changed, and scenes that only judge it."""
+_ITERATIONS = (5, 10, 20, 40, 80, 160)
+_EQUAL = 0.1  # dB; two fits of a scene differ by that much
+Row = dict[str, Any]
+
+
+def cells(size: int) -> list[str]:
+    """All cells, ``scene; noise; tilts; size``."""
+    scenes, noises, ranges = list(SCENES), list(NOISES), list(RANGES)
+    places = [(turn, place) for turn in range(len(noises) * len(ranges)) for place in range(len(scenes))]
+    return [
+        "; ".join((scenes[i], noises[(i + t) % len(noises)], ranges[(t + t // 8 + i // 2) % len(ranges)], str(size)))
+        for t, i in places
+    ]
+
+
+def psnr(volume: Any, made: IndependentSeries) -> float:
+    """Volume PSNR relative to the largest density, dB; nothing is rescaled."""
+    return float(10 * np.log10(made.truth.max() ** 2 / np.mean((volume - made.truth) ** 2)))
+
+
+def best_weight(made: IndependentSeries, method: str, first: float) -> tuple[float, float]:
+    """The highest PSNR among weights on a ladder of factors of 2 around the best, and its weight."""
+    tried: dict[int, float] = {}
+
+    def visit(rung: int) -> float:
+        if rung not in tried:
+            found = reconstruct(made.series, method=method, weight=first * 2.0**rung)
+            tried[rung] = psnr(found.volume.attenuation, made)
+        return tried[rung]
+
+    best = 0
+    while (better := max((best, best + 1, best - 1), key=visit)) != best:
+        best = better
+    return tried[best], first * 2.0**best
+
+
+def best_sirt(made: IndependentSeries) -> float:
+    """The highest PSNR of SIRT among numbers of iterations."""
+    problem = LineIntegralProblem.of(made.series, VolumeGrid.of(made.series))
+    volume, found, done = None, list[float](), 0
+    for count in _ITERATIONS:
+        volume = sirt(problem.line_integrals, problem.projector, num_iterations=count - done, start=volume)
+        done = count
+        found.append(psnr(volume.numpy(), made))
+    return max(found)
+
+
+def measure(cell: str) -> Row:
+    """The default, and other methods at what the truth calls their best."""
+    scene, noise, tilts, size = cell.split("; ")
+    made = independent_series(scene, noise, tilts, size=int(size))
+    found = reconstruct(made.series)
+    volume, choices = found.volume.attenuation, found.choices
+    row: Row = {"default": psnr(volume, made), "mass": float(volume.sum() / made.truth.sum()), "choices": choices}
+    # least squares counts squares in units of its own noise, as the joint fit does
+    row["l2"], weight = best_weight(made, "l2", float(choices["weight"]))
+    row["tv"], _ = best_weight(made, "tv", weight)
+    row["sirt"] = best_sirt(made)
+    return row
+
+
+def margin(row: Row) -> float:
+    """The default's gain over the best of the others, dB."""
+    return float(row["default"] - max(row["l2"], row["tv"], row["sirt"]))
+
+
+def page(content: dict[str, Any]) -> str:
+    """The page as Markdown, losses first."""
+    rows: dict[str, Row] = dict(sorted(content["cells"].items(), key=lambda item: margin(item[1])))
+    lines = []
+    for name, scenes in {**HALVES, "all": list(SCENES)}.items():
+        gains = [margin(row) for key, row in rows.items() if key.split("; ")[0] in scenes]
+        if gains:
+            kept = sum(gain > -_EQUAL for gain in gains)
+            words = f"{kept} of {len(gains)} ({kept / len(gains):.0%})"
+            lines.append([name, words, f"{statistics.mean(gains):+.2f}", f"{min(gains):+.2f}"])
+    cells_ = [
+        [
+            *key.split("; "),
+            f"{margin(row):+.2f}",
+            *(f"{row[name]:.2f}" for name in ("default", "l2", "tv", "sirt")),
+            f"{row['mass']:.3f}",
+            f"{row['choices']['noise model']}, weight {row['choices']['weight']:.2g}",
+        ]
+        for key, row in rows.items()
+    ]
+    head = (
+        "# Independent scenes\n\n"
+        "The default is compared with the best of three methods, each tuned against the ground truth: least squares with the "
+        "directional prior (`l2`) and with total variation (`tv`), both at the best weight of a ladder of factors of 2, and "
+        "SIRT at the best number of iterations. Scenes, their projector and their noise share no code with the library "
+        "(`tests/independent_scenes.py`). The numbers are volume PSNR in dB, without any rescaling, and the mass of the "
+        "volume relative to the truth.\n\n"
+        "Changes of the fit were made with the scenes `learn` in view; the scenes `judge` were only measured. Not all of the "
+        f"{len(cells(0))} cells have been measured; any number of the first ones covers scenes, noises and tilt ranges evenly. "
+        "Cells of commits before 9005e41 lack the choice of the regulariser.\n\n"
+        "The truncated object at 0…177° with outliers is a failure, and its cause is not known. Without the tilts beyond 60° it "
+        "is the same (14.2 dB). The flexible noise models are suspected: what leaves the field of view looks like outliers. "
+        "Least squares at its default weight has not been measured there."
+        "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
+    )
+    summary = table(["scenes", f"default within {_EQUAL} dB of the best", "mean gain (dB)", "worst (dB)"], lines)
+    header = ["scene", "noise", "tilts", "voxels", "gain (dB)", "default", "l2", "tv", "sirt", "mass", "chosen"]
+    return "\n\n".join([head, summary, table(header, cells_), measured_on([content])]) + "\n"
+
+
+def main() -> None:
+    """Run the chosen cells and save each, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("run", "page"))
+    parser.add_argument("--half", choices=HALVES, help="of the scenes; all by default")
+    parser.add_argument("--only", default="", help="cells whose name contains this")
+    parser.add_argument("--most", type=int, help="number of cells to measure")
+    parser.add_argument("--size", type=int, default=32, help="voxels along each edge")
+    parser.add_argument("--again", action="store_true", help="measure the chosen cells again")
+    parser.add_argument("--out", type=Path, default=FOLDER / "results" / "independent.json")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    results, output = Results(options.out, "independent"), Output(json_mode=False)
+    if options.part == "page":
+        with atomic_path(FOLDER / "independent.md") as partial:
+            partial.write_text(page(results.content), encoding="utf-8")
+        return
+    scenes = HALVES.get(options.half, list(SCENES))
+    chosen = [cell for cell in cells(options.size) if cell.split("; ")[0] in scenes and options.only in cell]
+    for cell in chosen[: options.most]:
+        if options.again:
+            results.forget(cell)
+        row = results.cell(cell, lambda name=cell: measure(name))  # type: ignore[misc]
+        output.line(f"{cell}: {margin(row):+.2f} dB, default {row['default']:.2f}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"independent.py: {error}")

@@ -1,0 +1,119 @@
+"""The distribution of observations that take a few levels, not equally spaced, such as square roots or tables of codes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import constraints
+
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+
+# Distance from a level, relative to the smallest gap, up to which a value counts as that level: more than number formats round.
+_ROUNDED = 1e-3
+# Share of the former edges in matched ones: a level that the data lack keeps a thousandth of its width, and is not impossible.
+_KEPT = 1e-3
+
+
+class CodedDistribution(NoiseDistribution):
+    """The levels of a converter: level j represents the values before it in (edges[j − 1], edges[j]].
+
+    A value that is no level has the probability of the nearest one: rare levels may be missing in the data of a fit.
+
+    Args:
+        levels: (K,) levels, increasing, at least two.
+        edges: (K − 1,) values before the converter that separate them, increasing.
+        base: distribution before the converter: any torch distribution of one number per pixel.
+    """
+
+    per_pixel = ()
+    discrete = True
+    has_rsample = False  # type: ignore[misc]
+
+    def __init__(self, levels: Tensor, edges: Tensor, base: Any) -> None:
+        base = as_noise_distribution(base)
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base: NoiseDistribution = base
+        self.levels, self.edges = levels.to(base.device).double(), edges.to(base.device).double()
+        self._bounds = torch.nn.functional.pad(self.edges, (1, 1), value=math.inf)
+        self._bounds[0] = -math.inf
+
+    @property
+    def independent(self) -> bool:  # type: ignore[override]
+        """Whether pixels can be evaluated independently."""
+        return self.base.independent
+
+    def rescaled(self, scale: Tensor, shift: Tensor) -> CodedDistribution:
+        return CodedDistribution(self.levels, self.edges, self.base.rescaled(scale, shift))
+
+    def _bound(self, value: Tensor, *, before: bool = False) -> Tensor:
+        """The upper end, before the converter, of the levels up to a value, or only of those before it."""
+        slack = (-_ROUNDED if before else _ROUNDED) * torch.diff(self.levels).amin()
+        return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        place = torch.bucketize(value.double().contiguous(), (self.levels[1:] + self.levels[:-1]) / 2)
+        return self.base.log_interval_prob(self._bounds[place], self._bounds[place + 1])
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.base.log_interval_prob(self._bound(low), self._bound(high))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self.base.cdf(self._bound(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self.base.cdf(self._bound(value, before=True))
+
+    def code(self, value: Tensor) -> Tensor:
+        """The levels of values before the converter."""
+        return self.levels[torch.searchsorted(self.edges, value.double().contiguous())].to(value)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.code(self.base.icdf(value))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        return self.code(self.base.sample(sample_shape, generator=generator))
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The lowest and the highest level."""
+        return self.levels[0], self.levels[-1]
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The range of the levels."""
+        return constraints.interval(self.levels[0], self.levels[-1])  # type: ignore[no-untyped-call]
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        """All levels and their probabilities, (K, *batch) each."""
+        nodes = self.levels.view(-1, *(1,) * len(self.batch_shape)).expand(-1, *self.batch_shape)
+        return nodes, torch.exp(self.log_prob(nodes))
+
+
+@torch.no_grad()
+def matching_edges(base: NoiseDistribution, weight: Tensor, shares: Tensor, start: Tensor) -> Tensor:
+    """The edges at which the mean distribution function of pixels is that of their observations.
+
+    Args:
+        base: distribution before the converter at (S,) signals.
+        weight: (S,) shares of the pixels with these signals.
+        shares: (K,) shares of the pixels at each level.
+        start: (K − 1,) edges near the answer, increasing; (K + 1,) with the ends of the range to search.
+
+    Returns:
+        (K − 1,) edges, increasing: those of a histogram test of a converter.
+    """
+    # Between neighbouring starts, the distribution function is nearly a line; a quarter of the gap is a curve's hundredth.
+    parts = torch.linspace(0, 1, 5, dtype=torch.float64, device=start.device)[:-1]
+    grid = torch.cat([(start[:-1, None] + torch.diff(start)[:, None] * parts).reshape(-1), start[-1:]])
+    below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
+    wanted = torch.cumsum(shares, 0)[:-1].contiguous()
+    after = torch.searchsorted(below, wanted).clamp(1, grid.numel() - 1)
+    slope = (below[after] - below[after - 1]).clamp(min=torch.finfo(torch.float64).tiny)
+    share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
+    found = grid[after - 1] + share * (grid[after] - grid[after - 1])
+    return torch.lerp(found, start[1:-1], _KEPT)

@@ -1,0 +1,138 @@
+"""Choice of the regulariser weight by the likelihood of held-out pixels."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec
+
+import numpy as np
+from torch import Tensor, nn
+
+from noiseflow.fitting.result import FitResult, WeightChoice
+
+_Given = ParamSpec("_Given")
+# Users state the scale of their penalty by guess: this ladder reaches a thousandth and a thousand times of it
+_FACTOR, _MOST = 4.0, 10
+HELD_OUT = "held-out"
+
+
+def choose_weight(
+    held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8, evidence: float = 0.0
+) -> WeightChoice:
+    """Find the weight with the lowest held-out NLL.
+
+    A geometric ladder of weights brackets the minimum. Half a rung towards the lower neighbour is tried next, then the vertex of
+    a parabola.
+
+    Args:
+        held_out_nll: function that fits with a weight and returns the held-out NLL.
+        first: initial weight.
+        factor: ratio of neighbouring rungs.
+        most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
+        evidence: the ladder also ends where a further rung lowers the NLL by less than this.
+    """
+    tried: dict[float, float] = {}
+
+    def visit(rung: float) -> None:
+        nll = held_out_nll(first * factor**rung)
+        tried[rung] = nll if math.isfinite(nll) else math.inf
+
+    def lowest() -> float:
+        return min(tried, key=lambda rung: tried[rung])
+
+    visit(0.0)
+    while len(tried) < most:
+        middle = lowest()
+        missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
+        if not missing:
+            # the NLL rises faster above the minimum than below: a parabola through whole rungs would be biased to low weights
+            visit(middle + math.copysign(0.5, tried[middle - 1] - tried[middle + 1]))
+            break
+        visit(missing[0])
+        if 0 < tried[middle] - tried[missing[0]] < evidence:
+            break
+    return WeightChoice(first * factor ** _vertex(tried), {first * factor**rung: nll for rung, nll in tried.items()})
+
+
+def _vertex(tried: dict[float, float]) -> float:
+    """The vertex of the parabola through the lowest rung and its neighbours."""
+    best = min(tried, key=lambda rung: tried[rung])
+    below = max((rung for rung in tried if rung < best), default=None)
+    above = min((rung for rung in tried if rung > best), default=None)
+    if below is None or above is None or not all(math.isfinite(tried[rung]) for rung in (below, above)):
+        return best
+    left, right = (tried[best] - tried[below]) / (best - below), (tried[above] - tried[best]) / (above - best)
+    if not right > left:
+        return best
+    # zero of the linearly interpolated slope between the midpoints to the neighbours
+    return 0.5 * (below + best) - left * 0.5 * (above - below) / (right - left)
+
+
+def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:
+    """Decorator of a fit: ``weights="held-out"`` chooses the factor on the ``penalty()`` of its signal model.
+
+    All fits start from the same models and hold out the same pixels, so that only the factor differs; the last one, with the
+    chosen factor, is returned with the choice.
+    """
+    signature = inspect.signature(fit)
+
+    @wraps(fit)
+    def chosen(*args: _Given.args, **kwargs: _Given.kwargs) -> FitResult:
+        given: dict[str, Any] = dict(signature.bind(*args, **kwargs).arguments)
+        if not isinstance(given.get("weights"), str):
+            return fit(*args, **kwargs)
+        signal_model, generator = given["signal"], given.get("generator")
+        if given.pop("weights") != HELD_OUT or not hasattr(signal_model, "penalty"):
+            raise ValueError(f'weights is a tensor, or "{HELD_OUT}" for a signal model that has a penalty() to weight')
+        if given.get("checkpoint") is not None or given.get("resume") is not None:
+            raise ValueError(
+                "a choice of the weight keeps no checkpoints: choose it first, then fit with the penalty so weighted"
+            )
+        models = [given["noise_model"], signal_model]
+        starts = [copy.deepcopy(model.state_dict()) for model in models]
+        generator_state = None if generator is None else generator.get_state()
+
+        def fitted(weight: float) -> FitResult:
+            for model, start in zip(models, starts, strict=True):
+                model.load_state_dict(start)
+            if generator is not None:
+                generator.set_state(generator_state)
+            return fit(**given | {"signal": WeightedPenalty(signal_model, weight)})  # type: ignore[call-arg]
+
+        held_out = given.get("held_out", signature.parameters["held_out"].default)
+        judged = float(held_out.sum()) if np.ndim(held_out) else held_out * math.prod(given["observation"].shape)
+        # one nat of all held-out pixels together is no evidence
+        options: dict[str, Any] = {"factor": _FACTOR, "most": _MOST, "evidence": 1 / judged}
+        choice = choose_weight(lambda weight: fitted(weight).last_nll, 1.0, **options)
+        result = fitted(choice.weight)
+        result.weight_choice = choice
+        return result
+
+    return chosen
+
+
+class WeightedPenalty(nn.Module):
+    """A signal model with a factor on its ``penalty()``; everything else is that of the model."""
+
+    def __init__(self, model: nn.Module, weight: float) -> None:
+        super().__init__()
+        self.model, self.weight = model, weight
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return getattr(super().__getattr__("model"), name)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        predicted: Tensor = self.model(pixels)
+        return predicted
+
+    def penalty(self) -> Tensor:
+        """The weighted penalty, nats per pixel."""
+        penalty: Tensor = self.model.penalty()  # type: ignore[operator]
+        return self.weight * penalty

@@ -1,0 +1,182 @@
+"""Noise that depends on more than the signal, such as the gain, the dwell time or the camera."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from noiseflow.arguments import real
+from noiseflow.distributions.image_pixels import Signal
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import ModelAround
+
+# Positive conditions that span more than this ratio, such as gains and exposure times, act by their logarithm.
+_LOGARITHMIC = 4.0
+# Relative excess over the range of the fit that is rounding.
+_ROUNDED = 1e-6
+
+
+class Conditioned(ModelAround):
+    """Noise models at a grid of values of named conditions; between them, their parameters are interpolated linearly.
+
+    ``fit(model, signal, observation, condition={"gain": …})`` makes one from any single-pixel model. Positive conditions that
+    span more than a factor of four are interpolated in their logarithm.
+
+    Args:
+        model: the noise model at one condition.
+        values: values of each condition in the grid, increasing, by name.
+
+    Raises:
+        ValueError: there is no condition, or its values do not increase.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> signal = torch.linspace(10.0, 100.0, 8000)
+        >>> gain = torch.tensor([1.0, 2.0]).repeat(4000)
+        >>> observation = signal + gain * torch.randn(8000, generator=torch.Generator().manual_seed(0))
+        >>> noise = noiseflow.fit(noiseflow.Gaussian(), signal, observation, condition={"gain": gain}).noise_model
+        >>> between = noise(torch.tensor(50.0), condition={"gain": 1.5})
+        >>> bool(1.3 < between.stddev < 1.6)
+        True
+    """
+
+    fits_directly = False
+
+    def __init__(self, model: nn.Module, values: Mapping[str, Sequence[float]]) -> None:
+        super().__init__(model)
+        self.values = {name: tuple(map(float, each)) for name, each in values.items()}
+        if not self.values or not all(
+            each and list(each) == sorted(set(each)) and all(map(math.isfinite, each)) for each in self.values.values()
+        ):
+            raise ValueError('give the values of at least one condition, increasing, such as {"gain": [1.0, 2.0, 4.0]}')
+        sizes = [len(each) for each in self.values.values()]
+        for name, tensor in self.model.state_dict().items():
+            self.register_buffer(_stored(name), tensor.detach().expand(*sizes, *tensor.shape).clone())
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """The smallest and the largest value of each condition."""
+        return {name: (each[0], each[-1]) for name, each in self.values.items()}
+
+    @torch.no_grad()
+    def set(self, place: tuple[int, ...], model: NoiseModelBase) -> None:
+        """Set the model at one place of the grid.
+
+        Args:
+            place: index of the value of each condition.
+            model: a model of the kind of the inner one.
+        """
+        for name, tensor in model.state_dict().items():
+            getattr(self, _stored(name))[place] = tensor
+
+    @torch.no_grad()
+    def without(self, name: str, place: int) -> Conditioned:
+        """The same models without those at one value of a condition.
+
+        Args:
+            name: the condition.
+            place: index of the value.
+        """
+        axis, values = list(self.values).index(name), dict(self.values)
+        values[name] = values[name][:place] + values[name][place + 1 :]
+        found = Conditioned(self.model, values)
+        for part in self.model.state_dict():
+            grid: Tensor = getattr(self, _stored(part))
+            kept = [i for i in range(grid.shape[axis]) if i != place]
+            getattr(found, _stored(part)).copy_(grid.index_select(axis, torch.tensor(kept, device=grid.device)))
+        return found
+
+    @torch.no_grad()
+    def at(self, condition: Mapping[str, float]) -> NoiseModelBase:
+        """The noise model at one condition, to sample, evaluate or save like any other.
+
+        Args:
+            condition: a number for each name.
+
+        Raises:
+            ValueError: names differ, or a value lies outside the range of the fit.
+        """
+        if set(condition) != set(self.values):
+            raise ValueError(
+                f"this model needs the conditions {', '.join(self.values)}; given: {', '.join(condition) or 'none'}"
+            )
+        weights = [self._weights(name, float(condition[name])) for name in self.values]
+        found = copy.deepcopy(self.model)
+        state = found.state_dict()
+        for name in state:
+            grid: Tensor = getattr(self, _stored(name))
+            parts = (
+                (math.prod(w for _, w in corner), grid[tuple(i for i, _ in corner)]) for corner in product(*weights)
+            )
+            state[name].copy_(sum(share * part for share, part in parts))
+        found.requires_grad_(False)
+        return found
+
+    def _weights(self, name: str, value: float) -> list[tuple[int, float]]:
+        """Neighbours in the grid of a value, and their weights."""
+        values = self.values[name]
+        slack = _ROUNDED * max(abs(values[0]), abs(values[-1]))
+        if not values[0] - slack <= value <= values[-1] + slack:
+            raise ValueError(
+                f"{name}={value:g} is outside the range of the fit, {values[0]:g} … {values[-1]:g}; fit a wider range"
+            )
+        if len(values) == 1:
+            return [(0, 1.0)]
+        scale = math.log if values[0] > 0 and values[-1] > _LOGARITHMIC * values[0] else float
+        after = next((i for i, each in enumerate(values[:-1]) if value < each), len(values) - 1) or 1
+        low, high = scale(values[after - 1]), scale(values[after])
+        share = min(max((scale(min(max(value, values[0]), values[-1])) - low) / (high - low), 0.0), 1.0)
+        return [(after - 1, 1 - share), (after, share)]
+
+    def __call__(self, signal: Any, condition: Mapping[str, float] | None = None) -> Any:
+        """The distribution of the observations at one condition, given signals of any shape; see `at`."""
+        return self.at({} if condition is None else condition)(signal)
+
+    def forward(self, signal: Signal) -> NoiseDistribution:
+        """Refuses: the condition is missing; see `__call__`."""
+        found: NoiseDistribution = self(signal)
+        return found
+
+    def config(self) -> dict[str, Any]:
+        """The grid."""
+        return {"values": {name: list(each) for name, each in self.values.items()}}
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name} {low:g} … {high:g}" for name, (low, high) in self.ranges.items())
+
+
+def _stored(name: str) -> str:
+    return "at_" + name.replace(".", "_")
+
+
+def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[str, Tensor]:
+    """The conditions of all pixels, (N,) each, float64.
+
+    Args:
+        condition: numbers, or arrays that broadcast with the observation, by name.
+        observation: pixel values of any shape.
+
+    Raises:
+        ValueError: there is none, or it does not broadcast, is not real or not finite.
+    """
+    found = {}
+    for name, given in condition.items():
+        try:
+            values = real(given, name).to(observation.device).double().expand(observation.shape).reshape(-1)
+        except RuntimeError as error:
+            raise ValueError(
+                f"condition {name} does not broadcast with the observation, {tuple(observation.shape)}"
+            ) from error
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError(f"condition {name} is NaN or infinite in some pixels; leave them out of all images")
+        found[name] = values
+    if not found:
+        raise ValueError('condition is empty; give numbers or arrays by name, such as {"gain": 2.0}')
+    return found
