@@ -59,10 +59,10 @@ class Schedule:
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
         trial: signal steps of each compared weight, from the state of the nearest one before.
-        quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
-            at much too large weights (needle: 51 after 50 steps, 8 after 180).
+        quiet_trial: the same for quiet series. Unconverged fits predict gaps of tilts best
+            at larger weights; twice as many steps chose smaller ones, and left-out tilts lost 0.5 nats.
         whole: signal steps of the volume, unless the user sets their number.
-        quiet: the same for quiet series, which have more detail to fit.
+        quiet: the same for quiet series, which have more detail to fit; 80 lose 0.3 to 1.0 dB of left-out tilts of the needle.
     """
 
     settle: int = 30
@@ -74,7 +74,7 @@ class Schedule:
     trial: int = 24
     quiet_trial: int = 40
     whole: int = 60
-    quiet: int = 80
+    quiet: int = 160
 
     def for_adam(self) -> Schedule:
         """The schedule with three times as many steps of signals (`benchmarks/pages/optimisers.py`)."""
@@ -188,9 +188,8 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         elif facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-        elif facts.halvings:
-            add("go on", noise, quarter, 1)
-    add("fit", noise, num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1))
+    # with half of the steps at half the resolution, four volumes of 64³ lost 0.1 dB; with a quarter, nothing
+    add("fit", noise, num_steps - quarter * (3 if taken_over else 1))
     return stages
 
 

@@ -57,8 +57,7 @@ PLANS = {
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      15  simple, half the resolution
-        whole  go on                        signal      15  chosen, half the resolution
-        whole  fit                          signal      30  chosen
+        whole  fit                          signal      45  chosen
         """,
     ),
     "wide": (
@@ -68,7 +67,7 @@ PLANS = {
         whole  begin                        signal      30  simple, a quarter of the resolution
         whole  go on                        signal      90  chosen, a quarter of the resolution
         whole  go on at half                signal      60  chosen, half the resolution
-        whole  fit                          signal      30  chosen
+        whole  fit                          signal      45  chosen
         """,
     ),
     "noise known, weight given": (
@@ -76,8 +75,7 @@ PLANS = {
         """
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      15  simple, half the resolution
-        whole  go on                        signal      15  chosen, half the resolution
-        whole  fit                          signal      30  chosen
+        whole  fit                          signal      45  chosen
         """,
     ),
     "a block of a settled series": (
@@ -96,10 +94,10 @@ PLANS = {
         slab   learn noise                  noise       20  chosen
         slab   adapt                        signal      12  chosen, offset held
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      20  simple, offset held
-        whole  go on                        signal      40  simple, offset held
+        whole  begin                        signal      40  simple, offset held
+        whole  go on                        signal      80  simple, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      20  chosen, offset held
+        whole  fit                          signal      40  chosen, offset held
         """,
     ),
     "quiet": (
@@ -112,9 +110,8 @@ PLANS = {
         slab   refine noise                 noise       20  simple
         slab   choose weight                weights     40 x 4  simple, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      20  simple, offset held, half the resolution
-        whole  go on                        signal      20  simple, offset held, half the resolution
-        whole  fit                          signal      40  simple, offset held
+        whole  begin                        signal      40  simple, offset held, half the resolution
+        whole  fit                          signal      120  simple, offset held
         whole  describe noise               noise       600  chosen
         """,
     ),
