@@ -108,6 +108,6 @@ def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_pat
     words = ["reconstruct", tmp_path / "new" / "tilts.mrc", "-o", out, "--method", "sirt", "--strict", "--angles"]
     assert run_command(*words, tmp_path / "new" / "tilts.rawtlt")["verdict"]["grade"] == "good"
     out.unlink()
-    with pytest.raises(ValueError, match=r"--strict: the verdict is bad \(.* is written\)\. .*angles"):
+    with pytest.raises(ValueError, match=r"--strict: the verdict is bad \(.* is written\)"):
         run_command(*words, tmp_path / "wrong.tlt")
     assert io.read(out).data.shape == (24, 24, 24)

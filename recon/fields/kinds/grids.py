@@ -15,7 +15,7 @@ from recon.projection.tiles import Tiles
 
 # Half width of the bend of `positive`, units. Softplus bends over several units: the slope of vacuum is a thousandth of that of
 # the object, and L-BFGS needs many times the steps. At 0.03, filaments hidden in vacuum need twice as many as at 0.1.
-_BEND = 0.1
+_BEND = 0.03
 # Units at the start of a fit, where vacuum is less than 1 % of the object but can still move.
 _LEAST, _MOST = 0.008, 20.0
 # Scale of the values of the finest grid, units: the largest change by the first step of a fit.
