@@ -162,6 +162,10 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     start, learns = change.detach().clone(), change.requires_grad
 
     def loss() -> Tensor:
+        if not all(
+            math.isfinite(float(each.detach())) for each in (detector.gain, detector.offset, detector.read_noise)
+        ):
+            return math.inf + 0.0 * torch.nan_to_num(change).sum()  # a step too far, which is not taken
         log_prob: Tensor = noise_model(signal).log_prob(observation)
         return -torch.dot(log_prob.double(), weight)
 

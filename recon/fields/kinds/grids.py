@@ -14,7 +14,8 @@ from recon.projection.gradients import SavedGradient
 from recon.projection.tiles import Tiles
 
 # Half width of the bend of `positive`, units. Softplus bends over several units: the slope of vacuum is a thousandth of that of
-# the object, and L-BFGS needs many times the steps. At 0.03, filaments hidden in vacuum need twice as many as at 0.1.
+# the object, and L-BFGS needs many times the steps. At 0.1, vacuum keeps a haze of 6 % of the mass of a particle, and the mass is
+# 4 % too large (`tests/recon/joint/test_counts.py`); at 0.03, filaments lose 0.1 dB.
 _BEND = 0.03
 # Units at the start of a fit, where vacuum is less than 1 % of the object but can still move.
 _LEAST, _MOST = 0.008, 20.0
