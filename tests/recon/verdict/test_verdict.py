@@ -187,9 +187,20 @@ def test_borders_that_an_alignment_filled_are_seen_until_they_are_masked() -> No
     assert "lines" not in judged(replace(series, mask=series.images > 0)).subjects
 
 
+_AXIS = pytest.mark.xfail(
+    reason="left-out tilts do not show a small error of the axis on this object; see the page of sabotage"
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["angles shuffled", "two series spliced", "axis wrong by 5°", "axis 5 pixels off the middle"]
+    "name",
+    [
+        "angles shuffled",
+        "two series spliced",
+        pytest.param("axis wrong by 5°", marks=_AXIS),
+        pytest.param("axis 5 pixels off the middle", marks=_AXIS),
+    ],
 )
 @pytest.mark.usefixtures("one_thread")
 def test_what_spoils_a_larger_series_is_named(name: str) -> None:
