@@ -26,7 +26,7 @@ def test_signature_lists_every_field_with_its_default() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "meant"), [("steps", "num_steps"), ("wieght", "weight"), ("zzz", "num_steps, weight")]
+    ("given", "meant"), [("steps", "num_steps"), ("weightt", "weight"), ("zzz", "num_steps, weight")]
 )
 def test_an_unknown_argument_is_answered_by_the_nearest(given: str, meant: str) -> None:
     with pytest.raises(TypeError, match=meant):
