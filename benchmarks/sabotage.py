@@ -148,7 +148,7 @@ def graded(verdict: Verdict) -> Cell:
     }
 
 
-def graded anew(cell: Cell) -> Cell:
+def graded_anew(cell: Cell) -> Cell:
     """The cell as the present table of checks grades its evidence; tolerances that depend on the series are those stored."""
     if "evidence" not in cell:
         return cell

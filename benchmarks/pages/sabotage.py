@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.sabotage import PHANTOMS, WAYS, kept, outcome, graded anew, table
+from benchmarks.sabotage import PHANTOMS, WAYS, kept, outcome, graded_anew, table
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure
@@ -116,7 +116,7 @@ def draw(cells: Cells) -> None:
 def main(arguments: list[str]) -> None:
     """Write the page and its picture, or print what limits would be."""
     content = json.loads(RESULTS.read_text(encoding="utf-8"))
-    content["cells"] = {key: graded anew(cell) for key, cell in content["cells"].items()}
+    content["cells"] = {key: graded_anew(cell) for key, cell in content["cells"].items()}
     if arguments == ["limits"]:
         print("\n".join(limits(content["cells"])))
         return
