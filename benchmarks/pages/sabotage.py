@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.sabotage import PHANTOMS, WAYS, kept, outcome, graded_anew, table
+from benchmarks.sabotage import PHANTOMS, WAYS, graded_anew, kept, outcome, table
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure
