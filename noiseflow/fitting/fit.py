@@ -23,7 +23,6 @@ from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
 from noiseflow.fitting.stages import fit_in_stages
-from noiseflow.fitting.steps import MakeOptimiser, adam
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
@@ -68,7 +67,6 @@ def fit(
     checkpoint_interval: float | None = None,
     resume: dict[str, Any] | None = None,
     parameter_groups: Sequence[dict[str, Any]] | None = None,
-    optimiser: MakeOptimiser = adam,
     tables: TableKeeper | None = None,
 ) -> FitResult:
     """Fit a noise model in place by maximum likelihood; with a trainable signal model, fit both jointly.
@@ -116,8 +114,6 @@ def fit(
         checkpoint_interval: call `checkpoint` after a step at this interval (s) instead.
         resume: a state passed to `checkpoint`; the fit continues from it.
         parameter_groups: parameter groups of the signal model with learning rates, instead of its ``parameter_groups()``.
-        optimiser: makes the optimiser of the signal model, `adam` or `noiseflow.fitting.steps.quasi_newton`; the latter needs
-            fewer steps, but only for signal models with ``signal()`` under a noise model that is not trained.
         tables: stores the tabulated likelihood for further fits of the same pixels under the same frozen noise model.
 
     Returns:
@@ -184,11 +180,6 @@ def fit(
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     learning_rate = model.learning_rate if learning_rate is None else learning_rate
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
-    if optimiser is not adam and (not hasattr(signal_model, "signal") or (train_noise and model.learns)):
-        raise ValueError(
-            "a quasi-Newton method needs the gradient of all pixels of one objective: a signal model with signal(), and "
-            "train_noise=False; leave out optimiser to fit by Adam"
-        )
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     direct = train_noise and resume is None and pixels.train.ndim == 1
     if (
@@ -220,12 +211,7 @@ def fit(
             "tabulate": tabulate,
         }
         shared |= {"batch_size": batch_size, "checkpoint_interval": checkpoint_interval}
-        shared |= {
-            "parameter_groups": parameter_groups,
-            "optimiser": optimiser,
-            "checkpoint": checkpoint,
-            "resume": resume,
-        }
+        shared |= {"parameter_groups": parameter_groups, "checkpoint": checkpoint, "resume": resume}
         options = {"num_steps": num_steps, "generator": pixels.generator, "progress": progress}
         found = fit_in_stages(fit, model, signal_model, observation, **options, **shared)
         return replace(found, noise_model=result.noise_model, digitisation=digitisation)
@@ -235,7 +221,6 @@ def fit(
         standardise=standardise and resume is None,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
-        optimiser=optimiser,
     )
     if resume is not None:
         loop.load_state(resume)

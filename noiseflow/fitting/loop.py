@@ -18,7 +18,7 @@ from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
-from noiseflow.fitting.steps import MakeOptimiser, adam, take_step
+from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.threads import few_threads
@@ -74,7 +74,6 @@ class FitLoop:
         standardise: bool,
         train_noise: bool = True,
         parameter_groups: Sequence[dict[str, Any]] | None = None,
-        optimiser: MakeOptimiser = adam,
     ) -> None:
         """Scale the noise model to the data and set up the optimisers.
 
@@ -83,7 +82,6 @@ class FitLoop:
             standardise: measure the scaling of the data first.
             train_noise: whether to train the noise model.
             parameter_groups: parameter groups of the signal model, instead of its own.
-            optimiser: makes the optimiser of the signal model.
         """
         if standardise:
             with torch.no_grad():
@@ -95,7 +93,7 @@ class FitLoop:
         if any(p.requires_grad for p in self.signal_model.parameters()):
             everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
             own = getattr(self.signal_model, "parameter_groups", lambda: everything)
-            self.signal_optimiser = optimiser(own() if parameter_groups is None else parameter_groups)
+            self.signal_optimiser = adam(own() if parameter_groups is None else parameter_groups)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
         if noise and self.signal_optimiser is None:
             self.average = WeightAverage(self.noise_model)

@@ -1,18 +1,13 @@
-"""Optimisers, and single steps that are skipped if loss or gradient is not finite."""
+"""Single optimiser steps that are skipped if loss or gradient is not finite."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
-
-from noiseflow.fitting.quasi_newton import QuasiNewton
-
-MakeOptimiser = Callable[[Sequence[dict[str, Any]]], torch.optim.Optimizer]
-"""Makes an optimiser from parameter groups with ``lr``: `adam` or `quasi_newton`."""
 
 
 def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
@@ -23,18 +18,11 @@ def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
 
 
 _Adam, _LBFGS = _without_compiler(torch.optim.Adam), _without_compiler(torch.optim.LBFGS)
-_QuasiNewton = _without_compiler(QuasiNewton)
 
 
 def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     """Adam with a short memory of squared gradients."""
     optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=(0.9, 0.99), fused=True)
-    return optimiser
-
-
-def quasi_newton(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
-    """L-BFGS with one gradient per step, for all pixels at a time and noise models that do not change."""
-    optimiser: torch.optim.Optimizer = _QuasiNewton(groups)
     return optimiser
 
 

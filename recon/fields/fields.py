@@ -43,10 +43,8 @@ class Field(Described, ABC):
 
     measured_in = "attenuation per voxel"
     scale: Tensor
-    quasi_newton = False
-    """Whether fits use L-BFGS instead of Adam. Parameters must act smoothly, and be the same ones throughout a fit."""
     relative_rate = 1.0
-    """Learning rate of the field for Adam, relative to that of voxels."""
+    """Learning rate of the field relative to that of a voxel field."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0
@@ -197,15 +195,11 @@ class Field(Described, ABC):
         """This field on a voxel grid with half the resolution, with shared parameters. None if there is no such grid."""
         return None
 
-    def _units_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
-        """A volume (z, y, x) resampled to `shape`, (depth, width, height), in units of the scale."""
+    def _raw_of(self, volume: Tensor, shape: Sequence[int]) -> Tensor:
+        """Unconstrained values of a volume (z, y, x) resampled to `shape`, (depth, width, height)."""
         lattice = volume.transpose(1, 2)[None, None] / self.scale
-        return functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """Parameters with their ``lr``: for Adam, the learning rate relative to that of voxels; for a `quasi_newton` fit, the
-        scale of their values."""
-        return [{"params": list(self.parameters()), "lr": self.relative_rate, "eps": 1e-15}]
+        pooled = functional.adaptive_avg_pool3d(lattice, (shape[0], shape[1], shape[2]))[0, 0]
+        return torch.log(torch.expm1(pooled.clamp(EMPTY, 20)))
 
     def forward(self) -> Tensor:
         """Attenuation per voxel, (depth * width, height)."""

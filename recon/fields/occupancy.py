@@ -14,14 +14,14 @@ from recon.projection.base import Projector
 OCCUPIED_MARGIN = 2
 """Margin, voxels, around the contents of a rough volume that is also occupied."""
 
-_RETEST_EVERY = 5
+_RETEST_EVERY = 10
 
 
 class Occupancy(nn.Module):
     """The voxels that may be non-empty, from a rough volume; voxels are added if the data require it.
 
     All voxels within a margin around the contents of the rough volume are occupied. The others are treated as vacuum and tested
-    again in every fifth step. A block of voxels becomes occupied if raising it increases the likelihood by more than the total
+    again in every tenth step. A block of voxels becomes occupied if raising it increases the likelihood by more than the total
     variation of its faces costs. This must hold in two tests in a row, because an oscillating fit makes many blocks pass once.
     Occupied voxels are never removed.
 
@@ -80,7 +80,7 @@ class Occupancy(nn.Module):
 
     @torch.no_grad()
     def retest(self, gradient: Tensor, projector: Projector, cost: float) -> None:
-        """In every fifth call, test unoccupied blocks and occupy those that pass.
+        """In every tenth call, test unoccupied blocks and occupy those that pass.
 
         Args:
             gradient: gradient of the loss with respect to the line integrals, (tilts * detector_width, height).

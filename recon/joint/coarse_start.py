@@ -25,10 +25,8 @@ from recon.series.masks import binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _COARSE = 24
-# Steps between two measurements of the noise width, which is too large at a rough start.
-_ROUND = 20
 _LEAST_BINNING = 4
-_HIGHEST_RATE, _RATE = 0.24, 0.36
+_HIGHEST_RATE, _RATE = 0.4, 0.6
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
 # of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
 _HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
@@ -67,7 +65,7 @@ def coarse_start(
     response: Transmission | Linear,
     grid: VolumeGrid,
     *,
-    num_steps: int = 60,
+    num_steps: int = 200,
     generator: torch.Generator,
 ) -> Tensor:
     """Reconstruct binned images by least squares, and fit the response to them.
@@ -92,22 +90,11 @@ def coarse_start(
     field = MultiresolutionField((depth, height, width), scale=attenuation_scale(start), coarsest=2)
     field.start_from(start)
     images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (small.images, mask))
+    rate = learning_rate(start, field)
     response_now = _BestResponse(response, images, use)
-    signal_model = TomographySignal(field, projector, response_now, weight=0.1)
+    signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
     with num_threads(1):  # operations on 24³ voxels
-        for _ in range(max(1, num_steps // _ROUND)):
-            fit(
-                Gaussian(),
-                signal_model,
-                images,
-                mask=use,
-                digitise=False,
-                num_steps=min(num_steps, _ROUND),
-                train_noise=False,
-                generator=generator,
-                parameter_groups=field.parameter_groups(),
-                optimiser=signal_model.optimiser,
-            )
+        fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
     return field.volume() / binning
 
 

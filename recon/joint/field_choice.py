@@ -83,4 +83,8 @@ def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:
     if field != AUTO:
         return []
     steps = fit.schedule.whole if fit.num_steps is None else fit.num_steps
-    return [FitStage("choose field", "fields", "slab", "chosen", steps, fits=len(field_kinds(field)))]
+    return [
+        FitStage(
+            "choose field", "fields", "slab", "chosen", steps, rate=fit.schedule.rate, fits=len(field_kinds(field))
+        )
+    ]

@@ -80,7 +80,7 @@ class JointReconstructor:
         defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
             `recon.projection.defocused_projector.ImageDefocusedProjector`.
         slab: number of slices of the slab; by default 24, or more if slices are small.
-        schedule: numbers of steps.
+        schedule: numbers of steps and learning rates.
         seed: seed of all random choices.
         device: torch device.
         run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` also stores states and results.
@@ -284,7 +284,6 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
-            first_order=not whole.field.quasi_newton,
             halvings=0 if given is not None and needs_image(given) else self._halvings(whole),
         )
         return facts, rows, given

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from noiseflow.described import described
+
 Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "fields"]
 Where = Literal["slab", "whole"]
 Noise = Literal["simple", "chosen"]
@@ -31,7 +33,6 @@ class Facts:
             and the noise model is fitted to the residuals. A given noise model is used from three quarters of the steps on.
         hold_offset: whether the offset of a linear response is fixed to that of the coarse reconstruction. In least squares
             without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit.
-        first_order: whether the field is fitted by Adam, which takes three times as many steps as L-BFGS.
     """
 
     choose_noise: bool = True
@@ -42,12 +43,11 @@ class Facts:
     settled: bool = False
     quiet: bool = False
     hold_offset: bool = False
-    first_order: bool = False
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Numbers of steps; `docs/benchmarks/schedule.md` has a row for each. A step is one evaluation of the objective.
+    """Numbers of steps and learning rates; `docs/benchmarks/ablations.md` has a row for each.
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
@@ -58,30 +58,28 @@ class Schedule:
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
-        trial: signal steps of each compared weight, from the state of the nearest one before.
-        quiet_trial: the same for quiet series. Unconverged fits predict gaps of tilts best
-            at larger weights; twice as many steps chose smaller ones, and left-out tilts lost 0.5 nats.
+        trial: signal steps for the comparison of weights, after the first quarter of those of the volume.
+        quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
+            at much too large weights (needle: 51 after 50 steps, 8 after 180).
         whole: signal steps of the volume, unless the user sets their number.
-        quiet: the same for quiet series, which have more detail to fit; 80 lose 0.3 to 1.0 dB of left-out tilts of the needle.
+        quiet: the same for quiet series, which have more detail to fit.
+        rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
     """
 
-    settle: int = 30
+    settle: int = 40
     candidate: int = 30
-    adapt: int = 12
+    adapt: int = 20
     refine: int = 20
     learn: int = 60
     describe: int = 600
-    trial: int = 24
-    quiet_trial: int = 40
-    whole: int = 60
-    quiet: int = 160
-
-    def for_adam(self) -> Schedule:
-        """The schedule with three times as many steps of signals (`benchmarks/pages/optimisers.py`)."""
-        names = ("settle", "adapt", "trial", "quiet_trial", "whole", "quiet")
-        return replace(self, **{name: 3 * getattr(self, name) for name in names})
+    trial: int = 50
+    quiet_trial: int = 180
+    whole: int = 150
+    quiet: int = 240
+    rate: float = 0.6
 
 
+@described(rate="of a rough start's learning rate")
 @dataclass(frozen=True)
 class FitStage:
     """One stage of a joint fit.
@@ -95,7 +93,10 @@ class FitStage:
         where: the slab or the whole volume.
         noise: the simple noise model of the first fits, or the chosen model.
         num_steps: optimisation steps of each fit.
+        rate: learning rate of the signal relative to that for a rough start.
         halvings: how often the resolution is halved.
+        afresh: restart from the coarse reconstruction.
+        warm_up: increase the rate gradually at the start, because the first steps of Adam have full length even near the optimum.
         hold_offset: do not fit the offset.
         standardise: measure the scaling of the noise model first.
         fits: expected number of fits of the stage.
@@ -106,7 +107,10 @@ class FitStage:
     where: Where
     noise: Noise
     num_steps: int
+    rate: float = 1.0
     halvings: int = 0
+    afresh: bool = False
+    warm_up: bool = False
     hold_offset: bool = False
     standardise: bool = False
     fits: int = 1
@@ -122,10 +126,9 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
     Args:
         facts: what is known of the series.
         num_steps: signal steps of the whole volume; by default those of the schedule.
-        schedule: numbers of steps.
+        schedule: numbers of steps and learning rates.
     """
     schedule = Schedule() if schedule is None else schedule
-    schedule = schedule.for_adam() if facts.first_order else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
     stages = _on_the_slab(facts, schedule) if choosing else []
     if not facts.settled and not (choosing and (facts.quiet or facts.simple_is_final)):
@@ -156,12 +159,19 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
     adapt: Kind = "finalists" if facts.choose_noise else "signal"
-    stages.append(FitStage("adapt", adapt, "slab", noise, schedule.adapt, hold_offset=hold))
+    stages.append(
+        FitStage("adapt", adapt, "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True, hold_offset=hold)
+    )
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        steps = schedule.quiet_trial if facts.quiet else schedule.trial
-        stages.append(FitStage("choose weight", "weights", "slab", noise, steps, hold_offset=hold, fits=_TRIALS))
+        # trial and final fits share one schedule, because longer fits favour larger weights
+        rate, begin, steps = schedule.rate, schedule.whole // 4, schedule.trial
+        if facts.quiet:
+            begin, steps = schedule.quiet // 4, schedule.quiet_trial
+        again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
+        trials = FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
+        stages += [again, trials]
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -175,7 +185,8 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     taken_over = facts.quiet and not facts.simple_is_final
 
     def add(name: str, model: Noise, steps: int, halvings: int = 0) -> None:
-        stages.append(FitStage(name, "signal", "whole", model, steps, halvings=halvings, hold_offset=facts.hold_offset))
+        rate, hold = schedule.rate, facts.hold_offset
+        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, halvings=halvings, hold_offset=hold))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
         begin = 2 * quarter if facts.halvings == 2 else quarter
@@ -188,8 +199,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         elif facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-    # with half of the steps at half the resolution, four volumes of 64³ lost 0.1 dB; with a quarter, nothing
-    add("fit", noise, num_steps - quarter * (3 if taken_over else 1))
+        elif facts.halvings:
+            add("go on", noise, quarter, 1)
+    add("fit", noise, num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1))
     return stages
 
 
@@ -204,8 +216,14 @@ def describe(stages: Sequence[FitStage]) -> str:
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
+        if stage.kind in ("signal", "finalists", "weights", "fields"):
+            how.append(f"rate {stage.rate:g}")
         if stage.hold_offset:
             how.append("offset held")
+        if stage.afresh:
+            how.append("afresh")
+        if stage.warm_up:
+            how.append("warm-up")
         if stage.halvings:
             how.append(("half the resolution", "a quarter of the resolution")[stage.halvings - 1])
         lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")

@@ -29,6 +29,7 @@ from recon.joint.task import Task
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
 _BATCH = 4096  # pixels per noise-model step
+_WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _TABULATED = 0.05  # nats per pixel
@@ -117,6 +118,8 @@ class Runner:
             "finalists": self._finalists,
             "weights": self._weights,
         }
+        for where in {stage.where for stage in stages if stage.afresh}:
+            self.tasks[where].remember()  # needs as much memory as the field, so only if required
         for stage in stages:
             before = self._done
             carry_out[stage.kind](stage, self.tasks[stage.where])
@@ -124,6 +127,8 @@ class Runner:
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
+        if stage.afresh:
+            task.restart()
         with ExitStack() as stack:
             for _ in range(stage.halvings):
                 task = stack.enter_context(task.halved())
@@ -189,28 +194,29 @@ class Runner:
             model.load_state_dict(adapted)
 
     def _weights(self, stage: FitStage, task: Task) -> None:
-        """Compare weights by fits, each from the state of the nearest weight before: few steps then suffice. The task is left in
-        the most likely state."""
+        """Compare weights by fits from the same state, so that they are independent of each other. The task is left in the most
+        likely state."""
         model = task.signal_model
-        states = dict[float, tuple[float, dict[str, Tensor]]]()
+        start = likeliest = copy.deepcopy(model.state_dict())
+        lowest = math.inf
 
         def held_out_nll(weight: float) -> float:
-            if states:
-                nearest = min(states, key=lambda tried: abs(math.log(tried / weight)))
-                model.load_state_dict(states[nearest][1])
+            nonlocal likeliest, lowest
+            model.load_state_dict(start)
             model.weight = weight
             nll = self._fit_signal(stage, task, f"{stage.name} {weight:.4g}").last_nll
-            states[weight] = nll, copy.deepcopy(model.state_dict())
+            if nll < lowest:
+                lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
         self.weight_choice = choose_weight(held_out_nll, self.first_weight)
-        model.load_state_dict(min(states.values(), key=lambda tried: tried[0])[1])
+        model.load_state_dict(likeliest)
         model.weight = self.weight_choice.weight
-        self._priors(stage, task)
+        self._priors(stage, task, start)
         for each in self.tasks.values():
             each.signal_model.weight, each.signal_model.regulariser = model.weight, model.regulariser
 
-    def _priors(self, stage: FitStage, task: Task) -> None:
+    def _priors(self, stage: FitStage, task: Task, start: dict[str, Tensor]) -> None:
         """Compare the other regularisers with the usual one at its weight, and take one that predicts held-out pixels
         significantly better. The task is left in that state.
 
@@ -222,6 +228,7 @@ class Runner:
         usual = _held_out(task, noise_model)
         for regulariser in self.regularisers:
             before, state = model.regulariser, copy.deepcopy(model.state_dict())
+            model.load_state_dict(start)
             model.regulariser = regulariser
             self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
             found = _held_out(task, noise_model)
@@ -246,8 +253,8 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
-                parameter_groups=model.parameter_groups(hold_response=stage.hold_offset),
-                optimiser=model.optimiser,
+                parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
+                warm_up=_WARM_UP if stage.warm_up else 0.0,
                 tables=task.tables(noise_model),
             )
         finally:

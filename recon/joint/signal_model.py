@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.fitting.steps import MakeOptimiser, adam, quasi_newton
 from noiseflow.models.base import Described
 from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
@@ -206,24 +204,16 @@ class TomographySignal(Described):
         if isinstance(self.image_formation, Linear):
             self.image_formation.least_offset.fill_(least_signal)
 
-    @property
-    def optimiser(self) -> MakeOptimiser:
-        """Makes the optimiser that suits the field."""
-        return quasi_newton if self.field.quasi_newton else adam
-
-    def parameter_groups(self, *, hold_response: bool = False) -> list[dict[str, Any]]:
-        """Parameters with their learning rates for Adam, or their scales for L-BFGS.
+    def parameter_groups(self, *, rate: float = 1.0, hold_response: bool = False) -> list[dict[str, Any]]:
+        """Parameters with their learning rates, for Adam.
 
         Args:
+            rate: factor on all learning rates.
             hold_response: do not fit the detector response.
         """
-        groups = self.field.parameter_groups()
         response = [p for p in self.image_formation.parameters() if p.requires_grad and not hold_response]
-        if not self.field.quasi_newton:
-            for group in groups:
-                group["lr"] *= self.learning_rate
-            return groups + ([{"params": response, "lr": self.learning_rate * _RESPONSE_RATE}] if response else [])
-        # curvatures are proportional to the number of pixels that depend on a value: the tilts for a voxel, all pixels shared by
-        # the values of a response
-        voxels, finest = math.prod((self.field.depth, self.field.height, self.field.width)), groups[0]["lr"]
-        return groups + [{"params": [p], "lr": finest * math.sqrt(p.numel() / voxels)} for p in response]
+        usual = self.learning_rate * rate
+        groups: list[dict[str, Any]] = [
+            {"params": list(self.field.parameters()), "lr": usual * self.field.relative_rate, "eps": 1e-15}
+        ]
+        return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])

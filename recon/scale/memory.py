@@ -18,7 +18,6 @@ from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-# Bytes; of each voxel, 75 were measured at 240³ that nothing is skipped of, with everything else in them
 _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab

@@ -19,9 +19,8 @@ _POINTS_TOGETHER = 2**17
 _ACTIVATIONS = 4 * 3 * 64
 # steps and learning rate with which a network first learns the rough volume, which starts the fit near the object
 _FIRST_STEPS, _FIRST_RATE = 60, 1e-3
-# voxels along each axis of the rough volume that it learns; finer detail of a rough volume is noise; and its
-# largest value, units
-_COARSE, _DENSEST = 24, 20.0
+# voxels along each axis of the rough volume that it learns; finer detail of a rough volume is noise
+_COARSE = 24
 
 
 class SineNetwork(nn.Module):
@@ -101,8 +100,7 @@ class CoordinateNetwork(Field):
 
     def start_from(self, volume: Tensor) -> None:
         box = (self.depth, self.width, self.height)
-        target = self._units_of(volume, [min(_COARSE, *pair) for pair in zip(box, volume.mT.shape, strict=True)])
-        target = torch.log(torch.expm1(target.clamp(EMPTY, _DENSEST)))
+        target = self._raw_of(volume, [min(_COARSE, *pair) for pair in zip(box, volume.mT.shape, strict=True)])
         axes = [
             (torch.arange(size, device=target.device) + 0.5) * (own / size) - 0.5
             for own, size in zip(box, target.shape, strict=True)

@@ -168,7 +168,7 @@ def test_gain_of_a_block_is_summed_over_its_voxels_and_compared_with_its_faces(b
     assert 0 < int(found.sum()) < found.numel()
 
 
-def test_vacuum_is_tested_in_every_fifth_step():
+def test_vacuum_is_tested_in_every_tenth_step():
     projector, occupancy = (
         SliceProjector(tilt_angles=[0.0], depth=8, width=8),
         Occupancy(torch.zeros(8, 8, 8), (8, 8, 8)),
@@ -177,7 +177,7 @@ def test_vacuum_is_tested_in_every_fifth_step():
     for _ in range(30):
         occupancy.retest(-torch.ones(8, 8), projector, 1e-6)
         shares.append(occupancy.share)
-    assert shares == [0.0] * 9 + [1.0] * 21  # wanted in the fifth, and again in the tenth
+    assert shares == [0.0] * 19 + [1.0] * 11  # wanted in the tenth, and again in the twentieth
 
 
 def test_what_the_data_wants_becomes_occupied_and_nothing_else():
@@ -206,7 +206,7 @@ def test_what_is_wanted_only_once_stays_empty():
     )
     swings = -torch.ones(8, 8), torch.ones(8, 8)
     for step in range(40):
-        occupancy.retest(swings[step // 5 % 2], projector, 1e-6)
+        occupancy.retest(swings[step // 10 % 2], projector, 1e-6)
     assert occupancy.share == 0
     for _ in range(20):
         occupancy.retest(swings[0], projector, 1e-6)

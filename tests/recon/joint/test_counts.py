@@ -17,10 +17,6 @@ def _psnr(volume: np.ndarray, truth: np.ndarray) -> float:
     return float(10 * np.log10(truth.max() ** 2 / np.mean((volume - truth) ** 2)))
 
 
-_CLIPPED = pytest.mark.xfail(reason="the offset of clipped counts drifts to −0.4, and the mass is 3 % too large")
-_BLOBS = pytest.mark.xfail(reason="quasi-Newton trials choose a weight at which the second order does not win")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "offset", "mass"),
@@ -31,7 +27,7 @@ _BLOBS = pytest.mark.xfail(reason="quasi-Newton trials choose a weight at which 
         (poisson(40), 0, 0.02),
         (poisson(100), 0, 0.02),
         (poisson(10, offset=7), 7, 0.02),
-        pytest.param(_clipped, 0, 0.02, marks=_CLIPPED),
+        (_clipped, 0, 0.02),
     ],
     ids=["2", "10", "40", "100", "dark offset", "clipped"],
 )
@@ -48,7 +44,7 @@ def test_the_joint_fit_of_counts_has_the_true_mass_and_is_not_below_least_square
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "gain"), [pytest.param("smooth_blobs", 0.5, marks=_BLOBS), ("tilted_slab", None)])
+@pytest.mark.parametrize(("scene", "gain"), [("smooth_blobs", 0.5), ("tilted_slab", None)])
 def test_the_regulariser_is_chosen_where_held_out_pixels_show_one(scene: str, gain: float | None) -> None:
     made = independent_series(scene, poisson(10), "±60°/2°")
     chosen = recon.reconstruct(made.series)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from benchmarks.scenes import make_scene
 from noiseflow import Gaussian
-from recon.fields.kinds.grids import MultiresolutionField, unconstrained
+from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation
@@ -50,7 +50,7 @@ def smooth_model(shape, *, detector_width=None, occupancy=False, offset=0.0):
     with torch.no_grad():
         for grid in field.grids:
             grid.zero_()
-        field.grids[-2].copy_(unconstrained(functional.softplus(7 * rough[0, 0] - 4)))
+        field.grids[-2].copy_(7 * rough[0, 0] - 4)
     skip = Occupancy(torch.ones(1, 1, 1), shape) if occupancy else None
     return TomographySignal(field, projector, Transmission(1.0), weight=0.5, occupancy=skip)
 

@@ -22,96 +22,102 @@ PLANS = {
         Facts(),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      30  simple
+        slab   settle                       signal      40  simple, rate 1
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        finalists   12  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   choose weight                weights     24 x 4  chosen
+        slab   begin again                  signal      37  simple, rate 0.6, afresh
+        slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      15  simple
-        whole  fit                          signal      45  chosen
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
         Facts(choose_noise=False, simple_is_final=True, choose_weight=False),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      30  simple
+        slab   settle                       signal      40  simple, rate 1
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      12  simple
+        slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        whole  begin                        signal      15  simple
-        whole  fit                          signal      45  simple
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  simple, rate 0.6
         """,
     ),
     "everything chosen, large": (
         Facts(halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      30  simple
+        slab   settle                       signal      40  simple, rate 1
         slab   choose noise                 candidates  30 x 2  chosen
-        slab   adapt                        finalists   12  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   choose weight                weights     24 x 4  chosen
+        slab   begin again                  signal      37  simple, rate 0.6, afresh
+        slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      15  simple, half the resolution
-        whole  fit                          signal      45  chosen
+        whole  begin                        signal      37  simple, rate 0.6, half the resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "wide": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=2),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      30  simple, a quarter of the resolution
-        whole  go on                        signal      90  chosen, a quarter of the resolution
-        whole  go on at half                signal      60  chosen, half the resolution
-        whole  fit                          signal      45  chosen
+        whole  begin                        signal      74  simple, rate 0.6, a quarter of the resolution
+        whole  go on                        signal      222  chosen, rate 0.6, a quarter of the resolution
+        whole  go on at half                signal      148  chosen, rate 0.6, half the resolution
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      15  simple, half the resolution
-        whole  fit                          signal      45  chosen
+        whole  begin                        signal      37  simple, rate 0.6, half the resolution
+        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      15  simple
-        whole  fit                          signal      45  chosen
+        whole  begin                        signal      37  simple, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
     "quiet, noise model given": (
         Facts(choose_noise=False, choose_weight=False, quiet=True, hold_offset=True),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      30  simple, offset held
+        slab   settle                       signal      40  simple, rate 1, offset held
         slab   measure noise                noise       10  simple
         slab   learn noise                  noise       20  chosen
-        slab   adapt                        signal      12  chosen, offset held
+        slab   adapt                        signal      20  chosen, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      40  simple, offset held
-        whole  go on                        signal      80  simple, offset held
+        whole  begin                        signal      60  simple, rate 0.6, offset held
+        whole  go on                        signal      120  simple, rate 0.6, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      40  chosen, offset held
+        whole  fit                          signal      60  chosen, rate 0.6, offset held
         """,
     ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      30  simple, offset held
+        slab   settle                       signal      40  simple, rate 1, offset held
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      12  simple, offset held
+        slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
-        slab   choose weight                weights     40 x 4  simple, offset held
+        slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
+        slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      40  simple, offset held, half the resolution
-        whole  fit                          signal      120  simple, offset held
+        whole  begin                        signal      60  simple, rate 0.6, offset held, half the resolution
+        whole  go on                        signal      60  simple, rate 0.6, offset held, half the resolution
+        whole  fit                          signal      120  simple, rate 0.6, offset held
         whole  describe noise               noise       600  chosen
         """,
     ),
