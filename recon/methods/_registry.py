@@ -360,7 +360,8 @@ def _in_blocks(
     settings: Settings,
 ) -> Reconstruction:
     folder = None if settings.keep is None else settings.keep(settings.prefix)
-    assert method.blockwise is not None
+    if method.blockwise is None:
+        raise ValueError(f"method {method.name} does not reconstruct in blocks; remove slices_at_once")
     return reconstruct_in_blocks(
         method.blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks
     )
