@@ -37,8 +37,8 @@ def read(path: Path) -> TiltTable:
         ValueError: no table has tilt angles, or a value is not a number.
     """
     tables = _tables(text_lines(path, "angle file", holds="a table of tilts"))
-    found = ((table, angles) for table in tables if (angles := _numbers(table, _ANGLES, path)) is not None)
-    table, angles = next(found, (None, None))
+    tilted = ((table, angles) for table in tables if (angles := _numbers(table, _ANGLES, path)) is not None)
+    table, angles = next(tilted, (None, None))
     if table is None or angles is None:
         raise ValueError(f"{path} holds no angles: no table has a column {', '.join(_ANGLES)}")
     sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
