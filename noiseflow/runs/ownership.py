@@ -134,9 +134,8 @@ def locked(output: str | Path) -> Iterator[None]:
         OSError: the lock file cannot be created.
     """
     path = lock_file(output)
-    lock = FileLock(
-        path, timeout=0, is_singleton=True, on_acquired=_sign
-    )  # a singleton of each thread counts its blocks
+    # a singleton of each thread counts its blocks
+    lock = FileLock(path, timeout=0, is_singleton=True, on_acquired=_sign)
     try:
         _take(lock, output)
         yield

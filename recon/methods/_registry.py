@@ -295,9 +295,8 @@ def reconstruct(
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found, blocks)
     if chosen.noise_model is not None and needs_image(chosen.noise_model):
-        return _of_distinct_tilts(
-            run, found, tilt_series, grid, chosen
-        )  # per-pixel maps of the detector are not transformed
+        # per-pixel maps of the detector are not transformed
+        return _of_distinct_tilts(run, found, tilt_series, grid, chosen)
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
@@ -353,11 +352,7 @@ def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings
 
 
 def _in_blocks(
-    method: Method,
-    blocks: dict[str, Any],
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    settings: Settings,
+    method: Method, blocks: dict[str, Any], tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
 ) -> Reconstruction:
     folder = None if settings.keep is None else settings.keep(settings.prefix)
     if method.blockwise is None:

@@ -180,12 +180,7 @@ def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading("Volume")
-    options = {
-        "original": list(values.shape),
-        "limits": [low, high],
-        "voxelSize": size,
-        "unit": unit,
-    }
+    options = {"original": list(values.shape), "limits": [low, high], "voxelSize": size, "unit": unit}
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
