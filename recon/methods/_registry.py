@@ -24,8 +24,8 @@ from recon.joint.run import RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.names import METHODS
 from recon.names import method_names as method_names
+from recon.projection.classical import WINDOWS
 from recon.projection.defocused_projector import KERNELS
-from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
 from recon.scale.running import reconstruct_in_blocks
@@ -50,7 +50,7 @@ class Settings:
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
-        window: window of the back-projection, one of `recon.projection.wbp.WINDOWS`.
+        window: window of the back-projection, one of `recon.projection.classical.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
         defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
