@@ -38,8 +38,7 @@ def simulate(
         ),
     ] = "clipped",
     clip: Annotated[
-        bool,
-        typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal."),
+        bool, typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal.")
     ] = False,
     defocus: Annotated[
         float,

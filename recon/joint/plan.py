@@ -150,9 +150,8 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
         FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold),
     ]
-    if (
-        facts.quiet and not facts.simple_is_final
-    ):  # with a width measured on a rough signal, the regulariser would dominate
+    # with a width measured on a rough signal, the regulariser would dominate
+    if facts.quiet and not facts.simple_is_final:
         stages.append(FitStage("measure noise", "noise", "slab", "simple", _START, standardise=True))
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))

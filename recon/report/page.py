@@ -18,9 +18,8 @@ from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
+from recon.report.charts import add_error_bars, noise_charts
 from recon.report.methods import methods_paragraph
-from recon.report.noise import noise_charts
-from recon.report.uncertainty import add_error_bars
 from recon.report.verdict import add_differences, add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -181,12 +180,7 @@ def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading("Volume")
-    options = {
-        "original": list(values.shape),
-        "limits": [low, high],
-        "voxelSize": size,
-        "unit": unit,
-    }
+    options = {"original": list(values.shape), "limits": [low, high], "voxelSize": size, "unit": unit}
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
