@@ -1,4 +1,8 @@
-"""Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
+"""Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed.
+
+How a composition works: `images` chooses the reader by the suffix; every reader returns an `ImageFile` in the units of the file.
+Files of angles and alignments become a `TiltTable` in the same way (`angles`), which is then joined with the images it lists.
+"""
 
 from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_folder as check_folder

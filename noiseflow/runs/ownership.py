@@ -27,7 +27,6 @@ from noiseflow.runs.partials import link_target
 
 MARK = "noiseflow"
 NPY_HEADER_BYTES = 1024
-_PAGE_HEAD = 1000
 _BATCH_COLUMNS = b"series,volume,status,verdict,reason,error,"
 
 
@@ -84,7 +83,7 @@ def is_own(path: Path) -> bool:
         return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
     if kind == ".json":
         return f'"written_by": "{MARK}'.encode() in head
-    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
+    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head
 
 
 def npy_start() -> bytes:
