@@ -90,9 +90,8 @@ class CalibrationCase:
     @property
     def filtered(self) -> bool:
         """Whether the correlation is that of a short filter, before which the gain is reported."""
-        known = (
-            self.correlation.local and self.correlation.factor > 0.5
-        )  # the factor of sharpened frames is poorly known
+        # the factor of sharpened frames is poorly known
+        known = self.correlation.local and self.correlation.factor > 0.5
         return known and (self.camera is not None or correctable(self.correlation, self.repairs))
 
 

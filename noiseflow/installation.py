@@ -15,6 +15,11 @@ def library_version() -> str:
     return version(DISTRIBUTION)
 
 
+def checkout() -> Path | None:
+    """The source tree that the library is loaded from; None for an installed package."""
+    return _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
+
+
 def install_command(extra: str) -> str:
     """The command that installs an extra, from the checkout where the library is loaded from one.
 
@@ -26,6 +31,5 @@ def install_command(extra: str) -> str:
         >>> "[formats]" in install_command("formats")
         True
     """
-    if (_CHECKOUT / "pyproject.toml").is_file():
-        return f"pip install '.[{extra}]' (in {_CHECKOUT})"
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
+    root = checkout()
+    return f"pip install '{DISTRIBUTION}[{extra}]'" if root is None else f"pip install '.[{extra}]' (in {root})"

@@ -78,9 +78,8 @@ def clear_of_rails(
     for rail, side in ((low, 1.0), (high, -1.0)):
         if np.isfinite(rail):
             near = mask & (side * level < np.percentile(side * level[mask], 25))
-            middle, far = np.percentile(
-                side * (frame - level)[near], (50, 84.13)
-            )  # the side away from the limit, which is not clipped
+            # the side away from the limit, which is not clipped
+            middle, far = np.percentile(side * (frame - level)[near], (50, 84.13))
             clear &= side * (level - rail) > deviations * (far - middle)
     return clear
 
@@ -98,9 +97,8 @@ def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviat
         side: side of the neighbourhood that is tested and excluded as a whole, pixels.
         deviations: threshold: standard deviations of the neighbours' covariance above its typical value.
     """
-    residual = residual - np.median(
-        residual, axis=0
-    )  # an outlier in one frame shifts the mean that the others are compared with
+    # an outlier in one frame shifts the mean that the others are compared with
+    residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]

@@ -68,9 +68,8 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     import tifffile
 
     if voxel_size is None:
-        tifffile.imwrite(
-            path, data, photometric="minisblack", software=signature()
-        )  # otherwise a stack of three would be stored as colour
+        # otherwise a stack of three would be stored as colour
+        tifffile.imwrite(path, data, photometric="minisblack", software=signature())
         return data
     z, y, x = voxel_size
     if data.dtype in _OUTSIDE_OME:

@@ -150,9 +150,8 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
         FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold),
     ]
-    if (
-        facts.quiet and not facts.simple_is_final
-    ):  # with a width measured on a rough signal, the regulariser would dominate
+    # with a width measured on a rough signal, the regulariser would dominate
+    if facts.quiet and not facts.simple_is_final:
         stages.append(FitStage("measure noise", "noise", "slab", "simple", _START, standardise=True))
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
@@ -189,7 +188,8 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, halvings=halvings, hold_offset=hold))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
-        begin = 2 * quarter if facts.halvings == 2 else quarter
+        # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more
+        begin = quarter if taken_over or not facts.halvings else 2 * quarter
         add("begin", "simple", begin, min(1, facts.halvings) if taken_over else facts.halvings)
         if taken_over:
             add("go on", "simple", 2 * quarter)
@@ -199,8 +199,6 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         elif facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-        elif facts.halvings:
-            add("go on", noise, quarter, 1)
     add("fit", noise, num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1))
     return stages
 

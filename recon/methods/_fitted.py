@@ -37,12 +37,7 @@ Options = Callable[[Settings], dict[str, Any]]
 
 
 def fitted(
-    name: str,
-    description: str,
-    options: Options,
-    *,
-    keeps_noise_model: bool = False,
-    refuses: tuple[str, ...] = (),
+    name: str, description: str, options: Options, *, keeps_noise_model: bool = False, refuses: tuple[str, ...] = ()
 ) -> Method:
     """Create a method that is a joint fit.
 

@@ -21,7 +21,7 @@ from typing import Any
 from noiseflow import io
 from noiseflow.io.image_file import SUFFIXES
 from noiseflow.runs.ownership import signature
-from recon.scale.cluster import all_threads_of_worker, usable_cores
+from recon.scale.running import all_threads_of_worker, usable_cores
 
 Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "options", "seconds")
@@ -253,9 +253,8 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
         running.processes.add(process)
     said, told = process.communicate()
     running.processes.discard(process)
-    lines = [
-        text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))
-    ]  # lines of the frame around usage errors
+    # lines of the frame around usage errors
+    lines = [text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))]
     last = lines[-1].removeprefix("noiseflow: ") if lines else ""
     if process.returncode:
         return None, last or f"exit {process.returncode}"

@@ -58,8 +58,7 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  begin                        signal      74  simple, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -77,8 +76,7 @@ PLANS = {
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  begin                        signal      74  simple, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -115,8 +113,7 @@ PLANS = {
         slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
         slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      60  simple, rate 0.6, offset held, half the resolution
-        whole  go on                        signal      60  simple, rate 0.6, offset held, half the resolution
+        whole  begin                        signal      120  simple, rate 0.6, offset held, half the resolution
         whole  fit                          signal      120  simple, rate 0.6, offset held
         whole  describe noise               noise       600  chosen
         """,
