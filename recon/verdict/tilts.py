@@ -35,7 +35,7 @@ def largest_gaps(angles: Array) -> tuple[float, float, int]:
 
 def repeated(tilt_series: TiltSeries) -> Effect:
     """Share of images that are exactly equal to another, which noise excludes for separate exposures."""
-    different = {hashlib.sha256(np.ascontiguousarray(image)).digest() for image in tilt_series.images}
+    different = {hashlib.sha256(image.tobytes()).digest() for image in tilt_series.images}
     return Effect(1 - len(different) / tilt_series.num_tilts)
 
 
