@@ -1,4 +1,4 @@
-"""Other geometries: a tilt axis, angles, a thickness or two objects that predict held-out gaps of tilts better."""
+"""Other geometries: angles, a thickness or two objects that predict held-out gaps of tilts better."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from noiseflow.checks import Effect
 from recon.series.holdout import GAP
@@ -25,14 +24,7 @@ _SINGLE = 0.3
 _REPLICATES = 8
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
 _LEAST_FREE = 0.1
-_TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
-# pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
-_LIKE_A_TURN = 0.211
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
-# coarse pixels: half a pixel is resolved, and larger ones gain more
-_OFFSETS = (-3.0, -1.0, 1.0, 3.0)
-# share of used neighbours of an interpolated pixel
-_SEEN = 0.99
 # degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
 _WIDEST = 190.0
 
@@ -89,14 +81,14 @@ class Geometry:
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
 
-    def _fit(self, smoothness: float, *, offset: float = 0.0, gap: float = GAP, **changes: Any) -> GapFit:
+    def _fit(self, smoothness: float, *, gap: float = GAP, **changes: Any) -> GapFit:
         coarse = replace(self.coarse, **changes)
         return GapFit(
             coarse.tilt_angles,
             depth=coarse.depth,
             width=coarse.width,
             detector_width=coarse.images.shape[2],
-            detector_offset=coarse.detector_offset + offset,
+            detector_offset=coarse.detector_offset,
             smoothness=smoothness,
             gap=gap,
         )
@@ -116,47 +108,18 @@ class Geometry:
         raised = profile - profile.min()
         return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
-    def axis(self) -> Effect:
-        """The best other direction of the tilt axis.
-
-        Interpolation alone reduces the noise, so each turn is compared with its opposite and with a shift.
-        """
-        shifted = self._moved(
-            lambda image: ndimage.shift(image, (_LIKE_A_TURN,) * 2, order=1, mode="nearest"),
-            self._fit(self.smoothness, offset=_LIKE_A_TURN),
-        )
-        gains = []
-        for size in _TURNS:
-            both = {turn: self._moved(partial(_turned, turn), self.fit) for turn in (-size, size)}
-            for turn, errors in both.items():
-                what = f"turned by {turn:g}°"
-                gains.append(min((self._gain(errors, other, what) for other in (shifted, both[-turn])), key=_value))
-        if self.coarse.images.shape[1] == self.coarse.images.shape[2]:
-            across = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
-            gains.append(self._gain(across, self.errors, "turned by 90°"))
-        return _best(gains)
-
-    def _moved(self, move: Callable[[Array], Array], fit: GapFit) -> Array:
-        """Errors of moved images."""
-        images, used = (
-            np.stack([move(image.astype(np.float64)) for image in stack])
-            for stack in (self.coarse.images, self.coarse.used)
-        )
-        return fit.errors(images, used > _SEEN)
+    def transposed(self) -> Effect:
+        """Images with rows and columns exchanged, as if the tilt axis were across."""
+        if self.coarse.images.shape[1] != self.coarse.images.shape[2]:
+            return Effect(0.0)
+        errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
+        return _best([self._gain(errors, self.errors, "")])
 
     def angles(self) -> Effect:
         """The best other scale of the tilt angles."""
         angles = self.coarse.tilt_angles
         scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
         return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
-
-    def middle(self) -> Effect:
-        """The best other position of the tilt axis across the images."""
-        coarse = self.coarse
-        return _best(
-            self._with(f"{size * coarse.binning:+g} pixels", detector_offset=coarse.detector_offset + size)
-            for size in _OFFSETS
-        )
 
     def thicker(self) -> Effect:
         """A volume with a depth equal to the width, if it is thinner."""
@@ -207,7 +170,3 @@ def _value(effect: Effect) -> float:
 def _best(effects: Iterable[Effect]) -> Effect:
     best = max(effects, key=_value)
     return best._replace(value=max(0.0, best.value))
-
-
-def _turned(degrees: float, image: Array) -> Array:
-    return np.asarray(ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest"))
