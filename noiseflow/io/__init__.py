@@ -30,5 +30,5 @@ from .images import read_image as read_image
 from .images import write as write
 from .imod import parse_views as parse_views
 from .imod import read_transforms as read_transforms
-from .tilt_axis import tilt_axis_of as tilt_axis_of
+from .metadata import tilt_axis_of as tilt_axis_of
 from .tilt_table import TiltTable as TiltTable

@@ -21,6 +21,7 @@ class TiltTable:
         names: (row,) file of each image; empty if the table does not name them.
         sections: (row,) index of each image in its stack as written, from 0 or 1; None if the rows are all images in order.
         transforms: (row, 2, 3) of IMOD, from raw to aligned (x, y); None if the table is not an alignment.
+        in_angstrom: whether the shifts of the transforms are in Å, not pixels of the stack.
         image_shape: (y, x) of the images that the transforms refer to; None if unknown.
         pixel_size: Å, or None if unknown.
         tilt_axis: degrees from y towards −x, or None if unknown.
@@ -33,6 +34,7 @@ class TiltTable:
     names: tuple[str, ...] = ()
     sections: NDArray[np.int64] | None = None
     transforms: NDArray[np.float64] | None = None
+    in_angstrom: bool = False
     image_shape: tuple[int, int] | None = None
     pixel_size: float | None = None
     tilt_axis: float | None = None
