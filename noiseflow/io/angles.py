@@ -27,6 +27,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
+_LIST = re.compile(r"tilt|angle|theta", re.IGNORECASE)
 _STAGES = re.compile(r"_(pre)?ali$")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -225,6 +226,8 @@ def candidates(stack: str | Path) -> list[Path]:
     inside = [
         file for suffix in (*RAW_FIRST, ".mdoc", *_TABLES) for file in stack.glob(f"*{suffix}") if _is_table(file)
     ]
+    named = [file for file in stack.iterdir() if file.suffix.lower() in (".txt", ".csv") and _LIST.search(file.stem)]
+    inside = inside or named
     return [*beside(stack), *(inside if len(inside) == 1 else [])]
 
 
