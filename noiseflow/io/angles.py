@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import angle_text, aretomo, imod, mdoc, star
-from noiseflow.io.image_file import ImageFile
-from noiseflow.io.tilt_table import LARGEST_ANGLE as LARGEST_ANGLE
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import LARGEST_ANGLE as LARGEST_ANGLE
+from noiseflow.io.image_file import ImageFile, TiltTable
 
 _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".mdoc": mdoc.read,

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import angles
-from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile, TiltTable
 
 _NUMBER = re.compile(r"((?<![a-z])(?:(?:minus|neg|plus|pos)_?|[mnp])|[-+]*)(\d+(?:\.\d+)?)", re.IGNORECASE)
 _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import TiltTable
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
 _OTHER = re.compile(r"\s*\[\s*(?!t\s*=)\w+\s*=.*\]\s*", re.IGNORECASE)
