@@ -691,6 +691,30 @@ def test_images_that_a_table_of_sections_leaves_out_are_left_out(tmp_path: Path)
     np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
 
 
+def test_an_mdoc_without_a_section_leaves_its_image_out(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 8, 9)).astype(np.float32)
+    io.write(tmp_path / "a.mrc", stack)
+    sections = "".join(f"[ZValue = {z}]\nTiltAngle = {20 * z - 20}\n" for z in (3, 0, 2))
+    (tmp_path / "a.mrc.mdoc").write_text(sections)
+    with pytest.warns(UserWarning, match="3 of 4"):
+        series = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert series.tilt_angles.tolist() == [-20, 20, 40]
+    np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
+
+
+def test_a_list_inside_a_folder_is_found_by_its_name(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "f", ["a1.tif", "a2.tif", "a10.tif"], STACK)
+    (folder / "log.txt").write_text("1\n2\n3\n")
+    (folder / "tilt_angles.txt").write_text("-9\n0\n9\n")
+    series = recon.read_tilt_series(folder)
+    assert series.tilt_angles.tolist() == [-9, 0, 9]
+    np.testing.assert_array_equal(series.images, STACK)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "a.jpg").touch()
+    with pytest.raises(ValueError, match=r"holds \.jpg"):
+        io.read(tmp_path / "b")
+
+
 @pytest.mark.parametrize("suffix", [".gz", ".bz2"])
 def test_damaged_packed_files_are_named(suffix: str, tmp_path: Path) -> None:
     import bz2

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from noiseflow.io.checks import number, text_lines
+from noiseflow.io.image_file import TiltTable, rotations
 from noiseflow.io.imod import x_tilt_of
-from noiseflow.io.tilt_table import TiltTable, rotations
 
 _MOST = 1e6  # sections, more than any series has
 _COLUMNS = 10

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.angles import candidates
 from noiseflow.io.checks import text_lines
-from noiseflow.io.image_file import ImageFile
-from noiseflow.io.tilt_table import LARGEST_ANGLE
+from noiseflow.io.image_file import LARGEST_ANGLE, ImageFile
 
 _ANGLE_NAME = re.compile(
     r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE

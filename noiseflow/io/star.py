@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
+from noiseflow.io.image_file import TiltTable, rotations
 from noiseflow.io.imod import x_tilt_of
-from noiseflow.io.tilt_table import TiltTable, rotations
 
 _ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
 _NAMES = ("rlnMicrographMovieName", "rlnMicrographName", "wrpMovieName")
