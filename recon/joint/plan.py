@@ -47,7 +47,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Numbers of steps and learning rates; `docs/benchmarks/ablations.md` has a row for each.
+    """Numbers of steps and learning rates; `docs/benchmarks/schedule.md` has a row for each.
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
@@ -58,9 +58,9 @@ class Schedule:
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
-        trial: signal steps for the comparison of weights, after those of `settle`.
-        quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
-            at much too large weights (needle: 51 after 50 steps, 8 after 180).
+        trial: signal steps for the comparison of weights, after those of `settle`. Three quarters of `quiet` for quiet series,
+            because unconverged fits predict gaps of tilts best at much too large weights (needle: 51 after 50 steps, 8 after
+            180).
         whole: signal steps of the volume, unless the user sets their number.
         quiet: the same for quiet series, which have more detail to fit.
         rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
@@ -73,7 +73,6 @@ class Schedule:
     learn: int = 60
     describe: int = 600
     trial: int = 50
-    quiet_trial: int = 180
     whole: int = 150
     quiet: int = 240
     rate: float = 0.6
@@ -164,7 +163,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        steps, rate = schedule.quiet_trial if facts.quiet else schedule.trial, schedule.rate
+        steps, rate = schedule.quiet * 3 // 4 if facts.quiet else schedule.trial, schedule.rate
         stages.append(
             FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
         )
