@@ -25,10 +25,10 @@ from .checks import require_finite as require_finite
 from .folder import files_of as files_of
 from .image_file import SUFFIXES as SUFFIXES
 from .image_file import ImageFile as ImageFile
+from .image_file import TiltTable as TiltTable
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
 from .imod import parse_views as parse_views
 from .imod import read_transforms as read_transforms
-from .tilt_axis import tilt_axis_of as tilt_axis_of
-from .tilt_table import TiltTable as TiltTable
+from .metadata import tilt_axis_of as tilt_axis_of

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase

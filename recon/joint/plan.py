@@ -58,7 +58,7 @@ class Schedule:
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
-        trial: signal steps for the comparison of weights, after the first quarter of those of the volume.
+        trial: signal steps for the comparison of weights, after those of `settle`.
         quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
             at much too large weights (needle: 51 after 50 steps, 8 after 180).
         whole: signal steps of the volume, unless the user sets their number.
@@ -95,7 +95,7 @@ class FitStage:
         num_steps: optimisation steps of each fit.
         rate: learning rate of the signal relative to that for a rough start.
         halvings: how often the resolution is halved.
-        afresh: restart from the coarse reconstruction.
+        remember: weights are compared from the volume after this stage on.
         warm_up: increase the rate gradually at the start, because the first steps of Adam have full length even near the optimum.
         hold_offset: do not fit the offset.
         standardise: measure the scaling of the noise model first.
@@ -109,7 +109,7 @@ class FitStage:
     num_steps: int
     rate: float = 1.0
     halvings: int = 0
-    afresh: bool = False
+    remember: bool = False
     warm_up: bool = False
     hold_offset: bool = False
     standardise: bool = False
@@ -148,7 +148,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     hold = facts.hold_offset
     stages = [
         FitStage("start noise", "noise", "slab", "simple", _START, standardise=True),
-        FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold),
+        FitStage("settle", "signal", "slab", "simple", schedule.settle, hold_offset=hold, remember=facts.choose_weight),
     ]
     # with a width measured on a rough signal, the regulariser would dominate
     if facts.quiet and not facts.simple_is_final:
@@ -164,13 +164,10 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        # trial and final fits share one schedule, because longer fits favour larger weights
-        rate, begin, steps = schedule.rate, schedule.whole // 4, schedule.trial
-        if facts.quiet:
-            begin, steps = schedule.quiet // 4, schedule.quiet_trial
-        again = FitStage("begin again", "signal", "slab", "simple", begin, rate=rate, afresh=True, hold_offset=hold)
-        trials = FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
-        stages += [again, trials]
+        steps, rate = schedule.quiet_trial if facts.quiet else schedule.trial, schedule.rate
+        stages.append(
+            FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
+        )
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -218,8 +215,8 @@ def describe(stages: Sequence[FitStage]) -> str:
             how.append(f"rate {stage.rate:g}")
         if stage.hold_offset:
             how.append("offset held")
-        if stage.afresh:
-            how.append("afresh")
+        if stage.remember:
+            how.append("remembered")
         if stage.warm_up:
             how.append("warm-up")
         if stage.halvings:

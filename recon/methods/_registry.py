@@ -17,7 +17,7 @@ from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
-from recon.fields._registry import field_kinds
+from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,6 @@ class Geometry:
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
         left: (tilt, y, u) residuals of that fit to all tilts.
-        replicates: series (tilt, y, u) of the given geometry, drawn from this fit.
     """
 
     def __init__(self, coarse: Coarse) -> None:
@@ -50,14 +49,10 @@ class Geometry:
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    @cached_property
+    @property
     def single(self) -> GapFit:
         """The fit that holds out single angles, which their neighbours predict."""
         return self._fit(self.smoothness, gap=self._step)
-
-    @cached_property
-    def _smooth(self) -> GapFit:
-        return self._fit(_SINGLE, gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -65,13 +60,15 @@ class Geometry:
         directions = self.coarse.directions
         return directions.span / len(np.unique(np.round(directions.angles, 3)))
 
-    def single_errors(self, images: Array) -> Array:
-        """(tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
-        return self._smooth.errors(images, self.coarse.used)
+    @property
+    def single_errors(self) -> Callable[[Array], Array]:
+        """The (tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
+        return partial(self._fit(_SINGLE, gap=self._step).errors, used=self.coarse.used)
 
-    @cached_property
-    def replicates(self) -> list[Array]:
-        """The fit with its residuals in random signs, the same along rows, in which most detectors correlate their noise.
+    @property
+    def replicates(self) -> Iterator[Array]:
+        """Series (tilt, y, u) of the given geometry: the fit with its residuals in random signs, the same along rows, in which
+        most detectors correlate their noise. They are drawn one at a time, the same ones each time.
 
         Residuals are smaller than the noise by the degrees of freedom of the fit.
         """
@@ -81,7 +78,7 @@ class Geometry:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
-        return [(fitted + sign * noise) * self.coarse.used for sign in signs]
+        return ((fitted + sign * noise) * self.coarse.used for sign in signs)
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
@@ -158,18 +155,18 @@ class Geometry:
         for part in (first, ~first):
             fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
             errors[part] = fit.errors(self.coarse.images[part], used)
-            expected[part] = fit.errors(self.replicates[0][part], used)
+            expected[part] = fit.errors(next(self.replicates)[part], used)
         return self._beyond_expected(errors, expected, name)
 
     def _with(self, what: str, **changes: Any) -> Effect:
         fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
+        return self._beyond_expected(self._errors(fit), fit.errors(next(self.replicates), self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
         any volume smoother, which predicts some objects better."""
         gain = self._gain(errors, self.errors, what)
-        chance = self._gain(expected, self.fit.errors(self.replicates[0], self.coarse.used), what)
+        chance = self._gain(expected, self.fit.errors(next(self.replicates), self.coarse.used), what)
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:

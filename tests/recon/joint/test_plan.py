@@ -22,11 +22,10 @@ PLANS = {
         Facts(),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      40  simple, rate 1, remembered
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
@@ -50,11 +49,10 @@ PLANS = {
         Facts(halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      40  simple, rate 1, remembered
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
@@ -106,11 +104,10 @@ PLANS = {
         Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   settle                       signal      40  simple, rate 1, offset held, remembered
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
-        slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
         slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      120  simple, rate 0.6, offset held, half the resolution
@@ -195,7 +192,7 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
     short = replace(Schedule(), settle=1, adapt=1, quiet=4, quiet_trial=1, describe=1)
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
-    assert JointReconstructor().plan(smooth(32, 160))[1] == 12
+    assert JointReconstructor().plan(smooth(32, 160))[1] == 16
 
 
 def test_stages_are_values():
