@@ -125,7 +125,7 @@ class Geometry:
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
-        gain = self._beyond_expected(self._reordered(self.coarse.images), self._reordered(self.replicates[0]), "")
+        gain = self._beyond_expected(self._reordered(self.coarse.images), self._reordered(next(self.replicates)), "")
         return gain._replace(value=max(0.0, gain.value))
 
     def _reordered(self, images: Array) -> Array:
