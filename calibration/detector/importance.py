@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +41,13 @@ class Weighted:
         draws: (S, 3) coordinates.
         weight: (S,) weights with sum 1.
         half: (S,) 0 or 1, for two independent halves.
+        value: (S,) log-density, nats.
     """
 
     draws: Image
     weight: Image
     half: NDArray[np.int64]
+    value: Image
 
     @property
     def effective(self) -> float:
@@ -107,7 +109,7 @@ def importance_sample(
         if not np.isfinite(log_weight).any():
             return None
         weight = np.exp(log_weight - log_weight.max())
-        found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2)
+        found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2, values)
         if progress is not None:
             progress(
                 "Sampling the detector's posterior",
@@ -127,7 +129,7 @@ def _next_kernels(found: Weighted, generator: np.random.Generator, first: Image)
     """Return kernels around likely draws; their width includes a small part of the first round's."""
     tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()
-    centres = Weighted(found.draws, tempered, found.half).resampled(DRAWS, generator)
+    centres = replace(found, weight=tempered).resampled(DRAWS, generator)
     middle = tempered @ found.draws
     spread = (found.draws - middle).T * tempered @ (found.draws - middle)
     return centres, _factor(BANDWIDTH**2 * spread + 1e-4 * first @ first.T)

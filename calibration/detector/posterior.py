@@ -190,6 +190,12 @@ def sample_posterior(
     if len(walkers) > 3 and largest_num_steps > LEAST_STEPS:
         starts = [(best, np.cov(walkers.T)), *_smooth_start(log_posterior)]
         drawn = importance_sample(log_posterior, starts, generator, progress)
+        if drawn is not None:
+            highest = int(np.argmax(drawn.value))
+            if drawn.value[highest] > log_posterior(best)[0] + 1.0:  # a nat: that maximum was a local one
+                start = tuple(float(value[0]) for value in log_posterior.parameters(drawn.draws[highest]))  # type: ignore[assignment]
+                kwargs: Any = {"num_steps": num_steps, "largest_num_steps": largest_num_steps}
+                return sample_posterior(levels, offset=offset, start=start, seed=seed, progress=progress, **kwargs)
         if drawn is not None and drawn.disagreement() < LARGEST_RHAT:
             number, rhat = len(drawn.draws), drawn.disagreement()
             samples = np.column_stack(log_posterior.parameters(drawn.resampled(NUM_SAMPLES, generator)))
