@@ -71,7 +71,7 @@ TARGETS = {
     "recon/fields/regularisers/total_variation.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
     "recon/fields/occupancy.py": ["recon/fields/test_occupancy.py", "recon/fields/test_vacuum.py"],
     "calibration/detector/log_posterior.py": ["calibration/detector/test_log_posterior.py"],
-    "noiseflow/runs/states.py": ["noiseflow/runs/test_states.py", "recon/test_resume.py"],
+    "noiseflow/runs/run_folder.py": ["noiseflow/runs/test_states.py", "recon/test_resume.py"],
 }
 """File → the tests nearest to it, nearest first."""
 PAIRS: dict[type, type] = {

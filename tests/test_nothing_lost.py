@@ -26,7 +26,7 @@ from noiseflow import io
 from noiseflow.commands.cli import main
 from noiseflow.runs.ownership import require_own
 from noiseflow.runs.partials import _prefix
-from noiseflow.runs.states import discard_states, write_state
+from noiseflow.runs.run_folder import discard_states, write_state
 from tests.processes import finish, start, wait_for
 
 CALIBRATE = (

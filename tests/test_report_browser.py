@@ -18,8 +18,8 @@ import pytest
 
 from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
 from recon.methods._registry import reconstruct
+from recon.report.charts import error_bar_figure
 from recon.report.page import even_odd, reconstruction_report
-from recon.report.uncertainty import error_bar_figure
 from recon.series.tilt_series import Volume, VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 

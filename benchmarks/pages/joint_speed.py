@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.scenes import in_turn, make_scene
 from noiseflow import Gaussian, fit
-from noiseflow.kept_memory import kept_memory
+from noiseflow.resources import kept_memory
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.kinds.network import CoordinateNetwork
 from recon.fields.kinds.voxels import VoxelField

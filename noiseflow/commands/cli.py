@@ -17,13 +17,20 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from noiseflow.commands.console import START_AGAIN, Invocation, end_stopped, invoked
+from noiseflow.commands.console import (
+    START_AGAIN,
+    Invocation,
+    SteadyStream,
+    end_stopped,
+    invoked,
+    steady_streams,
+    was_lost,
+)
 from noiseflow.commands.option_files import arrange, shared_options, shows_everything, write_options
-from noiseflow.commands.streams import SteadyStream, steady_streams, was_lost
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version
 from noiseflow.plugins import load_plugin, package_of, plugins
-from noiseflow.threads import wait_passively
+from noiseflow.resources import wait_passively
 
 _ORDER = (
     "demo",

@@ -14,7 +14,7 @@ import typer
 from noiseflow.commands.console import JsonOption, Output
 from noiseflow.installation import DISTRIBUTION, install_command, library_version
 from noiseflow.plugins import GROUPS, load_plugin, plugins
-from noiseflow.threads import waiting
+from noiseflow.resources import waiting
 
 _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
 

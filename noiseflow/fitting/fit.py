@@ -31,7 +31,7 @@ from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
-from noiseflow.threads import few_threads, warn_if_spinning
+from noiseflow.resources import few_threads, warn_if_spinning
 
 _CELLS = 2**13  # about as many cells as a fit has
 

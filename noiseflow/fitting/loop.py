@@ -21,7 +21,7 @@ from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import adam, take_step
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
-from noiseflow.threads import few_threads
+from noiseflow.resources import few_threads
 
 Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000

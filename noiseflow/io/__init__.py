@@ -1,11 +1,11 @@
 """Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
 
-from noiseflow.runs.lock import locked as locked
 from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_folder as check_folder
 from noiseflow.runs.outputs import check_output as check_output
 from noiseflow.runs.outputs import output_folder as output_folder
 from noiseflow.runs.outputs import require_other as require_other
+from noiseflow.runs.ownership import locked as locked
 from noiseflow.runs.partials import partial_folder as partial_folder
 
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE

@@ -95,15 +95,7 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
         ValueError: the angle file cannot be read, or does not match the images.
     """
     file = angle_file_of(stack) if angles is None else Path(angles)
-    if file is None and image.tilt_angles is None:
-        names = ", ".join(candidate.name for candidate in candidates(stack)[:2])
-        raise FileNotFoundError(
-            f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
-        )
-    if file is None:
-        assert image.tilt_angles is not None
-        table = TiltTable(image.tilt_angles)
-    else:
+    if file is not None:
         table = read_tilts(file)
         rows = _joined(table, image, file, Path(stack))
         absent = [place for place, row in enumerate(rows) if row < 0]
@@ -112,6 +104,13 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
             named = f"{len(rows) - len(absent)} of {len(rows)} images of {stack}"
             warnings.warn(f"{file} names {named}; the others are left out", stacklevel=2)
             table = replace(table, excluded=(*table.excluded, *absent))
+    elif image.tilt_angles is not None:
+        table = TiltTable(image.tilt_angles)
+    else:
+        names = ", ".join(candidate.name for candidate in candidates(stack)[:2])
+        raise FileNotFoundError(
+            f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
+        )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
 

@@ -6,6 +6,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +39,12 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
     names = tuple(file.name for file in files)
     tables = [_own_table(file) for file in files]
+    images = (read(file) for file in files)
+    first = next(images)
     sections: list[NDArray[Any]] = []
     inside: list[float] = []
     frames: set[int] = set()
-    first: ImageFile | None = None
-    for file, table in zip(files, tables, strict=True):
-        image = read(file)
-        first = first or image
+    for file, table, image in zip(files, tables, chain([first], images), strict=True):
         if image.data.ndim == 3 and len(image.data) > 1:
             _require_movie(file, image, table, folder, names)
             frames.add(len(image.data))
@@ -60,7 +60,6 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
     if frames:
         counts = f"{min(frames)}" if len(frames) == 1 else f"{min(frames)} to {max(frames)}"
         warnings.warn(f"{folder} holds movies of {counts} frames, which are summed without an alignment", stacklevel=4)
-    assert first is not None
     own = next((table for table in tables if table is not None), None)
     size, stated = None if own is None else own.pixel_size, first.voxel_size
     if size is not None and (stated is None or stated[2] == 1):  # 1 Å: programs write it where they know no size

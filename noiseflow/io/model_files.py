@@ -16,7 +16,7 @@ from noiseflow.installation import library_version
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.plugins import load_plugins
-from noiseflow.runs.states import save_tensors
+from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024

@@ -37,11 +37,10 @@ def read(path: Path) -> TiltTable:
         ValueError: no table has tilt angles, or a value is not a number.
     """
     tables = _tables(text_lines(path, "angle file", holds="a table of tilts"))
-    table = next((table for table in tables if any(name in table for name in _ANGLES)), None)
-    if table is None:
+    tilted = ((table, angles) for table in tables if (angles := _numbers(table, _ANGLES, path)) is not None)
+    table, angles = next(tilted, (None, None))
+    if table is None or angles is None:
         raise ValueError(f"{path} holds no angles: no table has a column {', '.join(_ANGLES)}")
-    angles = _numbers(table, _ANGLES, path)
-    assert angles is not None
     sizes = next((found for each in (table, *tables) if (found := _numbers(each, _SIZES, path)) is not None), None)
     axes = _numbers(table, _AXES, path)
     size = None if sizes is None else float(sizes[0])

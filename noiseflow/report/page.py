@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import io
 import json
 import platform
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +24,6 @@ from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_SCRIPTS = ("core.js", "volume.js", "tilts.js", "downloads.js", "start.js")
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
 class Report:
@@ -43,38 +39,35 @@ class Report:
         self._parts: list[str] = []
         self._folded = False
 
+    def _add(self, part: str, *values: Any) -> None:
+        """Add a part from its macro in ``parts.html``."""
+        self._parts.append(getattr(_pages().get_template("parts.html").module, part)(*values))
+
     def heading(self, text: str, *, folded: bool = False) -> None:
         """Start a section; a folded one shows only its heading until the reader opens it."""
-        heading, self._parts = f"<h2>{_escape(text)}</h2>", [self._content()]
-        self._folded = folded
-        self._parts.append(f"<details><summary>{heading}</summary>" if folded else heading)
+        self._parts, self._folded = [self._content()], folded
+        self._add("heading", text, folded)
 
     def _content(self) -> str:
         return "".join(self._parts) + ("</details>" if self._folded else "")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(f"<p>{_escape(text)}</p>")
+        self._add("text", text)
 
     def command(self, text: str) -> None:
         """Add a command line; options are not broken across lines."""
-        unbroken = re.sub(r"(?<!\S)(--\S+)", r"<span>\1</span>", _escape(text))
-        self._parts.append(f'<p class="command">{unbroken}</p>')
+        self._add("command", re.split(r"(\s+)", text))
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
         """Add the most important values, (name, value), as cards."""
-        cards = "".join(f"<div><dt>{_escape(n)}</dt><dd>{_escape(v)}</dd></div>" for n, v in facts)
-        self._parts.append(f'<dl class="facts">{cards}</dl>')
+        self._add("facts", facts)
 
     def table(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str = "", prose: bool = False
     ) -> None:
         """Add a table. The first column is left-aligned; with `prose` all columns are, and long cells wrap."""
-        head = "".join(f"<th>{_escape(cell)}</th>" for cell in header)
-        body = "".join("<tr>" + "".join(f"<td>{_escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        note = f'<p class="note">{_escape(caption)}</p>' if caption else ""
-        kind = ' class="prose"' if prose else ""
-        self._parts.append(f'<div class="scroll"><table{kind}><tr>{head}</tr>{body}</table></div>{note}')
+        self._add("table", header, rows, caption, prose)
 
     def figure(self, figure: Figure, *, caption: str) -> None:
         """Add a matplotlib figure as PNG on white. Use it for images, and `charts` for curves."""
@@ -86,27 +79,16 @@ class Report:
             figure.set_layout_engine("none")
         margins = "tight" if engine is None else None
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
-        data = base64.b64encode(stream.getvalue()).decode()
-        text = _escape(caption)
-        self._parts.append(
-            f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
-        )
+        self._add("figure", base64.b64encode(stream.getvalue()).decode(), caption)
 
     def charts(self, figures: Sequence[Figure], *, caption: str) -> None:
         """Add small figures from `new_chart` side by side, as many per row as fit; they follow the page theme."""
-        drawn = "".join(themed_svg(figure) for figure in figures)
-        self._parts.append(
-            f'<figure><div class="charts">{drawn}</div><figcaption>{_escape(caption)}</figcaption></figure>'
-        )
+        self._add("charts", "".join(map(themed_svg, figures)), caption)
 
     def widget(self, kind: str, data: dict[str, Any], *, caption: str) -> None:
         """Add an interactive view, ``volume`` or ``tilts``, with the data for its script in ``assets``."""
         stored = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-        self._parts.append(
-            f'<figure data-widget="{_escape(kind)}"><script type="application/json">{stored}</script>'
-            "<noscript><p>This picture needs JavaScript.</p></noscript>"
-            f"<figcaption>{_escape(caption)}</figcaption></figure>"
-        )
+        self._add("widget", kind, stored, caption)
 
     def include(self, path: str | Path) -> None:
         """Add the content of a saved report as a part of this one."""
@@ -115,35 +97,31 @@ class Report:
         content = page.partition("<main>")[2].rpartition("</main>")[0]
         if not content:
             raise ValueError(f"{path} is not a noiseflow report and has no content to include")
-        content = content.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
-        self._parts = [f'{self._content()}<section class="part"><h2>{title}</h2>{content}</section>']
-        self._folded = False
+        self._parts, self._folded = [self._content()], False
+        self._add("included", title, content.replace("<h2>", "<h3>").replace("</h2>", "</h3>"))
 
     def save(self, path: str | Path) -> Path:
         """Write the page and return its path."""
         path = check_output(path, suffixes=frozenset({".html"}))
-        title, lead = _escape(self.title), _escape(self.lead)
-        page = (
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-            f'<meta name="generator" content="{signature()}">'
-            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}"><title>{title}</title>'
-            '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
-            f'<style>{_asset("page.css")}</style></head><body><div class="page"><header><h1>{title}</h1>'
-            f'<p class="note">{lead}</p></header><nav class="contents" aria-label="Contents"></nav>'
-            f"<main>{self._content()}</main></div>"
-            f"<script>'use strict';\n{''.join(map(_asset, _SCRIPTS))}</script></body></html>\n"
-        )
+        values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
+        page = _pages().get_template("page.html").render(values)
         with atomic_path(path) as partial:
             partial.write_text(page, encoding="utf-8")
         return path
 
 
-def _escape(text: str) -> str:
-    return html.escape(printable(text))
+@cache
+def _pages() -> Any:
+    """The templates of pages: text is escaped, and characters that cannot be printed are replaced."""
+    from jinja2 import Environment, PackageLoader
 
-
-def _asset(name: str) -> str:
-    return (files("noiseflow.report") / "assets" / name).read_text(encoding="utf-8")
+    return Environment(
+        loader=PackageLoader("noiseflow.report", "assets"),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        finalize=lambda value: printable(value) if type(value) is str else value,
+    )
 
 
 _PACKAGES = (DISTRIBUTION, "torch", "numpy", "scipy")

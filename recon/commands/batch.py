@@ -51,8 +51,8 @@ def batch(
     """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
     from noiseflow import io
     from noiseflow.runs.ownership import require_own
-    from recon.scale.cluster import client_of
     from recon.scale.many import finished, jobs_of, left_out, read_table, reconstruct_all, write_table
+    from recon.scale.running import client_of
 
     io.check_folder(out)
     output, table = Output(json), out / "batch.csv" if table is None else table

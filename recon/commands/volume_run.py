@@ -21,8 +21,8 @@ from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import fitted_slices
-from recon.scale.cluster import client_of
 from recon.scale.memory import expected_seconds
+from recon.scale.running import client_of
 from recon.series.tilt_series import VolumeGrid
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import torch
 
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import check_output
-from noiseflow.runs.states import save_tensors
+from noiseflow.runs.run_folder import save_tensors
 from recon.fields._registry import find_field, name_of
 from recon.fields.fields import Field
 from recon.series.tilt_series import Volume

@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from noiseflow import FitResult, fit
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.progress import Progress
-from noiseflow.runs.run_folder import RunFolder
-from noiseflow.runs.states import read_state
+from noiseflow.runs.run_folder import RunFolder, read_state
 from recon.joint.stages import Stage
 
 _CURRENT = "current.safetensors"

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from noiseflow import Gaussian, fit
-from noiseflow.threads import num_threads
+from noiseflow.resources import num_threads
 from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.signal_model import TomographySignal

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from noiseflow import Gaussian
 from noiseflow.distributions.image_pixels import needs_image
-from noiseflow.kept_memory import kept_memory
 from noiseflow.progress import Progress
+from noiseflow.resources import kept_memory
 from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy

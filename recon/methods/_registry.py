@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from noiseflow.arguments import takes_fields_of
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
-from noiseflow.kept_memory import kept_memory
-from noiseflow.keywords import takes_fields_of
 from noiseflow.progress import Progress
+from noiseflow.resources import kept_memory
 from recon.fields._registry import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
@@ -360,7 +360,8 @@ def _in_blocks(
     settings: Settings,
 ) -> Reconstruction:
     folder = None if settings.keep is None else settings.keep(settings.prefix)
-    assert method.blockwise is not None
+    if method.blockwise is None:
+        raise ValueError(f"method {method.name} does not reconstruct in blocks; remove slices_at_once")
     return reconstruct_in_blocks(
         method.blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from noiseflow.threads import wait_passively
+from noiseflow.resources import wait_passively
 
 wait_passively()  # here, because the plugin's own modules import torch
 from recon.napari.files import get_reader, write_image  # noqa: E402

@@ -18,9 +18,8 @@ from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
+from recon.report.charts import add_error_bars, noise_charts
 from recon.report.methods import methods_paragraph
-from recon.report.noise import noise_charts
-from recon.report.uncertainty import add_error_bars
 from recon.report.verdict import add_differences, add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from noiseflow.io import atomic_path
 from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_map
 from noiseflow.io.numpy_files import write as write_npy
-from noiseflow.kept_memory import hand_back
+from noiseflow.resources import hand_back
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.result import error_bar_paths
 from recon.uncertainty.shell_band import ShellPowers

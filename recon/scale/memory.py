@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from noiseflow.threads import num_threads
+from noiseflow.resources import num_threads
 from recon.joint.plan import FitStage
 from recon.projection.projector import SliceProjector
 from recon.projection.tiles import slices_of_a_tile

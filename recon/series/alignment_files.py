@@ -109,17 +109,15 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     """The alignment of a file with one transform for each image of a stack."""
     tables = (".aln", ".star", ".tomostar", ".mdoc", ".com")  # others are transforms, such as .xf and .prexg of IMOD
     table = io.read_tilts(path) if path.suffix.lower() in tables else _xf_with_angles(path, tilt_series)
-    if table.transforms is None:
-        raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
+    _transforms(table, path)
     table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
     known: dict[str, Any] = {"image_shape": table.image_shape, "pixel_size": table.pixel_size}
     if binning is not None:
         if not 0 < binning < np.inf:
             raise ValueError(f"--alignment-binning {binning:g}: give a positive number, such as 4")
-        moved = table.transforms / np.array([1, 1, binning])
-        table, known = replace(table, transforms=moved), {}
+        table, known = replace(table, transforms=_transforms(table, path) / np.array([1, 1, binning])), {}
     if tilt_series is None:
-        return Alignment.of_transforms(_transforms(table), table.angles, **known)
+        return Alignment.of_transforms(_transforms(table, path), table.angles, **known)
     views = np.arange(tilt_series.num_tilts) if tilt_series.views is None else tilt_series.views
     total = tilt_series.num_views or tilt_series.num_tilts
     sections = np.arange(len(table.angles)) if table.sections is None else table.sections
@@ -137,7 +135,7 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,
         )
-    alignment = Alignment.of_transforms(_transforms(table), raw, refined_angles=refined, **known)
+    alignment = Alignment.of_transforms(_transforms(table, path), raw, refined_angles=refined, **known)
     _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
     return alignment
 
@@ -153,8 +151,9 @@ def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, 
         )
 
 
-def _transforms(table: io.TiltTable) -> NDArray[np.float64]:
-    assert table.transforms is not None
+def _transforms(table: io.TiltTable, path: Path) -> NDArray[np.float64]:
+    if table.transforms is None:
+        raise ValueError(f"{path} holds tilt angles but no alignment; give it with --angles")
     return table.transforms
 
 

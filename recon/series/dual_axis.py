@@ -78,7 +78,8 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
 
 def about(tilt_series: TiltSeries, *, second: bool) -> TiltSeries:
     """The tilts about one of the two axes, in their own frame, with the axis along y."""
-    assert tilt_series.axes is not None
+    if tilt_series.axes is None:
+        raise ValueError("this series has one tilt axis; join two series with stacked()")
     part = tilt_series.select(np.flatnonzero((tilt_series.axes != 0) == second))
     mask = part.mask
     if second:

@@ -1,6 +1,9 @@
 from .coverage import left_out_ranks as left_out_ranks
 from .coverage import predictive_ranks as predictive_ranks
 from .coverage import share_within as share_within
+from .coverage import unseen_part as unseen_part
+from .coverage import unseen_range as unseen_range
+from .coverage import unseen_share as unseen_share
 from .coverage import voxel_coverage as voxel_coverage
 from .measure import Measurement as Measurement
 from .measure import line_profile as line_profile
@@ -10,6 +13,3 @@ from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
 from .result import Uncertainty as Uncertainty
 from .shell_band import ShellBand as ShellBand
-from .unseen import unseen_part as unseen_part
-from .unseen import unseen_range as unseen_range
-from .unseen import unseen_share as unseen_share

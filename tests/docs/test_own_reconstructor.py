@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,18 +11,6 @@ import pytest
 import torch
 
 from noiseflow.io import read_image
-
-EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "own_reconstructor.py"
-
-
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("own_reconstructor", EXAMPLE)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 def test_no_pixel_is_predicted_from_itself(example: ModuleType) -> None:

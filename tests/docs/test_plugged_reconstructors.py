@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -11,18 +9,6 @@ import torch
 from torch import nn
 
 import noiseflow
-
-EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "plugged_reconstructors.py"
-
-
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("plugged_reconstructors", EXAMPLE)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 # deconvolution of 3 072 pixels gains little, because the blurred signal of a pixel is that of its neighbours

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "train_denoiser.py"
-
 
 @pytest.mark.slow
-def test_likelihood_beats_squared_differences_on_clipped_values() -> None:
-    found = runpy.run_path(str(EXAMPLE))["compare"](num_steps=100, seed=1)
+def test_likelihood_beats_squared_differences_on_clipped_values(example: ModuleType) -> None:
+    found = example.compare(num_steps=100, seed=1)
     assert found["squared differences"] > found["noisy"] + 3
     assert found["likelihood, true noise model"] > found["squared differences"] + 0.2
     assert found["likelihood, noise model learnt along"] > found["squared differences"] + 0.2

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from noiseflow.kept_memory import _glibc, hand_back, kept_memory
+from noiseflow.resources import _glibc, hand_back, kept_memory
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux" or _glibc() is None, reason="glibc alone is told")
 _BYTES, _PAGE = 64 * 2**20, 4096

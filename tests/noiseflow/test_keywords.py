@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from noiseflow.keywords import takes_fields_of
+from noiseflow.arguments import takes_fields_of
 
 
 @dataclass

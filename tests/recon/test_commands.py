@@ -1,5 +1,6 @@
 """The commands end to end, and what they answer to bad input."""
 
+import json
 import shutil
 
 import mrcfile
@@ -100,7 +101,7 @@ def test_output_that_cannot_be_written_is_refused_before_the_work(series, tmp_pa
         run_command("reconstruct", series / "tilts.mrc", "-o", tmp_path / "none" / "out.mrc")
 
 
-def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_path):
+def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_path, capsys):
     run_command("simulate", tmp_path / "new", "--size", 24)
     angles = np.random.default_rng(0).permutation(io.read_angles(tmp_path / "new" / "tilts.rawtlt"))
     np.savetxt(tmp_path / "wrong.tlt", angles, fmt="%.2f")
@@ -110,4 +111,6 @@ def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_pat
     out.unlink()
     with pytest.raises(ValueError, match=r"--strict: the verdict is bad \(.* is written\)"):
         run_command(*words, tmp_path / "wrong.tlt")
+    effects = json.loads(capsys.readouterr().out.splitlines()[-1])["verdict"]["evidence"].values()
+    assert "angles" in {effect["reason"] for effect in effects if effect["cost"] > 1}
     assert io.read(out).data.shape == (24, 24, 24)

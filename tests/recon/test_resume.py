@@ -15,7 +15,7 @@ import noiseflow
 import recon.commands.results  # noqa: F401  or every child process would import it again
 from noiseflow import io
 from noiseflow.fitting.loop import FitLoop
-from noiseflow.runs.states import read_state, write_state
+from noiseflow.runs.run_folder import read_state, write_state
 from recon.joint.checkpoint import Journal
 from recon.joint.stages import Repeated
 from tests.processes import finish, start, wait_for

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
-from noiseflow.kept_memory import kept_memory
+from noiseflow.resources import kept_memory
 
 PIECE = 2**14
 """Pixels evaluated at once: a dozen float64 arrays of this size fit in the cache."""

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from noiseflow import io
-from noiseflow.runs.lock import lock_file
+from noiseflow.runs.ownership import lock_file
 from tests.processes import FORK
 
 

@@ -10,7 +10,7 @@ import torch
 from safetensors.numpy import load_file
 from torch.testing import assert_close
 
-from noiseflow.runs.states import _packed, discard_states, read_state, write_state
+from noiseflow.runs.run_folder import _packed, discard_states, read_state, write_state
 
 
 def test_nested_values_come_back_as_they_were(tmp_path: Path) -> None:

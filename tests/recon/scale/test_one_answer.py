@@ -198,12 +198,12 @@ def test_workers_that_all_die_are_one_line(tmp_path):
 
 def test_an_unreachable_scheduler_is_one_line(monkeypatch):
     pytest.importorskip("dask.distributed")
-    from recon.scale import cluster
+    from recon.scale import running
 
-    monkeypatch.setattr(cluster, "_PATIENCE", 0.5)
+    monkeypatch.setattr(running, "_PATIENCE", 0.5)
     with (
         pytest.raises(ConnectionError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"),
-        cluster.client_of(None, "tcp://127.0.0.1:9"),
+        running.client_of(None, "tcp://127.0.0.1:9"),
     ):
         pass
 

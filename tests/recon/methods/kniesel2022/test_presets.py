@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from noiseflow.runs.states import read_state, write_state
+from noiseflow.runs.run_folder import read_state, write_state
 from recon.commands.options import method_of
 from recon.fields.kinds.kniesel2022 import CoordinateDensity
 from recon.joint.stages import run_stage

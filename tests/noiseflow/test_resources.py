@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow import threads
+from noiseflow import resources
 
 _SHOW = "import os, sys; print(os.environ.get('OMP_WAIT_POLICY'), 'torch' in sys.modules)"
 _PROGRAM = (
@@ -21,7 +21,7 @@ _PROGRAM = (
 
 
 def _environment(**settings: str) -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name not in threads.PASSIVE} | settings
+    return {name: value for name, value in os.environ.items() if name not in resources.PASSIVE} | settings
 
 
 @pytest.mark.parametrize(("settings", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
@@ -39,8 +39,8 @@ def test_the_napari_plugin_waits_passively() -> None:
 
 @pytest.mark.parametrize(("size", "count"), [(4096, 1), (10**6, 2)])
 def test_small_operations_use_one_thread(size: int, count: int) -> None:
-    with threads.num_threads(2):
-        with threads.few_threads(size):
+    with resources.num_threads(2):
+        with resources.few_threads(size):
             assert torch.get_num_threads() == count
         assert torch.get_num_threads() == 2
 
@@ -49,7 +49,7 @@ def test_a_fit_to_known_signals_uses_one_thread() -> None:
     seen = list[int]()
     signal = torch.linspace(1, 2, 4000)
     noise = noiseflow.Gaussian(0.1)(signal).sample(generator=torch.Generator().manual_seed(0))
-    with threads.num_threads(2):
+    with resources.num_threads(2):
         options = {"num_steps": 8, "progress": lambda *_: seen.append(torch.get_num_threads())}
         noiseflow.fit(noiseflow.Gaussian(), signal, noise, **options)
     assert set(seen) == {1}
@@ -59,12 +59,12 @@ def test_a_fit_to_known_signals_uses_one_thread() -> None:
 def test_spinning_on_a_busy_machine_is_reported(
     policy: str, load: float, warned: bool, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
-    for name in threads.PASSIVE:
+    for name in resources.PASSIVE:
         monkeypatch.delenv(name, raising=False)
     if policy:
         monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with threads.num_threads(2):
-        threads.warn_if_spinning()
+    with resources.num_threads(2):
+        resources.warn_if_spinning()
     assert [each.category for each in recwarn] == [RuntimeWarning] * warned
