@@ -1,16 +1,15 @@
 """Components of the self-contained HTML report: page, figures, interactive images and provenance."""
 
-from noiseflow.report.charts import COLOURS, add_legend, new_chart, new_figure, show_image
+from noiseflow.report.charts import COLOURS, Chart, new_figure, show_image
 from noiseflow.report.page import Report, provenance
 from noiseflow.report.sprites import Sprites, make_sprites
 
 __all__ = [
     "COLOURS",
+    "Chart",
     "Report",
     "Sprites",
-    "add_legend",
     "make_sprites",
-    "new_chart",
     "new_figure",
     "provenance",
     "show_image",

@@ -7,6 +7,7 @@ import html
 import io
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = {name: f"var(--{name})" for name in ("ink", "soft", "line", "accent", "warm", "data")}
+LIGHT = {
+    "ink": "#1b2330",
+    "soft": "#5d6675",
+    "line": "#dcdfe4",
+    "accent": "#0b6e8a",
+    "warm": "#c4561a",
+    "data": "#9fb4c4",
+}
+"""Colours of charts outside pages: those of the light theme."""
+
+COLOURS = {name: f"var(--{name})" for name in LIGHT}
 """Colours of the page theme."""
 
 
@@ -79,7 +90,7 @@ class Chart:
         self, x: ArrayLike, y: ArrayLike, *, colour: str = COLOURS["accent"], label: str = "", width: float = 1.4,
         dashes: str = "", dots: float = 0.0, error: ArrayLike | None = None, across: bool = False
     ) -> None:  # fmt: skip
-        """Draw a line, dots of a radius, or both, with error bars along y, or along x if `across`; `width` 0 leaves out the line."""
+        """Draw a line unless its width is 0, dots of a radius, and error bars along y, or along x if `across`."""
         x, y = (np.asarray(values, float).ravel() for values in (x, y))
         if width:
             dash = f' stroke-dasharray="{dashes}"' if dashes else ""
@@ -131,7 +142,7 @@ class Chart:
     def svg(self) -> str:
         """The chart as an ``<svg>`` element with selectable text."""
         spans = {axis: self._span(axis) for axis in "xy"}
-        ticks = {axis: self.ticks.get(axis) or _ticks(*spans[axis], axis in self.log) for axis in "xy"}
+        ticks = {axis: self.ticks.get(axis) or _ticks(min(spans[axis]), max(spans[axis]), axis in self.log) for axis in "xy"}
         left = 22 + 5.2 * max([len(name) for _, name in ticks["y"]], default=0)
         rows = self._legend_rows(self.width - left - 8)
         box = (left, self.width - 10, self.height - 34, 24.0)  # left, right, bottom, top
@@ -160,11 +171,19 @@ class Chart:
             for across, (label, colour, filled) in row:
                 down = self.height + 6 + 14 * number
                 height = 7 if filled else 2
-                parts.append(
-                    f'<rect x="{left + across:.1f}" y="{down - height / 2 - 2:.1f}" width="14" height="{height}" fill="{colour}"/>'
-                )
+                shape = f'x="{left + across:.1f}" y="{down - height / 2 - 2:.1f}" width="14" height="{height}"'
+                parts.append(f'<rect {shape} fill="{colour}"/>')
                 parts.append(_text(left + across + 18, down + 1, label, "soft"))
         return "".join(parts) + "</svg>"
+
+    def save(self, path: str | Path) -> None:
+        """Write the chart as a file on white."""
+        svg = self.svg().replace(
+            'font-size="8.5">', 'font-size="8.5" style="background:white" font-family="sans-serif">', 1
+        )
+        for name, colour in LIGHT.items():
+            svg = svg.replace(COLOURS[name], colour)
+        Path(path).write_text(svg, encoding="utf-8")
 
     def _add(
         self, kind: str, place: Any, style: str, label: str = "", colour: str = "", *, filled: bool = False
@@ -231,11 +250,11 @@ def _ticks(low: float, high: float, log: bool, *, most: int = 6) -> list[tuple[f
     return [(place, f"{place:.6g}") for place in places if low <= place <= high]
 
 
-def _mark(
-    kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[float, float, float, float]
-) -> str:
+def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[float, float, float, float]) -> str:
     if kind == "across":
-        x, y = (None if value is None else float(place[axis](np.array(value))) for axis, value in zip("xy", at, strict=True))
+        x, y = (
+            None if value is None else float(place[axis](np.array(value))) for axis, value in zip("xy", at, strict=True)
+        )
         ends = (x, box[3], x, box[2]) if y is None else (box[0], y, box[1], y)
         return _rule(*ends, style=style)  # type: ignore[arg-type]
     x, y = (place[axis](values) for axis, values in zip("xy", at, strict=True))
