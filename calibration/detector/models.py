@@ -42,6 +42,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 """Arguments of their classes."""
 
+KEPT = ("standardise", "settle")
+"""Searches for a detector, which a measured one does without."""
+
 BLOCK = 8
 """Side of the held-out blocks, pixels."""
 
@@ -227,14 +230,13 @@ def fit_models(
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """
-    everything = [name for name in KINDS if name != "counting" or _counting(pixels)]
-    scores: list[ModelScore] = []
-    for names in (SIMPLE, everything) if kinds is None else (kinds,):
-        scores = _compared(sorted(names, key=_rank), pixels, detector, seed, device, progress)
+    if kinds is None:
+        scores = _compared(SIMPLE, pixels, detector, seed, device, progress)
         best = min(scores, key=lambda score: score.excess)
         if attainable(best.model, pixels) <= WORTH_FITTING and not heavy_tailed(best.model, pixels):
-            break
-    return scores
+            return scores
+        kinds = [name for name in KINDS if name != "counting" or _counting(pixels)]
+    return _compared(sorted(kinds, key=_rank), pixels, detector, seed, device, progress)
 
 
 def _compared(
@@ -256,7 +258,7 @@ def _compared(
         model = getattr(noiseflow, KINDS[name])(**OPTIONS.get(name, {}))
         if detector is not None and name == "poisson-gaussian":
             model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
-            model.standardise = model.settle = lambda *_, **__: None  # type: ignore[method-assign]
+            vars(model).update(dict.fromkeys(KEPT, lambda *_, **__: None))
         candidates[name] = model.to(device)
     train = np.random.default_rng(seed).permutation(np.flatnonzero(~pixels.held_out))[:MOST_PIXELS]
     used = np.sort(np.concatenate([train, np.flatnonzero(pixels.held_out)]))
@@ -274,7 +276,8 @@ def _compared(
     )
     held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
     for model in candidates.values():
-        vars(model).pop("standardise", None), vars(model).pop("settle", None)
+        for name in KEPT:
+            vars(model).pop(name, None)
     return [_score(found, number, held_out, seed) for found in selection.candidates]
 
 

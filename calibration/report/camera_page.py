@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.camera import Camera, rows_of
+from calibration.report.exports import FILES, figures_of_camera, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
 from calibration.report.page import describe_verdict
 from noiseflow.io import output_folder
@@ -57,8 +58,11 @@ def write_camera_report(
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
+    ends = [min(level.end, float(level.image.max())) for level in camera.figures.levels]
     with output_folder(folder) as made:
-        return page.save(made / "report.html")
+        shape, grade = camera.maps["response"].shape, camera.verdict.grade
+        write_exports(made, figures_of_camera(camera), top=max(ends), shape=shape, verdict=grade)
+        return page.save(made / FILES[0])
 
 
 def transfer_charts(camera: Camera) -> list[Chart]:

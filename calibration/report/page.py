@@ -12,9 +12,11 @@ from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import CHANCE, HEAVIER, ModelScore, foremost, simplest_sufficient
 from calibration.detector.posterior import Interval
 from calibration.detector.response import Response
+from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
+from calibration.report.exports import FILES, figures_of_exposures, write_exports
 from calibration.report.figures import (
     LABELS,
     corner_charts,
@@ -142,7 +144,7 @@ def describe_detector(findings: Findings) -> str:
     if detector is None or figures is None:
         return f"not measured: {findings.no_detector}"
     found = detector.posterior
-    text = describe_figures(figures) + f" {found.num_steps / found.autocorrelation_time:.0f} effective samples, "
+    text = describe_figures(figures) + f" {found.effective:.0f} effective samples, "
     text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
     if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
@@ -202,7 +204,7 @@ def write_report(
     inputs: Sequence[str | Path] = (),
     seed: int | None = None,
 ) -> Path:
-    """Write ``report.html`` to a folder, which is created if necessary, and return its path.
+    """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
     Args:
         folder: output folder.
@@ -233,7 +235,11 @@ def write_report(
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
-        return page.save(made / "report.html")
+        short = findings.pairs[0].short
+        top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
+        grade = findings.verdict.grade
+        write_exports(made, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
+        return page.save(made / FILES[0])
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:

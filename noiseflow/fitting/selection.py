@@ -45,7 +45,13 @@ class _Scored(Protocol):
 _Item = TypeVar("_Item", bound=_Scored)
 
 
-@described(nll="nats per pixel", nll_error="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
+@described(
+    nll="nats per pixel",
+    nll_error="nats per pixel",
+    excess="nats per pixel",
+    excess_error="nats per pixel",
+    seconds="s",
+)
 @dataclass(frozen=True)
 class Candidate:
     """A fitted noise model and its held-out likelihood.
