@@ -15,7 +15,9 @@ DIRECT = [
 ]
 
 
-@pytest.mark.parametrize(("figures", "gain"), [(DIRECT, 2.0), ([*DIRECT, Figure("excess-noise factor", "", "", 2.0)], 1.0)])
+@pytest.mark.parametrize(
+    ("figures", "gain"), [(DIRECT, 2.0), ([*DIRECT, Figure("excess-noise factor", "", "", 2.0)], 1.0)]
+)
 def test_simulators_have_the_gain_and_the_largest_value(figures, gain):
     found = simulators(figures, top=4095, shape=(32, 48))
     getframes, microsim = found["getframes"], found["microsim"]
