@@ -67,11 +67,10 @@ class Weighted:
             found.append(np.sqrt(1 + np.var(means, ddof=1) / max(float(np.mean(spreads)), np.finfo(float).tiny)))
         return float(max(found))
 
-    def resampled(self, number: int, generator: np.random.Generator) -> Image:
-        """Return equally weighted draws, (number, 3), by systematic resampling."""
+    def resampled(self, number: int, generator: np.random.Generator) -> NDArray[np.int64]:
+        """Return the indices of equally weighted draws, (number,), by systematic resampling."""
         place = (np.arange(number) + generator.random()) / number
-        index = np.searchsorted(np.cumsum(self.weight), place).clip(0, len(self.draws) - 1)
-        return np.asarray(self.draws[index])
+        return np.searchsorted(np.cumsum(self.weight), place).clip(0, len(self.draws) - 1)
 
 
 def importance_sample(
@@ -129,7 +128,7 @@ def _next_kernels(found: Weighted, generator: np.random.Generator, first: Image)
     """Return kernels around likely draws; their width includes a small part of the first round's."""
     tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()
-    centres = replace(found, weight=tempered).resampled(DRAWS, generator)
+    centres = found.draws[replace(found, weight=tempered).resampled(DRAWS, generator)]
     middle = tempered @ found.draws
     spread = (found.draws - middle).T * tempered @ (found.draws - middle)
     return centres, _factor(BANDWIDTH**2 * spread + 1e-4 * first @ first.T)

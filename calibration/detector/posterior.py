@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.detector.importance import importance_sample
+from calibration.detector.importance import Weighted, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
@@ -23,6 +23,9 @@ NINETY = 1.645
 
 LARGEST_RHAT = 1.05
 """Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
+
+FARTHEST = 5.0
+"""Distance of a local maximum from the samples, in their standard deviations; the true maximum is within 3."""
 
 NUM_SAMPLES = 2000
 """Number of equally weighted samples that are kept."""
@@ -137,7 +140,8 @@ def sample_posterior(
 ) -> DetectorPosterior:
     """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation.
 
-    If a draw is likelier than the maximum, that was a local one, and sampling starts again from the draw.
+    If samples are likelier than the maximum and far from it, it was a local one, and sampling starts again from the likeliest
+    sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -161,21 +165,36 @@ def sample_posterior(
         (2.0, 3)
     """
     generator = np.random.default_rng(seed)
+    log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+    chosen = drawn.resampled(NUM_SAMPLES, generator)
+    middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
+    highest = chosen[np.argmax(drawn.value[chosen])]
+    likelier = drawn.value[highest] > log_posterior(best)[0]
+    if likelier and np.any(np.abs(best - middle) > FARTHEST * spread):
+        start = _set(log_posterior, drawn.draws[highest])
+        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+        chosen = drawn.resampled(NUM_SAMPLES, generator)
+    samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
+    likely, number = np.array(_set(log_posterior, best)), len(drawn.draws)
+    return DetectorPosterior(
+        samples, likely, drawn.effective, drawn.disagreement(), number, tuple(log_posterior.levels)
+    )
+
+
+def _drawn(
+    levels: Sequence[Levels],
+    offset: tuple[float, float] | None,
+    start: tuple[float, float, float] | None,
+    generator: np.random.Generator,
+    progress: Progress | None,
+) -> tuple[LogPosterior, Image, Weighted]:
+    """Return the posterior, its maximum near `start`, and weighted draws around it."""
     log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
-    while True:
-        starts = [(best, _curvature(log_posterior, best)), *_smooth_start(log_posterior)]
-        drawn = importance_sample(log_posterior, starts, generator, progress)
-        if drawn is None or drawn.disagreement() > LARGEST_RHAT:
-            raise ValueError(NOT_CONVERGED)
-        highest = int(np.argmax(drawn.value))
-        # a nat: less is the tolerance of the maximisation
-        if drawn.value[highest] < log_posterior(best)[0] + 1.0:
-            break
-        log_posterior, best = maximum_likelihood(log_posterior, _set(log_posterior, drawn.draws[highest]))
-    samples = np.column_stack(log_posterior.parameters(drawn.resampled(NUM_SAMPLES, generator)))
-    likely = np.array(_set(log_posterior, best))
-    number, kept = len(drawn.draws), tuple(log_posterior.levels)
-    return DetectorPosterior(samples, likely, drawn.effective, drawn.disagreement(), number, kept)
+    starts = [(best, _curvature(log_posterior, best)), *_smooth_start(log_posterior)]
+    drawn = importance_sample(log_posterior, starts, generator, progress)
+    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+        raise ValueError(NOT_CONVERGED)
+    return log_posterior, best, drawn
 
 
 def _set(log_posterior: LogPosterior, coordinates: Image) -> tuple[float, float, float]:

@@ -129,13 +129,11 @@ def test_samples_that_do_not_represent_the_posterior_are_an_error(monkeypatch):
         sample_posterior([levels])
 
 
-def test_a_local_maximum_is_left_for_a_likelier_draw():
+def test_a_local_maximum_is_left_for_a_likelier_sample():
     generator = np.random.default_rng(3)
-    observed = 100 + 8 * (generator.poisson(12.0, 30_000) + 0.25 * generator.standard_normal(30_000))
-    one = readings(generator, np.full(30_000, 12.0))
-    one = replace(one, observation=np.round(observed), signal=np.full(30_000, 196.0))
+    one = cells(generator, generator.gamma(4.0, 3.0, 30_000), gain=8.0, read_noise=0.25)
     levels = [collect_cells([one], guess=(8.7, 104.0, 0.5))]
-    found = sample_posterior(levels, offset=(100.0, 1.0), start=(8.7, 104.0, 0.5))
+    found = sample_posterior(levels, start=(8.7, 104.0, 0.5))
     assert found.most_likely == pytest.approx([8.0, 100.0, 0.25], rel=0.05)
 
 
