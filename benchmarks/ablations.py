@@ -19,8 +19,8 @@ from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.kinds.voxels import VoxelField
 from recon.joint.joint import JointReconstructor
-from recon.joint.laplace import Laplace
 from recon.joint.run import RunFit, run_fit
+from recon.methods.l1 import Laplace
 from recon.metrics.metrics import compare
 
 WEIGHT = 0.4

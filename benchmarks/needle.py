@@ -18,7 +18,7 @@ from noiseflow import Gaussian, SignalDependentGaussian, fit
 from recon.fields.kinds.voxels import VoxelField
 from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
-from recon.joint.laplace import Laplace
+from recon.methods.l1 import Laplace
 from recon.metrics.comparison import project
 from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
 from recon.simulate.noises import CountingNoise

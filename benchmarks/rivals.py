@@ -28,8 +28,7 @@ from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem
 from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022
 from recon.metrics.metrics import compare
-from recon.projection.sirt import sirt
-from recon.projection.wbp import WINDOWS, wbp
+from recon.projection.classical import WINDOWS, sirt, wbp
 
 Point = tuple[str, float, NDArray[Any]]
 ITERATIONS = (1, 2, 4, 8, 16, 32, 64, 128)

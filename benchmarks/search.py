@@ -14,8 +14,7 @@ from noiseflow.fitting.weight import choose_weight
 from recon.denoise.denoisers import find_denoiser
 from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem
-from recon.projection.sirt import sirt
-from recon.projection.wbp import WINDOWS, wbp
+from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 Array = NDArray[Any]

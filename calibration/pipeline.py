@@ -14,8 +14,8 @@ from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
-from calibration.exposures.codes import below_joins
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
+from calibration.exposures.processing import below_joins
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst

@@ -19,9 +19,8 @@ from calibration.detector.photon_transfer import departure
 from calibration.detector.repair import LEAST_SHARE, Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import LEAST_CURVATURE, LINEAR, Response
-from calibration.exposures.codes import MOST_JOINED
-from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Image, rails
+from calibration.exposures.processing import MOST_JOINED, block_compressed, wavelet_compressed
 from calibration.exposures.scaling import CLEAR
 from calibration.registration.aligned import LARGEST_RATIO_ERROR, AlignedPair
 from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
@@ -90,9 +89,8 @@ class CalibrationCase:
     @property
     def filtered(self) -> bool:
         """Whether the correlation is that of a short filter, before which the gain is reported."""
-        known = (
-            self.correlation.local and self.correlation.factor > 0.5
-        )  # the factor of sharpened frames is poorly known
+        # the factor of sharpened frames is poorly known
+        known = self.correlation.local and self.correlation.factor > 0.5
         return known and (self.camera is not None or correctable(self.correlation, self.repairs))
 
 

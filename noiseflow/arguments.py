@@ -17,19 +17,31 @@ from noiseflow.arrays import as_tensor
 
 Rule = tuple[Callable[[float], bool], str]
 
-_POSITIVE: Rule = (lambda value: 0 < value < math.inf, "a positive number")
-_FINITE: Rule = (math.isfinite, "a finite number")
-_INSIDE: Rule = (lambda value: 0 < value < 1, "a number above 0 and below 1")
-_COUNT: Rule = (lambda value: value >= 1 and value == round(value), "a whole number, at least 1")
-_NONE_OR_MORE: Rule = (lambda value: value >= 0 and value == round(value), "a whole number, at least 0")
+
+def _whole(least: int) -> Rule:
+    return (lambda value: value >= least and value == round(value), f"a whole number, at least {least}")
+
+
+_COUNTS = (
+    "batch_size",
+    "noise_interval",
+    "num_components",
+    "num_bins",
+    "width",
+    "num_signal_bins",
+    "num_groups",
+    "most",
+)
 
 RULES: dict[str, Rule] = {
-    **dict.fromkeys(("gain", "read_noise", "scale", "variance", "learning_rate"), _POSITIVE),
-    **dict.fromkeys(("offset", "level"), _FINITE),
-    **dict.fromkeys(("held_out", "dead_time"), _INSIDE),
-    **dict.fromkeys(("batch_size", "noise_interval", "num_components", "num_bins", "width"), _COUNT),
-    **dict.fromkeys(("num_signal_bins", "num_groups", "most"), _COUNT),
-    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _NONE_OR_MORE),
+    **dict.fromkeys(
+        ("gain", "read_noise", "scale", "variance", "learning_rate"),
+        (lambda value: 0 < value < math.inf, "a positive number"),
+    ),
+    **dict.fromkeys(("offset", "level"), (math.isfinite, "a finite number")),
+    **dict.fromkeys(("held_out", "dead_time"), (lambda value: 0 < value < 1, "a number above 0 and below 1")),
+    **dict.fromkeys(_COUNTS, _whole(1)),
+    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
     "warm_up": (lambda value: 0 <= value < 1, "a share of the steps, at least 0 and below 1"),

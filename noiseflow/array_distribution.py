@@ -67,9 +67,8 @@ class ArrayDistribution:
             narrow = (
                 tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
             )
-            bare.append(
-                tensor if narrow else tensor.to(self._like.dtype)
-            )  # in a narrow type, values still equal the limit
+            # in a narrow type, values still equal the limit
+            bare.append(tensor if narrow else tensor.to(self._like.dtype))
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():
             found = getattr(self.tensors, name)

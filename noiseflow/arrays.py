@@ -74,7 +74,7 @@ def _from_numpy(array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(np.require(array, kind, ["C", "W"]))
 
 
-def strided(array: NDArray[Any], most: int) -> NDArray[Any]:
+def strided(array: NDArray[Any], most: int = 256) -> NDArray[Any]:
     """Every n-th element along each axis, at most `most` per axis: enough to choose the grey levels of a large array."""
     return array[tuple(slice(None, None, -(-size // most)) for size in array.shape)]
 

@@ -69,9 +69,10 @@ def waiting() -> str:
     return next((f"{name}={os.environ[name]}" for name in PASSIVE if name in os.environ), "")
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4  # malloc.h
-_NEVER, _NONE, _MOST = -1, 0, 65536
-_LARGE = 32 * 2**20  # bytes; the largest threshold that glibc sets by itself
+# parameters of mallopt (malloc.h): M_MMAP_MAX (-4) arrays are mapped separately; M_TRIM_THRESHOLD (-1) bytes at the end are kept
+_KEEPING = {-4: 0, -1: -1}
+# as before: 32 MiB is the largest M_MMAP_THRESHOLD (-3) that glibc sets by itself, with twice as much at the end
+_USUAL = {-4: 65536, -3: 32 * 2**20, -1: 64 * 2**20}
 _depth = 0
 
 
@@ -84,17 +85,14 @@ def kept_memory() -> Iterator[None]:
     """
     global _depth
     if _depth == 0 and (libc := _glibc()):
-        libc.mallopt(_MMAP_MAX, _NONE)
-        libc.mallopt(_TRIM_THRESHOLD, _NEVER)
+        _set(libc, _KEEPING)
     _depth += 1
     try:
         yield
     finally:
         _depth -= 1
         if _depth == 0 and (libc := _glibc()):
-            libc.mallopt(_MMAP_MAX, _MOST)
-            libc.mallopt(_MMAP_THRESHOLD, _LARGE)
-            libc.mallopt(_TRIM_THRESHOLD, 2 * _LARGE)
+            _set(libc, _USUAL)
             libc.malloc_trim(0)
 
 
@@ -102,6 +100,11 @@ def hand_back() -> None:
     """Release the memory held by `kept_memory`, before a computation with arrays of other sizes."""
     if libc := _glibc():
         libc.malloc_trim(0)
+
+
+def _set(libc: ctypes.CDLL, values: dict[int, int]) -> None:
+    for parameter, value in values.items():
+        libc.mallopt(parameter, value)
 
 
 def _glibc() -> ctypes.CDLL | None:

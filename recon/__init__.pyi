@@ -10,12 +10,12 @@ from .methods._registry import Method as Method
 from .methods._registry import reconstruct as reconstruct
 from .metrics.metrics import compare as compare
 from .metrics.metrics import fourier_shell_correlation as fourier_shell_correlation
+from .projection.classical import sirt as sirt
+from .projection.classical import wbp as wbp
 from .projection.dual_axis import DualAxisProjector as DualAxisProjector
 from .projection.image_formation import Linear as Linear
 from .projection.image_formation import Transmission as Transmission
 from .projection.projector import SliceProjector as SliceProjector
-from .projection.sirt import sirt as sirt
-from .projection.wbp import wbp as wbp
 from .reconstruction import Reconstruction as Reconstruction
 from .series.alignment import Alignment as Alignment
 from .series.alignment_files import read_alignment as read_alignment

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from noiseflow.plugins import Registry
+from noiseflow.installation import Registry
 
 AUTO = "auto"
 """The usual method, and the choice of a field by the likelihood of held-out pixels."""

@@ -101,7 +101,7 @@ def _images(folder: Path) -> None:
     header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (10000, 10000, 10000), }\n"
     (folder / "absurd.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(100))
     (folder / "pickle.npy").write_bytes(pickle.dumps(_Bomb()))
-    tifffile.imwrite(folder / "colour.tif", np.zeros((64, 64, 3), np.uint8), photometric="rgb")
+    tifffile.imwrite(folder / "colour.tif", np.arange(12288).astype(np.uint8).reshape(64, 64, 3), photometric="rgb")
     tifffile.imwrite(folder / "whole.tif", rng.integers(0, 999, (128, 128)).astype(np.uint16))
     whole = (folder / "whole.tif").read_bytes()
     (folder / "cut.tif").write_bytes(whole[: len(whole) // 2])

@@ -66,7 +66,7 @@ TARGETS = {
     ],
     "recon/projection/projector.py": ["recon/projection/test_projector.py"],
     "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
-    "recon/projection/wbp.py": ["recon/projection/test_wbp.py"],
+    "recon/projection/classical.py": ["recon/projection/test_wbp.py", "recon/methods/test_classical.py"],
     "recon/metrics/metrics.py": ["recon/metrics/test_shells.py"],
     "recon/fields/regularisers/total_variation.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
     "recon/fields/occupancy.py": ["recon/fields/test_occupancy.py", "recon/fields/test_vacuum.py"],

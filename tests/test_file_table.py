@@ -57,16 +57,22 @@ def _decimal_commas() -> str:
 
 def _star(prefix: str, names: list[str], order: Any = None) -> str:
     angles = ANGLES if order is None else ANGLES[order]
-    movie = {"rln": "rlnMicrographMovieName", "wrp": "wrpMovieName"}[prefix]
-    angle = {"rln": "rlnTomoNominalStageTiltAngle", "wrp": "wrpAngleTilt"}[prefix]
-    rows = "".join(f"frames/{name} {a}\n" for name, a in zip(names, angles, strict=True))
-    return f"data_series\n\nloop_\n_{movie} #1\n_{angle} #2\n{rows}"
+    relion = "MicrographMovieName TomoTiltMovieFrameCount TomoNominalStageTiltAngle TomoNominalTiltAxisAngle"
+    warp = "MovieName Dose AngleTilt AxisAngle AverageIntensity MaskedFraction"
+    columns = f"{relion} MicrographPreExposure TomoNominalDefocus" if prefix == "rln" else warp
+    titles = "".join(f"_{prefix}{name} #{number}\n" for number, name in enumerate(columns.split(), 1))
+    rows = "".join(f"frames/{name} 8 {a} 0.000 3.0 -4.0\n" for name, a in zip(names, angles, strict=True))
+    return f"\n# version 50001\n\ndata_{'TS_01' if prefix == 'rln' else ''}\n\nloop_\n{titles}{rows}\n"
 
 
 def _aln() -> str:
-    rows = "".join(f"{n} 0.0 1.0 0.0 0.0 1 1 1 0 {angle}\n" for n, angle in enumerate(ANGLES))
-    size = f"# RawSize = {SHAPE[2]} {SHAPE[1]} {SHAPE[0]}\n"
-    return f"# AreTomo Alignment\n{size}# SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT\n{rows}"
+    row = "{:5d}     0.0000    1.00000      0.000      0.000     1.00     1.00     1.00     0.00  {:8.2f}\n"
+    rows = "".join(row.format(number, angle) for number, angle in enumerate(ANGLES, 1))
+    size = f"# RawSize = {SHAPE[2]} {SHAPE[1]} {SHAPE[0]}\n# NumPatches = 0\n# AlphaOffset =     0.00\n"
+    titles = (
+        "# BetaOffset =     0.00\n# Thickness = 8\n# SEC     ROT         GMAG       TX          TY      SMEAN     SFIT"
+    )
+    return f"# AreTomo Alignment / Priims bprmMn\n{size}{titles}    SCALE     BASE     TILT\n{rows}"
 
 
 def folder_of(kind: str) -> Callable[[Path], Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -293,22 +294,30 @@ def test_tilt_com_adds_its_offset_and_excludes_its_views(tmp_path: Path) -> None
     assert recon.read_tilt_series(tmp_path / "b.mrc").num_tilts == 4  # the command file of another stack
 
 
+# the columns of a tilt series of RELION 5 after its alignment; the pixel size is in the list of all series
 RELION = """
-data_TS_1
+# version 50001
+
+data_TS_01
 
 loop_
 _rlnMicrographMovieName #1
-_rlnTomoNominalStageTiltAngle #2
-_rlnTomoNominalTiltAxisAngle #3
-_rlnMicrographOriginalPixelSize #4
-_rlnTomoYTilt #5
-_rlnTomoZRot #6
-_rlnTomoXShiftAngst #7
-_rlnTomoYShiftAngst #8
-frames/c.tif  30.0 85.0 2.5  30.5 90.0  5.0 -2.5
-frames/a.tif -30.0 85.0 2.5 -29.5 90.0 10.0  0.0
-frames/b.tif   0.0 85.0 2.5   0.5 90.0  0.0  0.0
+_rlnTomoTiltMovieFrameCount #2
+_rlnTomoNominalStageTiltAngle #3
+_rlnTomoNominalTiltAxisAngle #4
+_rlnMicrographPreExposure #5
+_rlnTomoNominalDefocus #6
+_rlnMicrographName #7
+_rlnTomoXTilt #8
+_rlnTomoYTilt #9
+_rlnTomoZRot #10
+_rlnTomoXShiftAngst #11
+_rlnTomoYShiftAngst #12
+frames/c.tif\t8\t 30.0\t85.0\t6.0\t-4.0\tMotionCorr/job002/c.mrc  0.000000  30.500000  90.000000  5.000000 -2.500000
+frames/a.tif\t8\t-30.0\t85.0\t3.0\t-4.0\tMotionCorr/job002/a.mrc  0.000000 -29.500000  90.000000 10.000000  0.000000
+frames/b.tif\t8\t  0.0\t85.0\t0.0\t-4.0\tMotionCorr/job002/b.mrc  0.000000   0.500000  90.000000  0.000000  0.000000
 """
+# as WarpTools' ts_import writes it
 WARP = """
 data_
 
@@ -316,9 +325,12 @@ loop_
 _wrpMovieName #1
 _wrpAngleTilt #2
 _wrpAxisAngle #3
-../frames/c.tif  30.5 85.0
-../frames/a.tif -29.5 85.0
-../frames/b.tif   0.5 85.0
+_wrpDose #4
+_wrpAverageIntensity #5
+_wrpMaskedFraction #6
+  ../warp_frameseries/c.tif   30.5   85.000   105.600006   3.854   0.000
+  ../warp_frameseries/a.tif  -29.5   85.000       102.96   3.950   0.000
+  ../warp_frameseries/b.tif    0.5   85.000            0   3.953   0.000
 """
 
 
@@ -329,17 +341,25 @@ def test_tables_of_relion_and_warp_join_movies_by_name(suffix: str, text: str, t
     series = recon.read_tilt_series(folder)
     assert series.tilt_angles.tolist() == [-29.5, 0.5, 30.5]
     assert series.tilt_axis == 85
-    assert series.pixel_size == (2.5 if suffix == ".star" else None)
+    assert series.dose is not None
+    assert series.dose.argsort().tolist() == [1, 0, 2]
 
 
 ARETOMO = """# AreTomo Alignment / Priims bprmMn
 # RawSize = 40 30 4
-# NumPatches = 0
-# DarkFrame = 3 4 60.00
-# SEC  ROT  GMAG  TX  TY  SMEAN  SFIT  SCALE  BASE  TILT
-1 -80 1.0  3.0 -2.0 1 1 1 0 -29.0
-2 -80 1.0 -1.5  0.5 1 1 1 0   1.0
-3 -80 1.0  0.0  4.0 1 1 1 0  31.0
+# NumPatches = 1
+# DarkFrame =     3    4    61.00
+# AlphaOffset =     1.00
+# BetaOffset =     4.00
+# Thickness = 20
+# SEC     ROT         GMAG       TX          TY      SMEAN     SFIT    SCALE     BASE     TILT
+    1   -80.0000    1.00000      3.000     -2.000     1.00     1.00     1.00     0.00    -29.00
+    2   -80.0000    1.00000     -1.500      0.500     1.00     1.00     1.00     0.00      1.00
+    3   -80.0000    1.00000      0.000      4.000     1.00     1.00     1.00     0.00     31.00
+# Local Alignment
+   0   0    -8.00      6.00     -0.10      0.20   1.0
+   1   0    -8.00      6.00     -0.10      0.20   1.0
+   2   0    -8.00      6.00     -0.10      0.20   1.0
 """
 
 
@@ -357,6 +377,8 @@ def test_alignments_of_other_programs_lead_from_aligned_to_raw_images(program: s
         views = ""
     series = recon.read_tilt_series(tmp_path / "a.mrc", exclude_views=views)
     alignment = recon.read_alignment(path, series)
+    assert alignment.x_tilt == (4 if program == "AreTomo" else 0)
+    assert alignment.apply(series).x_tilt == alignment.x_tilt
     assert alignment.tilt_axis == pytest.approx(-80 if program == "AreTomo" else 90)
     expected = [[-2, 3], [0.5, -1.5], [4, 0]] if program == "AreTomo" else [[-1, 2], [0, 4], [0, 0]]
     np.testing.assert_allclose(alignment.shifts, expected, atol=1e-9)
@@ -364,6 +386,8 @@ def test_alignments_of_other_programs_lead_from_aligned_to_raw_images(program: s
     binned = recon.read_tilt_series(tmp_path / "a.mrc", exclude_views=views, pixel_size=5.0)
     if program == "RELION":
         np.testing.assert_allclose(alignment.joined(binned).shifts, np.array(expected) / 2, atol=1e-9)
+        with pytest.raises(ValueError, match="--pixel-size"):
+            recon.read_alignment(path, replace(series, pixel_size=None))
     else:
         half = recon.TiltSeries(binned.images[:, :15, :20], binned.tilt_angles, 5.0)
         np.testing.assert_allclose(alignment.joined(half).shifts, np.array(expected) / 2, atol=1e-9)
@@ -516,6 +540,23 @@ def test_dark_frames_of_aretomo_are_excluded_and_sections_put_in_order(tmp_path:
     assert recon.read_tilt_series(tmp_path / "a.mrc").tilt_angles.tolist() == [-30, 0, 30, 60]
 
 
+def test_sections_of_aretomo_count_from_one_or_from_zero(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 30, 40)).astype(np.float32)
+    io.write(tmp_path / "a.mrc", stack)
+    rows = ARETOMO.split("# Local")[0].replace("   3    4 ", "   3    3 ")
+    for first in (1, 2, 3):
+        rows = rows.replace(f"\n    {first} ", f"\n    {first - 1} ")
+    (tmp_path / "a.aln").write_text(f"Hello\n{rows}")  # as one version of AreTomo3 begins
+    with pytest.warns(UserWarning, match="4° about x"):
+        series = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert series.x_tilt == 4
+    np.testing.assert_array_equal(series.images, stack[:3])
+    inverted = replace(series, tilt_angles=-series.tilt_angles, x_tilt=-4)
+    alignment = recon.read_alignment(tmp_path / "a.aln", inverted)
+    assert alignment.apply(inverted).tilt_angles.tolist() == [29, -1, -31]
+    assert alignment.x_tilt == -4
+
+
 @pytest.mark.parametrize("stop", [np.pi / 2, np.pi, 2 * np.pi])
 def test_angles_that_look_like_radians_are_pointed_out(stop: float) -> None:
     with pytest.warns(UserWarning, match="radians"):
@@ -648,6 +689,30 @@ def test_images_that_a_table_of_sections_leaves_out_are_left_out(tmp_path: Path)
     assert series.dose is not None
     assert series.dose.tolist() == [0, 6, 3]
     np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
+
+
+def test_an_mdoc_without_a_section_leaves_its_image_out(tmp_path: Path) -> None:
+    stack = np.random.default_rng(0).random((4, 8, 9)).astype(np.float32)
+    io.write(tmp_path / "a.mrc", stack)
+    sections = "".join(f"[ZValue = {z}]\nTiltAngle = {20 * z - 20}\n" for z in (3, 0, 2))
+    (tmp_path / "a.mrc.mdoc").write_text(sections)
+    with pytest.warns(UserWarning, match="3 of 4"):
+        series = recon.read_tilt_series(tmp_path / "a.mrc")
+    assert series.tilt_angles.tolist() == [-20, 20, 40]
+    np.testing.assert_array_equal(series.images, stack[[0, 2, 3]])
+
+
+def test_a_list_inside_a_folder_is_found_by_its_name(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "f", ["a1.tif", "a2.tif", "a10.tif"], STACK)
+    (folder / "log.txt").write_text("1\n2\n3\n")
+    (folder / "tilt_angles.txt").write_text("-9\n0\n9\n")
+    series = recon.read_tilt_series(folder)
+    assert series.tilt_angles.tolist() == [-9, 0, 9]
+    np.testing.assert_array_equal(series.images, STACK)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "a.jpg").touch()
+    with pytest.raises(ValueError, match=r"holds \.jpg"):
+        io.read(tmp_path / "b")
 
 
 @pytest.mark.parametrize("suffix", [".gz", ".bz2"])

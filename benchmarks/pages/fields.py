@@ -22,7 +22,7 @@ from benchmarks.provenance import measured_on
 from benchmarks.scenes import EMPTY, Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
-from recon.fields._registry import field_kinds
+from recon.fields.files import field_kinds
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
 from recon.methods import reconstruct

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "zuko": {"transforms": 1, "bins": 16, "hidden": 64, "learning_rate": 5e-3, "num_steps": 500},

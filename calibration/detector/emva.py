@@ -16,7 +16,7 @@ from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.residual import CUT, Residual
 from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.outliers import without_outliers
+from calibration.exposures.masks import without_outliers
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 

@@ -78,9 +78,8 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
     figures = Figures(_with_line(detector), found.offset, found.read_noise)
     if not poisson_gaussian(detector):
         figures = _by_line(detector)
-    if (
-        correctable(correlation, repairs) and not detector.electrons
-    ):  # a filter would have blurred single-electron peaks
+    # a filter would have blurred single-electron peaks
+    if correctable(correlation, repairs) and not detector.electrons:
         return _decorrelated(figures, correlation)
     return figures
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.detector.cells import collect_cells
-from calibration.detector.electrons import electrons_show
+from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer

@@ -132,9 +132,8 @@ def own_variance(
     whole = np.asarray(ndimage.binary_erosion(mask, np.ones((3, 3)), border_value=0))
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
     chosen = signal[whole]
-    weight = _inverse_square(
-        fit_line(chosen, ((short - signal) ** 2)[whole]), chosen
-    )  # the total variance is better known than that of the long exposure
+    # the total variance is better known than that of the long exposure
+    weight = _inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
     line = _line(chosen, squares[whole], weight)
     error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
     kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves

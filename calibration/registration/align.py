@@ -327,9 +327,8 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     if not found:
         return None
     mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
-    smooth = ndimage.gaussian_filter(
-        long, 1.0
-    )  # otherwise the motion whose interpolation smooths more would be preferred
+    # otherwise the motion whose interpolation smooths more would be preferred
+    smooth = ndimage.gaussian_filter(long, 1.0)
     motion = max(
         found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )

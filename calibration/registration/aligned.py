@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
-from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, saturated
-from calibration.exposures.outliers import outliers_of
+from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, outliers_of, saturated
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from noiseflow.described import described

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated
-from calibration.exposures.outliers import without_outliers
+from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated, without_outliers
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair

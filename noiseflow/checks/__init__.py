@@ -1,7 +1,11 @@
-"""The engine of verdicts: a table of checks, a guard that keeps a failing check from losing a result, and a ranking."""
+"""The engine of verdicts: a table of checks, a guard that keeps a failing check from losing a result, and a ranking.
 
-from noiseflow.checks.engine import SIGNIFICANT, Check, Effect, Finding, Grade, grade, ranked, run
-from noiseflow.checks.guard import Guard, NotTested
+How a composition works: a `Check` is a row: how an effect is measured on a case, and what is harmless. `run` measures all rows
+under a `Guard`; `ranked` drops findings that others explain, and `verdict_of` turns the rest into grade and reasons. The tables
+are in `calibration.verdict` and `recon.verdict.table`.
+"""
+
+from noiseflow.checks.engine import SIGNIFICANT, Check, Effect, Finding, Grade, Guard, NotTested, grade, ranked, run
 from noiseflow.checks.verdict import Verdict, verdict_of
 
 __all__ = [

@@ -6,8 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from noiseflow.checks.engine import Finding, Grade, grade, ranked
-from noiseflow.checks.guard import Guard
+from noiseflow.checks.engine import Finding, Grade, Guard, grade, ranked
 
 
 @dataclass(frozen=True)

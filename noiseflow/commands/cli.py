@@ -28,8 +28,7 @@ from noiseflow.commands.console import (
 )
 from noiseflow.commands.option_files import arrange, shared_options, shows_everything, write_options
 from noiseflow.described import printable
-from noiseflow.installation import DISTRIBUTION, library_version
-from noiseflow.plugins import load_plugin, package_of, plugins
+from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
 
 _ORDER = (

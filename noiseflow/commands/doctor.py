@@ -12,8 +12,7 @@ from typing import Any
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
-from noiseflow.installation import DISTRIBUTION, install_command, library_version
-from noiseflow.plugins import GROUPS, load_plugin, plugins
+from noiseflow.installation import DISTRIBUTION, GROUPS, install_command, library_version, load_plugin, plugins
 from noiseflow.resources import waiting
 
 _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}

@@ -44,8 +44,7 @@ def shared_options(command: Any) -> list[Any]:
             ),
         ] = None,
         help_all: Annotated[
-            bool,
-            typer.Option("--help-all", is_eager=True, expose_value=False, callback=_show_all),
+            bool, typer.Option("--help-all", is_eager=True, expose_value=False, callback=_show_all)
         ] = False,
     ) -> None: ...
 

@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import (
-    DeviceOption,
-    JsonOption,
-    Output,
-    OverwriteOption,
-    SeedOption,
-    choose_device,
-)
+from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.progress import Progress, progress_shown
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-from .laws.latent import LatentDistribution as LatentDistribution
+from .laws.base import LatentDistribution as LatentDistribution
 from .laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
 from .laws.textbook import GaussianDistribution as GaussianDistribution
 from .laws.textbook import PoissonDistribution as PoissonDistribution

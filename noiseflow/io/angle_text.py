@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.tilt_table import LARGEST_ANGLE, TiltTable
+from noiseflow.io.image_file import LARGEST_ANGLE, TiltTable
 
 _COMMENT = re.compile(r"[#!%].*|//.*")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import angle_text, aretomo, imod, mdoc, star
-from noiseflow.io.image_file import ImageFile
-from noiseflow.io.tilt_table import LARGEST_ANGLE as LARGEST_ANGLE
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import LARGEST_ANGLE as LARGEST_ANGLE
+from noiseflow.io.image_file import ImageFile, TiltTable
 
 _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".mdoc": mdoc.read,
@@ -28,6 +27,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
+_LIST = re.compile(r"tilt|angle|theta", re.IGNORECASE)
 _STAGES = re.compile(r"_(pre)?ali$")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -226,6 +226,8 @@ def candidates(stack: str | Path) -> list[Path]:
     inside = [
         file for suffix in (*RAW_FIRST, ".mdoc", *_TABLES) for file in stack.glob(f"*{suffix}") if _is_table(file)
     ]
+    named = [file for file in stack.iterdir() if file.suffix.lower() in (".txt", ".csv") and _LIST.search(file.stem)]
+    inside = inside or named
     return [*beside(stack), *(inside if len(inside) == 1 else [])]
 
 

@@ -1,4 +1,7 @@
-"""AreTomo's ``.aln`` files: tilt axis, shift and angle of every image."""
+"""AreTomo's ``.aln`` files: tilt axis, shift and angle of every image.
+
+Source: https://github.com/czimaginginstitute/AreTomo3 (``CSaveAlignFile.cpp``)
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.tilt_table import TiltTable, rotations
+from noiseflow.io.image_file import TiltTable, rotations
+from noiseflow.io.imod import x_tilt_of
 
 _MOST = 1e6  # sections, more than any series has
 _COLUMNS = 10
 """SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT"""
 _SIZE = re.compile(r"#\s*RawSize\s*=\s*(\d+)\s+(\d+)")
 _DARK = re.compile(r"#\s*DarkFrame\s*=\s*\d+\s+(\d+)\s+(\S+)")
+_BETA = re.compile(r"#\s*BetaOffset\s*=\s*([-+]?\d+\.?\d*)")
 _SAME = 0.001
 """A magnification that moves the edge of a 4096-pixel image by two pixels."""
 _LOCAL = re.compile(r"#\s*Local\s*Alignment", re.IGNORECASE)
@@ -24,21 +29,25 @@ _LOCAL = re.compile(r"#\s*Local\s*Alignment", re.IGNORECASE)
 def read(path: Path) -> TiltTable:
     """The global alignment; magnifications and local alignments are left out, with a warning. Dark frames are excluded.
 
-    The axis ROT and the shift (TX, TY) lead from aligned to raw images; the pixels are those of the raw stack.
+    The axis ROT and the shift (TX, TY) lead from aligned to raw images; the pixels are those of the raw stack. SEC numbers its
+    sections from 0, or from 1 in AreTomo3. TILT includes ``AlphaOffset``; ``BetaOffset`` turns the specimen about x.
 
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: a row is not ten numbers.
     """
     rows, dark, shape = list[list[float]](), list[list[float]](), None
-    local = False
+    local, beta, begun = False, 0.0, False
     for count, line in enumerate(text_lines(path, "alignment file", holds="the table of AreTomo"), 1):
         local = local or _LOCAL.match(line) is not None
+        begun = begun or line.startswith("#")  # AreTomo3 may write a word first
         if size := _SIZE.match(line):
             shape = (int(size[2]), int(size[1]))
+        if offset := _BETA.match(line):
+            beta = float(offset[1])
         found = _DARK.match(line)
         words = [found[1], *["0"] * (_COLUMNS - 2), found[2]] if found else line.partition("#")[0].split()
-        if local or not words:
+        if local or not words or not begun:
             continue
         try:
             values = [number(word) for word in words]
@@ -61,4 +70,5 @@ def read(path: Path) -> TiltTable:
         image_shape=shape,
         tilt_axis=float(kept[:, 1].mean()) if len(kept) else None,
         excluded=tuple(range(len(rows), len(table))),
+        x_tilt=x_tilt_of(np.array([beta]), path),
     )

@@ -93,9 +93,8 @@ def raw(path: Path, member: str | None) -> Array:
     least = path.stat().st_size - frames * height * width * kind.itemsize
     if least < 0:
         raise Unsupported(f"is {-least} bytes shorter than {member}")
-    return np.fromfile(path, kind, frames * height * width, offset=least).reshape(
-        frames, height, width
-    )  # after any header
+    # after any header
+    return np.fromfile(path, kind, frames * height * width, offset=least).reshape(frames, height, width)
 
 
 def matlab(path: Path, member: str | None) -> Array:

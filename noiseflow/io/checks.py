@@ -21,6 +21,20 @@ def number(text: str) -> float:
     return float(text)
 
 
+def grey(data: NDArray[Any]) -> NDArray[Any]:
+    """Images (..., y, x, colour) whose colours are equal, as one channel; the last of two or four is the opacity.
+
+    Raises:
+        Unsupported: the colours differ, or the opacity varies.
+    """
+    colours = data.shape[-1] - (data.shape[-1] in (2, 4))
+    if (data[..., :colours] != data[..., :1]).any() or (
+        data[..., colours:] != data[..., colours:][..., :1, :1, :]
+    ).any():
+        raise Unsupported(f"is a colour image (shape {data.shape}); convert it to one grey channel first")
+    return np.ascontiguousarray(data[..., 0])
+
+
 class Unsupported(ValueError):
     """A valid file with contents that noiseflow cannot use; the message is appended to the file's name."""
 

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import angles
-from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile, TiltTable
 
-_NUMBER = re.compile(r"([-+]*)(\d+(?:\.\d+)?)")
+_NUMBER = re.compile(r"((?<![a-z])(?:(?:minus|neg|plus|pos)_?|[mnp])|[-+]*)(\d+(?:\.\d+)?)", re.IGNORECASE)
 _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 
@@ -35,7 +34,9 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
     """
     files = files_of(folder)
     if len(files) < 2:
-        found = f"with only one image, {files[0].name}" if files else "without images"
+        others = sorted({file.suffix for file in folder.iterdir() if file.suffix})
+        held = f" (it holds {', '.join(others[:5])})" if others else ""
+        found = f"with only one image, {files[0].name}" if files else f"without images that noiseflow reads{held}"
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
     names = tuple(file.name for file in files)
     tables = [_own_table(file) for file in files]
@@ -129,7 +130,8 @@ def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:
     """Tilt angles in file names, degrees, or None if there are none or they are ambiguous.
 
     A number in the name is taken as the angle if it has decimals or a sign in some names, or follows a word such as
-    ``tilt``, and if it differs between names and is within ±180. A minus in front of all numbers is a hyphen.
+    ``tilt``, and if it differs between names and is within ±180. A minus in front of all numbers is a hyphen. The letters or
+    words ``m``, ``n``, ``neg`` and ``minus`` in front of some of the numbers are a minus.
     """
     rows = [list(_NUMBER.finditer(name.rsplit(".", 1)[0])) for name in names]
     if len(names) < 2 or len({len(row) for row in rows}) != 1:
@@ -139,7 +141,10 @@ def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:
 
 
 def _angle_column(numbers: list[re.Match[str]]) -> NDArray[np.float64] | None:
-    signs = [number[1] for number in numbers]
+    words = [number[1][:1].lower() for number in numbers]
+    minus = {word in ("m", "n") for word in words} == {False, True} and not {"-", "+"} & set(words)
+    letters = {"m": "-", "n": "-", "p": "+"} if minus else dict.fromkeys("mnp", "")
+    signs = [letters.get(word, number[1]) for word, number in zip(words, numbers, strict=True)]
     hyphen = all(sign.startswith("-") for sign in signs)
     signs = [sign[1:] if hyphen else sign for sign in signs]
     named = all(_ANGLE_WORD.search(n.string[: n.start()]) for n in numbers)

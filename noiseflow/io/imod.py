@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io import angle_text
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.tilt_table import TiltTable
+from noiseflow.io.image_file import TiltTable
 
 _COMMANDS = ("tilt.com", "tilta.com", "tiltb.com")
 """Command files of a series, and of the two of a dual-axis tomogram."""

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
-from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles
-from noiseflow.io.tilt_axis import recorded_axis
+from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles, recorded_axis
 
 _PLUGINS = {
     ".dm3": "digitalmicrograph",

@@ -12,10 +12,9 @@ import torch
 from torch import nn
 
 import noiseflow
-from noiseflow.installation import library_version
+from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.plugins import load_plugins
 from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1

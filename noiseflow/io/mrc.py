@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
-from noiseflow.io.tilt_axis import axis_in_titles
+from noiseflow.io.metadata import axis_in_titles
 from noiseflow.runs.ownership import signature
 
 _HEADER_BYTES = 1024

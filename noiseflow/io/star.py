@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
+from noiseflow.io.image_file import TiltTable, rotations
 from noiseflow.io.imod import x_tilt_of
-from noiseflow.io.tilt_table import TiltTable, rotations
 
 _ANGLES = ("rlnTomoYTilt", "rlnTomoNominalStageTiltAngle", "wrpAngleTilt")
 _NAMES = ("rlnMicrographMovieName", "rlnMicrographName", "wrpMovieName")
@@ -30,7 +30,7 @@ Columns = dict[str, list[str]]
 
 
 def read(path: Path) -> TiltTable:
-    """The first table with tilt angles; an alignment of RELION becomes transforms if the file states the pixel size.
+    """The first table with tilt angles; an alignment of RELION becomes transforms in Å.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -51,7 +51,8 @@ def read(path: Path) -> TiltTable:
         angles,
         () if sections else tuple(names),
         np.array(sections, dtype=np.int64) - 1 if sections and len(sections) == len(names) else None,
-        transforms=None if size is None else _transforms(table, size, path),
+        transforms=_transforms(table, path),
+        in_angstrom=True,
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),
         x_tilt=0.0 if turned is None else x_tilt_of(turned, path),
@@ -67,12 +68,12 @@ def has_tilts(path: Path) -> bool:
         return False
 
 
-def _transforms(table: Columns, size: float, path: Path) -> NDArray[np.float64] | None:
+def _transforms(table: Columns, path: Path) -> NDArray[np.float64] | None:
     columns = [_numbers(table, (name,), path) for name in _ALIGNED]
     if any(column is None for column in columns):
         return None
     axes, x, y = (np.asarray(column) for column in columns)
-    return rotations(axes, np.stack([x, y], 1) / size)
+    return rotations(axes, np.stack([x, y], 1))
 
 
 def _numbers(table: Columns, names: Sequence[str], path: Path) -> NDArray[np.float64] | None:

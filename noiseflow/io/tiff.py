@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, choose_member, exactly_as, require_room
+from noiseflow.io.checks import Unsupported, choose_member, exactly_as, grey, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom
@@ -49,13 +49,14 @@ def read(path: Path, *, mapped: bool = False, member: str | None = None) -> Imag
                 "stacks of three and four; they are read as frames",
                 stacklevel=2,
             )
-        elif "S" in series.axes:
+        elif "S" in series.axes and not series.axes.endswith("YXS"):
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
         data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
+        data, axes = (grey(data), series.axes[:-1]) if series.axes.endswith("YXS") else (data, series.axes)
         if getattr(series.pages[0], "photometric", None) == 0:
             data = _inverted(data, series.pages[0], path)
         voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
-        data, channels = _channels_first(data, series.axes, _channel_names(tiff))
+        data, channels = _channels_first(data, axes, _channel_names(tiff))
     return ImageFile(data, voxel_size, channels=channels, named=named)
 
 
@@ -68,9 +69,8 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     import tifffile
 
     if voxel_size is None:
-        tifffile.imwrite(
-            path, data, photometric="minisblack", software=signature()
-        )  # otherwise a stack of three would be stored as colour
+        # otherwise a stack of three would be stored as colour
+        tifffile.imwrite(path, data, photometric="minisblack", software=signature())
         return data
     z, y, x = voxel_size
     if data.dtype in _OUTSIDE_OME:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
@@ -261,9 +261,8 @@ class RadialFlow(ConditionalFlow):
         neighbourhood: int = 1,
     ) -> None:
         check(num_layers=num_layers, num_conditional=num_conditional)
-        if (
-            num_layers > _MOST_LAYERS
-        ):  # each layer is an object: a file that claims many would use far more memory than its size
+        # each layer is an object: a file that claims many would use far more memory than its size
+        if num_layers > _MOST_LAYERS:
             raise ValueError(f"num_layers is {num_layers}; a radial flow has at most {_MOST_LAYERS} layers")
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]

@@ -126,9 +126,8 @@ def interpolate_unequal(knots: Tensor, table: Tensor, at: Tensor) -> Tensor:
         for other in (*near[:i], *near[i + 1 :]):
             term = term * ((at - other) / (own - other))
         cubic = cubic + term
-    start = torch.where(
-        at < near[1], 0, torch.where(at > near[2], 2, 1)
-    )  # the outermost gaps have no neighbour on one side
+    # the outermost gaps have no neighbour on one side
+    start = torch.where(at < near[1], 0, torch.where(at > near[2], 2, 1))
     low, high = (torch.stack(near[k : 3 + k]).gather(0, start[None])[0] for k in (0, 1))
     left, right = (torch.stack(values[k : 3 + k]).gather(0, start[None])[0] for k in (0, 1))
     found: Tensor = torch.where(alike & (start == 1), cubic, left + (right - left) * ((at - low) / (high - low)))

@@ -231,7 +231,6 @@ def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
             hazard = normal_hazard(z)
     if not twice:
         return z - (log_normal_cdf(z) - log_probability) / hazard
-    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(
-        z
-    )  # the first step carries the slope, the second the curvature
+    # the first step carries the slope, the second the curvature
+    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
     return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)

@@ -1,4 +1,8 @@
-"""Components of the self-contained HTML report: page, figures, interactive images and provenance."""
+"""Components of the self-contained HTML report: page, figures, interactive images and provenance.
+
+How a composition works: each method of `Report` adds a part, rendered by its macro in ``assets/parts.html``, which escapes all
+text; `save` places the parts, styles and scripts in ``assets/page.html``. Stacks become `Sprites`, which the scripts unpack.
+"""
 
 from noiseflow.report.charts import COLOURS, Chart, new_figure, show_image
 from noiseflow.report.page import Report, provenance

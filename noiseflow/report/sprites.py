@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SHEET = 2048
+# of WebP; the first, above 100, is lossless
 _QUALITIES = (101, 90, 75, 60)
-_LOSSLESS = 101
 _MOST_HALVINGS = 12
 _PROBED = 6
 _MOST_PIXELS = 2**26  # 400³: larger stacks hardly ever fit into a page, and trying would waste memory
@@ -122,7 +122,7 @@ def _packed(grey: NDArray[np.uint8], quality: int, original: Any, limits: tuple[
         image = np.ascontiguousarray(sheet.transpose(0, 2, 1, 3)).reshape(rows * height, columns * width)
         _, encoded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
         sheets.append(encoded.tobytes())
-    return Sprites(tuple(sheets), grey.shape, tuple(original), columns, per_sheet, *limits, quality == _LOSSLESS)
+    return Sprites(tuple(sheets), grey.shape, tuple(original), columns, per_sheet, *limits, quality == _QUALITIES[0])
 
 
 def _halved(stack: NDArray[Any], keep_sections: bool) -> NDArray[np.float32]:

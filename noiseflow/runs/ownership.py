@@ -27,7 +27,6 @@ from noiseflow.runs.partials import link_target
 
 MARK = "noiseflow"
 NPY_HEADER_BYTES = 1024
-_PAGE_HEAD = 1000
 _BATCH_COLUMNS = b"series,volume,status,verdict,reason,error,"
 
 
@@ -84,7 +83,7 @@ def is_own(path: Path) -> bool:
         return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
     if kind == ".json":
         return f'"written_by": "{MARK}'.encode() in head
-    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head[:_PAGE_HEAD]
+    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head
 
 
 def npy_start() -> bytes:
@@ -134,9 +133,8 @@ def locked(output: str | Path) -> Iterator[None]:
         OSError: the lock file cannot be created.
     """
     path = lock_file(output)
-    lock = FileLock(
-        path, timeout=0, is_singleton=True, on_acquired=_sign
-    )  # a singleton of each thread counts its blocks
+    # a singleton of each thread counts its blocks
+    lock = FileLock(path, timeout=0, is_singleton=True, on_acquired=_sign)
     try:
         _take(lock, output)
         yield

@@ -41,8 +41,7 @@ def batch(
     resume: Annotated[
         bool,
         typer.Option(
-            "--resume",
-            help="Skip series that are done with the same options; resume those that were interrupted.",
+            "--resume", help="Skip series that are done with the same options; resume those that were interrupted."
         ),
     ] = False,
     overwrite: OverwriteOption = False,
@@ -70,10 +69,7 @@ def batch(
         left = [job for job in jobs if str(job.out) not in known]
         if known:
             output.line(f"{len(known)} of {len(jobs)} series are already done")
-        with (
-            client_of(None, scheduler) as client,
-            progress_shown(json_mode=json) as progress,
-        ):
+        with client_of(None, scheduler) as client, progress_shown(json_mode=json) as progress:
             try:
                 for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
                     rows.append(row)

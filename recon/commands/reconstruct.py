@@ -9,20 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import (
-    DeviceOption,
-    JsonOption,
-    Output,
-    OverwriteOption,
-    SeedOption,
-    choose_device,
-)
+from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.commands.option_files import option_groups
 from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, method_of
-from recon.commands.running import (
-    warnings_as_lines,
-)
+from recon.commands.running import warnings_as_lines
 from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 
@@ -93,10 +84,7 @@ def reconstruct(
         float | None,
         typer.Option(help="How many times smaller the images are than those that .xf, .aln or .star were made on."),
     ] = None,
-    method: Annotated[
-        str,
-        typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}."),
-    ] = "auto",
+    method: Annotated[str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.")] = "auto",
     preset: Annotated[
         str | None,
         typer.Option(help="A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),

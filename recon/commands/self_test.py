@@ -8,8 +8,8 @@ def check_projection() -> str | None:
     import numpy as np
     import torch
 
+    from recon.projection.classical import sirt
     from recon.projection.projector import SliceProjector
-    from recon.projection.sirt import sirt
 
     size = 32
     grid = torch.linspace(-1, 1, size)

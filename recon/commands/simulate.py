@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from recon.simulate.simulation import Acquisition
 
-_VALIDATION, _TEST = 14, 20
-
 
 def simulate(
     folder: Annotated[
@@ -38,8 +36,7 @@ def simulate(
         ),
     ] = "clipped",
     clip: Annotated[
-        bool,
-        typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal."),
+        bool, typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal.")
     ] = False,
     defocus: Annotated[
         float,
@@ -75,8 +72,8 @@ def simulate(
         noise_model = _clipped(noise_model, acquisition.brightest)
     stacks = {
         "clean": angles,
-        "validation": angles_between(angles, _VALIDATION, share=1 / 3),
-        "test": angles_between(angles, _TEST, share=2 / 3),
+        "validation": angles_between(angles, 14, share=1 / 3),
+        "test": angles_between(angles, 20, share=2 / 3),
     }
     if dual_axis:
         stacks["clean_second"] = angles

@@ -16,7 +16,7 @@ from noiseflow.commands.console import Output
 from noiseflow.progress import progress_shown
 from recon.commands.results import Targets
 from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
-from recon.fields._registry import field_kinds
+from recon.fields.files import field_kinds
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference

@@ -127,9 +127,8 @@ def _variance_line(images: Array) -> tuple[float, float]:
     order = np.argsort(mean)
     groups = np.array_split(order, max(4, min(40, order.size // 500)))
     level = np.array([mean[group].mean() for group in groups])
-    variance = np.array(
-        [np.median(square[group]) / 0.4549 for group in groups]
-    )  # the median of χ² with one degree of freedom
+    # the median of χ² with one degree of freedom
+    variance = np.array([np.median(square[group]) / 0.4549 for group in groups])
     slope, intercept = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, 1e-3 * variance.max()))
     return float(slope), float(intercept)
 

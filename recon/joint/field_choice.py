@@ -10,8 +10,8 @@ from functools import partial
 from torch import nn
 
 from noiseflow.progress import Progress
-from recon.fields._registry import field_kinds
 from recon.fields.fields import Field
+from recon.fields.files import field_kinds
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import FitStage
 from recon.names import AUTO

@@ -118,17 +118,15 @@ class Runner:
             "finalists": self._finalists,
             "weights": self._weights,
         }
-        for where in {stage.where for stage in stages if stage.afresh}:
-            self.tasks[where].remember()  # needs as much memory as the field, so only if required
         for stage in stages:
             before = self._done
             carry_out[stage.kind](stage, self.tasks[stage.where])
+            if stage.remember:
+                self.tasks[stage.where].remember()
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
-        if stage.afresh:
-            task.restart()
         with ExitStack() as stack:
             for _ in range(stage.halvings):
                 task = stack.enter_context(task.halved())
@@ -195,8 +193,12 @@ class Runner:
 
     def _weights(self, stage: FitStage, task: Task) -> None:
         """Compare weights by fits from the same state, so that they are independent of each other. The task is left in the most
-        likely state."""
+        likely state.
+
+        The remembered state is that under simple noise: after more steps under other noise models, weights are too low.
+        """
         model = task.signal_model
+        task.restart()
         start = likeliest = copy.deepcopy(model.state_dict())
         lowest = math.inf
 

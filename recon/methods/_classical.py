@@ -14,10 +14,9 @@ from torch import Tensor
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
 from recon.projection.base import Projector
+from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.sirt import sirt
-from recon.projection.wbp import WINDOWS, wbp
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, Blockwise, Images
 from recon.series.first_guess import contrast_slab, estimate_response

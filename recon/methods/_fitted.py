@@ -14,7 +14,7 @@ from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.at_level import at_level
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
-from recon.fields._registry import field_kinds
+from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
 from recon.joint.joint import OTHERS, JointReconstructor
@@ -37,12 +37,7 @@ Options = Callable[[Settings], dict[str, Any]]
 
 
 def fitted(
-    name: str,
-    description: str,
-    options: Options,
-    *,
-    keeps_noise_model: bool = False,
-    refuses: tuple[str, ...] = (),
+    name: str, description: str, options: Options, *, keeps_noise_model: bool = False, refuses: tuple[str, ...] = ()
 ) -> Method:
     """Create a method that is a joint fit.
 

@@ -17,15 +17,15 @@ from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
-from recon.fields._registry import field_kinds
+from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit
 from recon.joint.stages import RunStage, run_stage
 from recon.names import METHODS
 from recon.names import method_names as method_names
+from recon.projection.classical import WINDOWS
 from recon.projection.defocused_projector import KERNELS
-from recon.projection.wbp import WINDOWS
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Blockwise
 from recon.scale.running import reconstruct_in_blocks
@@ -50,7 +50,7 @@ class Settings:
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
-        window: window of the back-projection, one of `recon.projection.wbp.WINDOWS`.
+        window: window of the back-projection, one of `recon.projection.classical.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
         defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
@@ -295,9 +295,8 @@ def reconstruct(
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found, blocks)
     if chosen.noise_model is not None and needs_image(chosen.noise_model):
-        return _of_distinct_tilts(
-            run, found, tilt_series, grid, chosen
-        )  # per-pixel maps of the detector are not transformed
+        # per-pixel maps of the detector are not transformed
+        return _of_distinct_tilts(run, found, tilt_series, grid, chosen)
     orientation = Orientation.of(tilt_series)
     rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
     return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
@@ -353,11 +352,7 @@ def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings
 
 
 def _in_blocks(
-    method: Method,
-    blocks: dict[str, Any],
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    settings: Settings,
+    method: Method, blocks: dict[str, Any], tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
 ) -> Reconstruction:
     folder = None if settings.keep is None else settings.keep(settings.prefix)
     if method.blockwise is None:

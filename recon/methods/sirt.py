@@ -25,8 +25,5 @@ def _settle(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
 
 
 METHOD = classical(
-    "sirt",
-    "SIRT; the number of iterations is chosen by held-out tilts.",
-    _settle,
-    refuses=("window", "denoiser"),
+    "sirt", "SIRT; the number of iterations is chosen by held-out tilts.", _settle, refuses=("window", "denoiser")
 )

@@ -33,7 +33,6 @@ THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
 _SLAB_VOXELS = 2**24  # projected at a time
-_PREVIEW = 256  # largest number of voxels per axis for the choice of grey levels
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         header, rows, caption="MSE in units of the squared range of the reference; projections are compared one by one."
     )
     line = matching_line(volume, reference, "affine")
-    some, known = strided(volume, _PREVIEW), strided(reference, _PREVIEW)
+    some, known = strided(volume), strided(reference)
     limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
     span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)

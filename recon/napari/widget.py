@@ -14,7 +14,6 @@ from recon.napari.files import LayerData, axes_of, error_bar_layer
 if TYPE_CHECKING:
     from noiseflow.progress import Progress
 
-_STEPS = 0  # the default number of the method
 _BUTTON = "Reconstruct"
 _SHARES = 100
 
@@ -33,7 +32,7 @@ def reconstruct_layers(
     method: str = "auto",
     field: str = FIELDS.first,
     thickness: int = 0,
-    num_steps: int = _STEPS,
+    num_steps: int = 0,
     invert_tilt: bool = False,
     uncertainty: int = 0,
     progress: "Progress | None" = None,
@@ -101,7 +100,7 @@ def reconstruct_widget() -> Any:
         method: str = "auto",
         field: str = FIELDS.first,
         thickness: int = 0,
-        num_steps: int = _STEPS,
+        num_steps: int = 0,
         invert_tilt: bool = False,
         uncertainty: int = 0,
     ) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -112,3 +113,33 @@ from_rays = from_columns
 def _require(tensor: Tensor, what: str, first: int, last: int) -> None:
     if tensor.ndim != 3 or tensor.shape[0] != first or tensor.shape[2] != last:
         raise ValueError(f"{what} must have shape ({first}, any, {last}), not {tuple(tensor.shape)}")
+
+
+Multiply = Callable[[Tensor, bool], Tensor]
+
+
+def linear(dense: Tensor, multiply: Multiply, *, transposed: bool = False) -> Tensor:
+    """``multiply(dense, transposed)``, the product with a matrix or with its transpose; its gradient is the other product."""
+    result: Tensor = _Linear.apply(dense, multiply, transposed)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Linear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, dense: Tensor, multiply: Multiply, transposed: bool) -> Tensor:
+        ctx.of = multiply, transposed
+        return multiply(dense, transposed)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        multiply, transposed = ctx.of
+        return linear(gradient, multiply, transposed=not transposed), None, None
+
+
+class SavedGradient(torch.autograd.Function):
+    """A scalar function whose ``forward`` saves the gradient with respect to its first argument, the only differentiable one."""
+
+    @staticmethod
+    def backward(ctx: Any, outer: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * outer, *[None] * (len(ctx.needs_input_grad) - 1)

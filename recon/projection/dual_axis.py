@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector
+from recon.projection.base import Projector, linear
 from recon.projection.defocused_projector import with_defocus
-from recon.projection.gradients import linear
 from recon.projection.projector import SliceProjector
 from recon.projection.sparse import PanelledMatrix
 

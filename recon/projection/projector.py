@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector, from_columns, from_rays, to_columns, to_rays
-from recon.projection.gradients import linear
+from recon.projection.base import Projector, from_columns, from_rays, linear, to_columns, to_rays
 from recon.projection.sparse import PanelledMatrix, panelled_by_groups
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]

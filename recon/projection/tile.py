@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.projection.gradients import SavedGradient
+from recon.projection.base import SavedGradient
 
 
 @dataclass(frozen=True)

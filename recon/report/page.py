@@ -26,7 +26,6 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
-_PREVIEW = 256  # largest number of pixels per axis for grey levels and charts of the noise
 _MOST_PIXELS = 2**24  # for correlations of residuals, whose errors are then negligible
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
@@ -176,23 +175,18 @@ def _text(value: object) -> str:
 def _add_volume(report: Report, volume: Volume, unit: str) -> None:
     values = volume.attenuation
     sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
-    low, high = (float(end) for end in np.percentile(strided(values, _PREVIEW), (0.5, 99.8)))
+    low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading("Volume")
-    options = {
-        "original": list(values.shape),
-        "limits": [low, high],
-        "voxelSize": size,
-        "unit": unit,
-    }
+    options = {"original": list(values.shape), "limits": [low, high], "voxelSize": size, "unit": unit}
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
 
 def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     images, predicted = tilt_series.images, outcome.projections
-    some = strided(images, _PREVIEW)
+    some = strided(images)
     ends = np.percentile(some, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
     both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
@@ -229,10 +223,8 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
 def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     if outcome.noise_model is None:
         return
-    images, predicted = (
-        strided(stack, _PREVIEW).astype(np.float32) for stack in (tilt_series.images, outcome.projections)
-    )
-    use = slice(None) if tilt_series.mask is None else strided(tilt_series.mask, _PREVIEW)
+    images, predicted = (strided(stack).astype(np.float32) for stack in (tilt_series.images, outcome.projections))
+    use = slice(None) if tilt_series.mask is None else strided(tilt_series.mask)
     report.heading("Noise", folded=True)
     caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)

@@ -34,7 +34,7 @@ HALO = 12
 0.09 dB with a halo of 8 or 10 compared with the whole volume, 0.04 dB with 4 or 14, and nothing with 12, 16 or 20."""
 
 _FADE = 4  # slices on each side of a border; the outer half of the halo is affected by the end of the block
-SETTLED_ON = 48
+SETTLED_ON = 32
 """Slices for the choices that all blocks share."""
 
 

@@ -253,9 +253,8 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
         running.processes.add(process)
     said, told = process.communicate()
     running.processes.discard(process)
-    lines = [
-        text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))
-    ]  # lines of the frame around usage errors
+    # lines of the frame around usage errors
+    lines = [text for line in told.decode(errors="replace").splitlines() if (text := line.strip("│╭╮╰╯─ "))]
     last = lines[-1].removeprefix("noiseflow: ") if lines else ""
     if process.returncode:
         return None, last or f"exit {process.returncode}"

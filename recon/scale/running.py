@@ -228,9 +228,8 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
         library.Client(cluster, set_as_default=False) as client,
     ):
-        for number, worker in enumerate(
-            client.scheduler_info(-1)["workers"]
-        ):  # while this process makes the choices for all blocks
+        # while this process makes the choices for all blocks
+        for number, worker in enumerate(client.scheduler_info(-1)["workers"]):
             library.fire_and_forget(client.submit(_import_what_blocks_need, number, workers=[worker]))
         yield client
 

@@ -23,7 +23,9 @@ _SAME_TILT = 0.3  # degrees, and a third of the smallest step: files round angle
 _SAME_SCALE = 0.02  # relative: binning by incomplete blocks loses up to one pixel in fifty
 
 
-@described(tilt_axis="°", shifts="px", tilt_angles="°", stretches="px/px", refined_angles="°", pixel_size="Å")
+@described(
+    tilt_axis="°", shifts="px", tilt_angles="°", stretches="px/px", refined_angles="°", pixel_size="Å", x_tilt="°"
+)
 @dataclass(frozen=True)
 class Alignment:
     """The transformation from aligned to raw images: a stretch, a rotation about the centre, then a shift.
@@ -38,6 +40,7 @@ class Alignment:
         refined_angles: (tilt,) degrees to use in place of `tilt_angles`; None if they did not change.
         image_shape: (y, x) of the raw images; None if unknown. Shifts are scaled for images of another binning.
         pixel_size: Å, of the raw images; None if unknown.
+        x_tilt: that of the aligned series if it is not 0, see `TiltSeries`.
 
     Example:
         >>> import numpy as np, recon
@@ -55,6 +58,7 @@ class Alignment:
     refined_angles: NDArray[np.float64] | None = None
     image_shape: tuple[int, int] | None = None
     pixel_size: float | None = None
+    x_tilt: float = 0.0
 
     @classmethod
     def of_transforms(
@@ -199,7 +203,8 @@ class Alignment:
             warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
         angles = tilt_series.tilt_angles if self.refined_angles is None else self.refined_angles
         part = None if mask.all() else mask
-        return replace(tilt_series, images=images, mask=part, tilt_axis=None, tilt_angles=angles)
+        turned = self.x_tilt or tilt_series.x_tilt
+        return replace(tilt_series, images=images, mask=part, tilt_axis=None, tilt_angles=angles, x_tilt=turned)
 
     def _shape(self, raw: tuple[int, ...]) -> tuple[int, ...]:
         """Shape of aligned images."""
@@ -262,6 +267,7 @@ class Alignment:
             "refined_angles_degrees": None if self.refined_angles is None else self.refined_angles.tolist(),
             "image_shape_yx": self.image_shape,
             "pixel_size_angstrom": self.pixel_size,
+            "x_tilt_degrees": self.x_tilt,
             "unexplained_variance": self.residual,
             "margin_standard_errors": self.margin,
             "candidates": [evidence.as_dict() for evidence in self.evidence],

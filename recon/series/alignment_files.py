@@ -98,6 +98,7 @@ def read_alignment(
             refined_angles=_array(known["refined_angles_degrees"]),
             image_shape=None if known["image_shape_yx"] is None else tuple(known["image_shape_yx"]),
             pixel_size=known["pixel_size_angstrom"],
+            x_tilt=float(known.get("x_tilt_degrees", 0.0)),
         )
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} does not exist; write it with --save-alignment") from None
@@ -111,13 +112,19 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     table = io.read_tilts(path) if path.suffix.lower() in tables else _xf_with_angles(path, tilt_series)
     _transforms(table, path)
     table = table.rows([row for row in range(len(table.angles)) if row not in table.excluded])
-    known: dict[str, Any] = {"image_shape": table.image_shape, "pixel_size": table.pixel_size}
+    size = table.pixel_size
+    if table.in_angstrom:  # RELION states the size in another file
+        size = size or (None if tilt_series is None else tilt_series.pixel_size)
+        if size is None:
+            raise ValueError(f"{path} states shifts in Å, and no file states the pixel size; give it with --pixel-size")
+        table = _scaled(table, size, path)
+    known: dict[str, Any] = {"image_shape": table.image_shape, "pixel_size": size}
     if binning is not None:
         if not 0 < binning < np.inf:
             raise ValueError(f"--alignment-binning {binning:g}: give a positive number, such as 4")
-        table, known = replace(table, transforms=_transforms(table, path) / np.array([1, 1, binning])), {}
+        table, known = _scaled(table, binning, path), {}
     if tilt_series is None:
-        return Alignment.of_transforms(_transforms(table, path), table.angles, **known)
+        return Alignment.of_transforms(_transforms(table, path), table.angles, x_tilt=table.x_tilt, **known)
     views = np.arange(tilt_series.num_tilts) if tilt_series.views is None else tilt_series.views
     total = tilt_series.num_views or tilt_series.num_tilts
     sections = np.arange(len(table.angles)) if table.sections is None else table.sections
@@ -129,13 +136,15 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     used = [tilt for tilt, view in enumerate(views) if int(view) in rows]
     table = table.rows([rows[int(views[tilt])] for tilt in used])
     refined = None if np.isnan(table.angles).any() else table.angles
-    raw = tilt_series.tilt_angles[used]
+    raw, turned = tilt_series.tilt_angles[used], table.x_tilt
+    if refined is not None and np.abs(refined + raw).max() < np.abs(refined - raw).max():  # --invert-tilt
+        refined, turned = -refined, -turned
     if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > _AS_WRITTEN:
         warnings.warn(
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,
         )
-    alignment = Alignment.of_transforms(_transforms(table, path), raw, refined_angles=refined, **known)
+    alignment = Alignment.of_transforms(_transforms(table, path), raw, refined_angles=refined, x_tilt=turned, **known)
     _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
     return alignment
 
@@ -149,6 +158,11 @@ def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, 
             "--alignment-binning, or put the stack that was aligned next to it",
             stacklevel=4,
         )
+
+
+def _scaled(table: io.TiltTable, pixel: float, path: Path) -> io.TiltTable:
+    """The table with shifts in larger pixels."""
+    return replace(table, transforms=_transforms(table, path) / np.array([1, 1, pixel]))
 
 
 def _transforms(table: io.TiltTable, path: Path) -> NDArray[np.float64]:
@@ -171,7 +185,7 @@ def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
         )
     unknown = io.TiltTable(np.full(len(transforms), np.nan))
     known = unknown if refined is None else adjusted(io.TiltTable(refined), path, path.stem)  # the offset of tilt.com
-    table = replace(unknown, angles=known.angles, transforms=transforms)
+    table = replace(unknown, angles=known.angles, transforms=transforms, x_tilt=known.x_tilt)
     stack = next((each for suffix in _RAW if (each := path.with_suffix(suffix)).is_file()), None)
     if stack is None:
         return table

@@ -10,9 +10,9 @@ import torch
 
 from noiseflow.arrays import strided
 from noiseflow.io import mapped
+from recon.projection.classical import sirt
 from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
-from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
 from recon.series.tilt_series import Mode, TiltSeries

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector
+from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
-from recon.projection.sirt import sirt
 from recon.series.masks import binned, used_values
 from recon.series.tilt_series import TiltSeries, filled
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.projection.sirt import sirt
 
 ITERATIONS = 10
 _FARTHEST = 3.0  # pixels per step; for larger shifts the linearisation of an image blurred by one pixel is not valid

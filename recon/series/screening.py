@@ -15,8 +15,8 @@ from torch import Tensor
 
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
+from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.projection.sirt import sirt
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
 from recon.series.tilt_series import TiltSeries

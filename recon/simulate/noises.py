@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_quadrature
 from noiseflow.models.base import NoiseModelBase

@@ -210,9 +210,8 @@ def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows
     box, places = canvas.window(np.zeros(3), 0.9)
     body = canvas.covered(places, np.array([0.7, 0.85, 0.8]), np.eye(3))
     waves = _waves(places, generator, 60, longest=0.8, shortest=0.5)
-    walls = np.clip(
-        0.5 + (0.3 - np.abs(waves)) * 3, 0, 1
-    )  # around the zeros of the waves: a sponge with one connected wall
+    # around the zeros of the waves: a sponge with one connected wall
+    walls = np.clip(0.5 + (0.3 - np.abs(waves)) * 3, 0, 1)
     canvas.volume[box] = (0.4 * body * walls).astype(np.float32)
     for _ in range(count):
         radius = generator.uniform(0.03, 0.06)

@@ -80,11 +80,7 @@ class Simulation:
         Raises:
             ValueError: the phantom is unknown or empty.
         """
-        with (
-            output_folder(folder),
-            locked(folder / "tilts.mrc"),
-            partial_folder(folder / "simulate") as partial,
-        ):
+        with output_folder(folder), locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
             unit = _Writer(self, partial, progress).run()
             for path in partial.glob("*.mrc"):
                 finish_mrc(path, stack=path.stem != "truth")

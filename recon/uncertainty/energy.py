@@ -85,9 +85,8 @@ class Energy:
         start, found = _slope(part, self.start), 0.0
         for _ in range(_POWER_STEPS):
             direction = direction * self.filled
-            step = (
-                0.01 * direction / direction.abs().max().clamp_min(1e-30)
-            )  # units: within the quadratic range of the smoothing
+            # units: within the quadratic range of the smoothing
+            step = 0.01 * direction / direction.abs().max().clamp_min(1e-30)
             direction = _slope(part, self.start + step) - start
             found = float(direction.norm() / step.norm().clamp_min(1e-30))
         return found

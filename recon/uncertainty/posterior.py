@@ -81,9 +81,8 @@ class Posterior:
         if tilt_series.mask is not None:
             train &= _native(tilt_series.mask).to(device)
         self.energy = Energy(model, noise_model, observation, train)
-        self.step_size = 1 / (
-            self.energy.stiffness() or 1.0
-        )  # the stiffness of a block of vacuum is zero, and nothing changes
+        # the stiffness of a block of vacuum is zero, and nothing changes
+        self.step_size = 1 / (self.energy.stiffness() or 1.0)
         seen = torch.where(train, observation, torch.nan)
         self.temperature = 1 / _effective_share(noise_model, model.signal().detach().view_as(observation), seen)
         first = 0 if rows is None else rows.start

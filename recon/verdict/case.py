@@ -24,6 +24,7 @@ from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.expected import Result, expected_images
 from recon.verdict.gap_fit import Unexplained, shared, unexplained
 from recon.verdict.geometry import Geometry
+from recon.verdict.moments import Axis, axis
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
@@ -40,6 +41,8 @@ _VISIBLE = 8.0
 _OUTLYING = 4.0
 # of the images: correct and inverted phantoms differ by at least 0.12
 OTHER_MODE = 0.05
+# line integral at the sides, relative to the mean
+FIELD = 0.4
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -141,6 +144,14 @@ class Case:
         if self.geometry.structure < _VISIBLE:
             raise NotTested("no object is visible")
         return self.geometry
+
+    @cached_property
+    def axis(self) -> Axis:
+        """The axis that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
+        if self.other_geometries.edge > FIELD:
+            raise NotTested("the object extends beyond the sides of the images")
+        filled = replace(self.coarse, images=np.where(self.coarse.used, self.coarse.images, self.own[0]))
+        return axis(filled, self.geometry.fit.fitted(filled.images))
 
     @cached_property
     def gap(self) -> Unexplained:

@@ -103,4 +103,4 @@ def inverted(response: Transmission | Linear, images: Array) -> Array:
         if isinstance(response, Transmission):
             floor = _LEAST_SHARE * response.intensity.reshape(-1, 1, 1)
             given = torch.maximum(given, floor.expand(given.shape))
-        return np.asarray(response.invert(given).double().numpy())
+        return np.asarray(response.invert(given).numpy())

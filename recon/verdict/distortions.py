@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
+from recon.verdict.moments import slope_over_tilts
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -87,7 +88,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     tiles = np.add.outer(np.arange(height) // _TILE * width, np.arange(width) // _TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
-    by_angle = _slope_over_tilts(residuals)
+    by_angle = slope_over_tilts(residuals.projections, residuals.tilt_angles)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
@@ -97,14 +98,6 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
         parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
-
-
-def _slope_over_tilts(residuals: Residuals) -> Array:
-    """Derivative of the projections with respect to the tilt angle, per radian; duplicates count as one angle."""
-    angles, first, back = np.unique(np.round(residuals.tilt_angles, 3), return_index=True, return_inverse=True)
-    if len(angles) < 2:
-        return np.zeros_like(residuals.projections)
-    return np.asarray(np.gradient(residuals.projections[first], np.deg2rad(angles), axis=0)[back])
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distortion:

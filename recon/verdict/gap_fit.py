@@ -50,6 +50,7 @@ class GapFit:
         rays, voxels, weights = joseph(angles, offsets, depth, width, detector_width)
         matrix = np.zeros((len(angles) * detector_width, depth * width + 1), np.float32)
         matrix[rays, voxels] = weights
+        del rays, voxels, weights
         matrix[:, -1] = np.sqrt(np.mean(matrix[:, :-1].sum(1) ** 2))
         self.detector_width, self.gaps = detector_width, Holdout.gaps(angles, gap).tilts()
         normal = matrix.T @ matrix
@@ -151,4 +152,4 @@ def _to_rays(images: Array) -> Array:
 
 
 def _to_images(rays: Array, shape: tuple[int, ...]) -> Array:
-    return np.asarray(rays.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1), dtype=np.float64)
+    return np.asarray(rays.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1))

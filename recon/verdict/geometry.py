@@ -1,15 +1,14 @@
-"""Other geometries: a tilt axis, angles, a thickness or two objects that predict held-out gaps of tilts better."""
+"""Other geometries: angles, a thickness or two objects that predict held-out gaps of tilts better."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from noiseflow.checks import Effect
 from recon.series.holdout import GAP
@@ -25,14 +24,7 @@ _SINGLE = 0.3
 _REPLICATES = 8
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
 _LEAST_FREE = 0.1
-_TURNS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0)  # degrees, in both directions
-# pixels: interpolation at this shift reduces noise like a rotation: f² + (1 − f)² = 2/3
-_LIKE_A_TURN = 0.211
 _SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
-# coarse pixels: half a pixel is resolved, and larger ones gain more
-_OFFSETS = (-3.0, -1.0, 1.0, 3.0)
-# share of used neighbours of an interpolated pixel
-_SEEN = 0.99
 # degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
 _WIDEST = 190.0
 
@@ -45,7 +37,6 @@ class Geometry:
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
         left: (tilt, y, u) residuals of that fit to all tilts.
-        replicates: series (tilt, y, u) of the given geometry, drawn from this fit.
     """
 
     def __init__(self, coarse: Coarse) -> None:
@@ -56,14 +47,10 @@ class Geometry:
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    @cached_property
+    @property
     def single(self) -> GapFit:
         """The fit that holds out single angles, which their neighbours predict."""
         return self._fit(self.smoothness, gap=self._step)
-
-    @cached_property
-    def _smooth(self) -> GapFit:
-        return self._fit(_SINGLE, gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -71,13 +58,15 @@ class Geometry:
         directions = self.coarse.directions
         return directions.span / len(np.unique(np.round(directions.angles, 3)))
 
-    def single_errors(self, images: Array) -> Array:
-        """(tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
-        return self._smooth.errors(images, self.coarse.used)
+    @property
+    def single_errors(self) -> Callable[[Array], Array]:
+        """The (tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
+        return partial(self._fit(_SINGLE, gap=self._step).errors, used=self.coarse.used)
 
-    @cached_property
-    def replicates(self) -> list[Array]:
-        """The fit with its residuals in random signs, the same along rows, in which most detectors correlate their noise.
+    @property
+    def replicates(self) -> Iterator[Array]:
+        """Series (tilt, y, u) of the given geometry: the fit with its residuals in random signs, the same along rows, in which
+        most detectors correlate their noise. They are drawn one at a time, the same ones each time.
 
         Residuals are smaller than the noise by the degrees of freedom of the fit.
         """
@@ -87,19 +76,19 @@ class Geometry:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
-        return [(fitted + sign * noise) * self.coarse.used for sign in signs]
+        return ((fitted + sign * noise) * self.coarse.used for sign in signs)
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
 
-    def _fit(self, smoothness: float, *, offset: float = 0.0, gap: float = GAP, **changes: Any) -> GapFit:
+    def _fit(self, smoothness: float, *, gap: float = GAP, **changes: Any) -> GapFit:
         coarse = replace(self.coarse, **changes)
         return GapFit(
             coarse.tilt_angles,
             depth=coarse.depth,
             width=coarse.width,
             detector_width=coarse.images.shape[2],
-            detector_offset=coarse.detector_offset + offset,
+            detector_offset=coarse.detector_offset,
             smoothness=smoothness,
             gap=gap,
         )
@@ -119,47 +108,18 @@ class Geometry:
         raised = profile - profile.min()
         return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
-    def axis(self) -> Effect:
-        """The best other direction of the tilt axis.
-
-        Interpolation alone reduces the noise, so each turn is compared with its opposite and with a shift.
-        """
-        shifted = self._moved(
-            lambda image: ndimage.shift(image, (_LIKE_A_TURN,) * 2, order=1, mode="nearest"),
-            self._fit(self.smoothness, offset=_LIKE_A_TURN),
-        )
-        gains = []
-        for size in _TURNS:
-            both = {turn: self._moved(partial(_turned, turn), self.fit) for turn in (-size, size)}
-            for turn, errors in both.items():
-                what = f"turned by {turn:g}°"
-                gains.append(min((self._gain(errors, other, what) for other in (shifted, both[-turn])), key=_value))
-        if self.coarse.images.shape[1] == self.coarse.images.shape[2]:
-            across = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
-            gains.append(self._gain(across, self.errors, "turned by 90°"))
-        return _best(gains)
-
-    def _moved(self, move: Callable[[Array], Array], fit: GapFit) -> Array:
-        """Errors of moved images."""
-        images, used = (
-            np.stack([move(image.astype(np.float64)) for image in stack])
-            for stack in (self.coarse.images, self.coarse.used)
-        )
-        return fit.errors(images, used > _SEEN)
+    def transposed(self) -> Effect:
+        """Images with rows and columns exchanged, as if the tilt axis were across."""
+        if self.coarse.images.shape[1] != self.coarse.images.shape[2]:
+            return Effect(0.0)
+        errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
+        return _best([self._gain(errors, self.errors, "")])
 
     def angles(self) -> Effect:
         """The best other scale of the tilt angles."""
         angles = self.coarse.tilt_angles
         scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
         return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
-
-    def middle(self) -> Effect:
-        """The best other position of the tilt axis across the images."""
-        coarse = self.coarse
-        return _best(
-            self._with(f"{size * coarse.binning:+g} pixels", detector_offset=coarse.detector_offset + size)
-            for size in _OFFSETS
-        )
 
     def thicker(self) -> Effect:
         """A volume with a depth equal to the width, if it is thinner."""
@@ -180,18 +140,18 @@ class Geometry:
         for part in (first, ~first):
             fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
             errors[part] = fit.errors(self.coarse.images[part], used)
-            expected[part] = fit.errors(self.replicates[0][part], used)
+            expected[part] = fit.errors(next(self.replicates)[part], used)
         return self._beyond_expected(errors, expected, name)
 
     def _with(self, what: str, **changes: Any) -> Effect:
         fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
+        return self._beyond_expected(self._errors(fit), fit.errors(next(self.replicates), self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
         any volume smoother, which predicts some objects better."""
         gain = self._gain(errors, self.errors, what)
-        chance = self._gain(expected, self.fit.errors(self.replicates[0], self.coarse.used), what)
+        chance = self._gain(expected, self.fit.errors(next(self.replicates), self.coarse.used), what)
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
@@ -210,7 +170,3 @@ def _value(effect: Effect) -> float:
 def _best(effects: Iterable[Effect]) -> Effect:
     best = max(effects, key=_value)
     return best._replace(value=max(0.0, best.value))
-
-
-def _turned(degrees: float, image: Array) -> Array:
-    return np.asarray(ndimage.rotate(image, degrees, reshape=False, order=1, mode="nearest"))

@@ -55,9 +55,8 @@ def cliff(residuals: Residuals) -> Effect:
     if not np.median(np.diff(values[-_FEWEST:])) < width / 2:
         raise NotTested("the histogram has too few values")
     total = np.append(0, np.cumsum(counts))
-    first = min(
-        int(np.searchsorted(total, 0.9 * images.size)), len(values) - 1
-    )  # steps in the middle belong to the object
+    # steps in the middle belong to the object
+    first = min(int(np.searchsorted(total, 0.9 * images.size)), len(values) - 1)
     tops, here = values[first:], total[first + 1 :]
     below = here - total[np.searchsorted(values, tops - width)]
     above = total[np.searchsorted(values, tops + width, "right")] - here
@@ -134,10 +133,11 @@ def borders(residuals: Residuals) -> Effect:
     Empty borders without noise are no fault: there the volume predicts that value.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
+    # (tilt, lines from the side, along it)
     lines, expected = (
         seen.transpose(0, 2, 1),
         residuals.projections.transpose(0, 2, 1),
-    )  # (tilt, lines from the side, along it)
+    )
     filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 

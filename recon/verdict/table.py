@@ -18,6 +18,14 @@ from recon.verdict.response import bent_response
 SHIFT, SMOOTH_SHIFT, OFF_MIDDLE = 0.25, 0.1, 0.06
 # the same at the edge of the images
 EDGE, SMOOTH_EDGE, ROTATION, ANGLE = 0.5, 0.2, 0.04, 0.6
+# a hundredth of the field of view, in coarse pixels
+OFF_AXIS = 0.3
+# moves the edge of 64 pixels by half a pixel
+DEGREES = 1.0
+# half of it at both ends of the series, where few tilts determine it
+TURN = 4.0
+# smaller angles make any volume smoother, and correct series need up to a fifth
+SCALE = 0.25
 # share of the contrast
 BRIGHTNESS = 0.18
 # of the structure: correct series leave at most 0.009 beyond replicates
@@ -169,8 +177,16 @@ DISTORTIONS: tuple[Row, ...] = (
     Row("contrast", "mode", "distortion", cases.inverted, "of the images", cases.OTHER_MODE,
         "the contrast looks inverted: as given and inverted, a volume explains {what}",
         "give the other --mode, or --invert-contrast"),
-    Row("tilt axis", "axis", "distortion", lambda case: case.other_geometries.axis(), "of the error", GAIN,
-        "images {what} explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS, score=2.5),
+    Row("tilt axis", "axis", "distortion", lambda case: case.axis.direction, "°", DEGREES,
+        "the tilt axis is rotated by {value:.1f}° in the images", AXIS),
+    Row("turn of the axis", "axis", "distortion", lambda case: case.axis.turn, "°", TURN,
+        "the tilt axis turns by {value:.1f}° in the images from the first tilt to the last", AXIS),
+    Row("axis across", "axis", "distortion", lambda case: case.other_geometries.transposed(), "of the error", GAIN,
+        "images turned by 90° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS, score=2.5),
+    Row("axis off the middle", "alignment", "distortion", lambda case: case.axis.offset, "pixels", coarse_pixels(OFF_AXIS),
+        "the tilt axis is {value:.1f} pixels off the middle of the images", ALIGN),
+    Row("moments and angles", "angles", "distortion", lambda case: case.axis.scale, "", SCALE,
+        "the range of the tilt angles is wrong by {value:.0%}", ANGLES),
     # smaller angles make any object smoother: 60 independent correct series gain at most 0.1
     Row("scale of the angles", "angles", "distortion", lambda case: case.other_geometries.angles(), "of the error", 0.1,
         "tilt angles {what} explain held-out tilts better: their error decreases by {value:.0%}", ANGLES, score=2.5),
@@ -195,8 +211,6 @@ DISTORTIONS: tuple[Row, ...] = (
         "the images drift across the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
     Row("drift along the axis", "alignment", "distortion", of("shift along y", "drift"), "pixels", coarse_pixels(SMOOTH_SHIFT),
         "the images drift along the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
-    Row("axis off the middle", "alignment", "distortion", lambda case: case.other_geometries.middle(), "of the error", GAIN,
-        "the tilt axis is off the middle of the images: {what} explain held-out tilts better, by {value:.0%}", ALIGN, score=2.0),
     Row("rotation of each image", "axis", "distortion", of("rotation", "jitter"), "pixels", coarse_pixels(EDGE),
         "the images are rotated relative to what the others predict, by {value:.2f} pixels at their edge", AXIS),
     Row("rotation", "axis", "distortion", of("rotation", "offset"), "pixels", coarse_pixels(ROTATION),
@@ -235,7 +249,7 @@ DISTORTIONS: tuple[Row, ...] = (
         "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
         "exclude the blurred tilts, or blur all tilts equally", local=True),
     # line integral at the sides relative to the mean
-    Row("field of view", "field", "distortion", cases.beyond_the_sides, "of the mean signal", 0.4,
+    Row("field of view", "field", "distortion", cases.beyond_the_sides, "of the mean signal", cases.FIELD,
         "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
         "use a larger field of view, or a smaller object"),
     Row("fixed pattern", "pattern", "distortion", _pixel(pixels.pattern), "of the contrast", 0.02,

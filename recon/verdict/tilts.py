@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -34,16 +35,19 @@ def largest_gaps(angles: Array) -> tuple[float, float, int]:
 
 def repeated(tilt_series: TiltSeries) -> Effect:
     """Share of images that are exactly equal to another, which noise excludes for separate exposures."""
-    different = {np.ascontiguousarray(image).tobytes() for image in tilt_series.images}
+    different = {hashlib.sha256(image.tobytes()).digest() for image in tilt_series.images}
     return Effect(1 - len(different) / tilt_series.num_tilts)
 
 
 def normalised(tilt_series: TiltSeries) -> Effect:
     """1 if every image has the same mean and deviation, or the same quantiles: each was scaled by itself."""
-    values = [image[use].astype(np.float64) for image, use in zip(tilt_series.images, tilt_series.used, strict=True)]
-    moments = np.array([(each.mean(), each.std()) for each in values])
-    ends = np.array([np.quantile(each, (0.01, 0.99)) for each in values])
-    counts = all(np.array_equal(each, np.round(each)) for each in values)  # whose quantiles are equal without scaling
+    found = []
+    for number, image in enumerate(tilt_series.images):  # one at a time: images may be on the disk
+        values = (image if tilt_series.mask is None else image[tilt_series.mask[number]]).astype(np.float64)
+        whole = np.array_equal(values, np.round(values))
+        found.append([values.mean(), values.std(), *np.quantile(values, (0.01, 0.99)), whole])
+    moments, ends, wholes = np.split(np.array(found), (2, 4), axis=1)
+    counts = wholes.all()  # whose quantiles are equal without scaling
     for pairs, scale in ((moments, moments[:, 1].mean()), (ends, 0.0 if counts else np.ptp(ends, axis=1).mean())):
         if np.ptp(pairs, axis=0).max() < 1e-3 * scale:
             return Effect(1.0)

@@ -12,9 +12,8 @@ from calibration.detector.independence import contained_share, correlation_in_ti
 from calibration.detector.log_posterior import LogPosterior, by_whole_electrons
 from calibration.detector.residual import Residual
 from calibration.detector.shape import unevenness
-from calibration.exposures.codes import coarser_above
-from calibration.exposures.compression import block_compressed, wavelet_compressed
 from calibration.exposures.frames import Burst, ExposurePair
+from calibration.exposures.processing import block_compressed, coarser_above, wavelet_compressed
 from calibration.pipeline import measure_exposures
 from calibration.registration.aligned import align_pair
 from calibration.registration.bursts import align_burst

@@ -8,7 +8,7 @@ from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
 from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
-from calibration.exposures.outliers import without_outliers
+from calibration.exposures.masks import without_outliers
 from calibration.pipeline import measure_exposures
 
 from . import simulators as sim

@@ -37,8 +37,13 @@ from noiseflow.distributions.electrons.narrow_cells import (
     is_narrow,
     posterior_mode,
 )
-from noiseflow.distributions.electrons.peaks import is_near_peak, peaks_and_slopes
-from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.electrons.poisson_terms import (
+    REACH,
+    is_near_peak,
+    lattice_mode,
+    log_poisson,
+    peaks_and_slopes,
+)
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
 
 RESOLVED = 1.5  # electrons: read noise below which the sum is used

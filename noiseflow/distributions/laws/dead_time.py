@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.discrete import DiscreteLevels
+from noiseflow.distributions.laws.base import DiscreteLevels
 from noiseflow.distributions.laws.textbook import PoissonDistribution, gamma_mass
 
 

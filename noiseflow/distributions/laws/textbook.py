@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.electrons.poisson_terms import log_poisson
-from noiseflow.distributions.laws.discrete import DiscreteLevels, between, log_sum
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import DiscreteLevels, LatentDistribution, between, log_sum
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
 

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import needs_image
-from noiseflow.distributions.numerics.fingerprint import fingerprint
 from noiseflow.distributions.numerics.signal_table import Table, Values
-from noiseflow.distributions.numerics.table_axes import RootScale
+from noiseflow.distributions.numerics.table_axes import RootScale, fingerprint
 from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18

@@ -1,19 +1,19 @@
-"""Table layout for a likelihood, a function of two scalars: scale of signals, rows and columns.
+"""Table layout for a likelihood, a function of two scalars: scale of signals, rows and columns; and a hash of the model it is of.
 
 Lookups are bilinear, in one fused pass over the pixels (``grid_sample``), at about the cost of a normal log-density.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-from noiseflow.distributions.numerics.fingerprint import fingerprint
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
@@ -181,3 +181,27 @@ def mean_error(found: Tensor, exact: Tensor) -> float:
 def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
     """A key that changes whenever the parameters of a model, or the given limits, change."""
     return (*limits, fingerprint(noise_model))
+
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+@torch.no_grad()
+def fingerprint(model: nn.Module) -> str:
+    """Hash all parameters and buffers with their data types and devices, and the plain settings of all submodules."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, tensor in (*model.named_parameters(), *model.named_buffers()):
+        digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}{tensor.device}".encode())
+        digest.update(_bytes(tensor))
+    for name, module in model.named_modules():
+        settings = {key: value for key, value in vars(module).items() if not key.startswith("_")}
+        plain = {key: value for key, value in settings.items() if isinstance(value, _PLAIN)}
+        digest.update(f"{name}{type(module).__qualname__}{sorted(plain.items(), key=str)}".encode())
+        for key, value in settings.items():
+            if isinstance(value, (Tensor, np.ndarray)):
+                digest.update(key.encode() + _bytes(torch.as_tensor(value)))
+    return digest.hexdigest()
+
+
+def _bytes(tensor: Tensor) -> Any:
+    return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data if tensor.numel() else b""

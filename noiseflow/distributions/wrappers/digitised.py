@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.discrete import DiscreteLevels
+from noiseflow.distributions.laws.base import DiscreteLevels
 from noiseflow.distributions.noise_distribution import NoiseDistribution, weighted_sum
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from noiseflow.distributions.laws.discrete import between, log_sum
+from noiseflow.distributions.laws.base import between, log_sum
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.quadrature import panels
 from noiseflow.distributions.pixel_batch import is_traced

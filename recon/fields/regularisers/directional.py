@@ -11,7 +11,7 @@ from torch import Tensor
 
 from recon.fields.regularisers.base import Regulariser, layers
 from recon.fields.regularisers.total_variation import TotalVariation
-from recon.projection.gradients import SavedGradient
+from recon.projection.base import SavedGradient
 
 
 class DirectionalVariation(Regulariser):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from recon.fields.regularisers.base import Regulariser, add_adjoint, difference, inner, layers
-from recon.projection.gradients import SavedGradient
+from recon.projection.base import SavedGradient
 
 
 class SecondOrderVariation(Regulariser):

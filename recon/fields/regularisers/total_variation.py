@@ -9,7 +9,7 @@ from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
 from recon.fields.regularisers.base import Regulariser, inner
-from recon.projection.gradients import SavedGradient
+from recon.projection.base import SavedGradient
 from recon.projection.tiles import Tiles
 
 

@@ -1,1 +1,1 @@
-from .method import METHOD as METHOD
+from .presets import METHOD as METHOD

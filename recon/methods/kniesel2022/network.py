@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Radial
 from noiseflow.models.base import NoiseModelBase
 

@@ -1,10 +1,10 @@
-"""Published methods with their own settings, for comparison. They take days; other methods take seconds."""
+"""The published settings, their training loop, and the method of reconstruction that runs them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from recon.fields.kinds.kniesel2022 import DENSEST, CoordinateDensity, PaperField
+from recon.joint.signal_model import TomographySignal
+from recon.methods._registry import Method, Settings
 from recon.methods.kniesel2022.network import PaperFlow, by_density, stratified
+from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Transmission
+from recon.reconstruction import Reconstruction
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -212,3 +216,37 @@ class PresetState:
 
 PRESETS = {"kniesel2022": Kniesel2022(), "kniesel2022-as-published": Kniesel2022(normalised=False)}
 """Presets by name."""
+
+
+def preset_method(name: str, description: str) -> Method:
+    """Wrap a preset of `PRESETS` as a method."""
+
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        width = tilt_series.images.shape[2]
+        if grid.width != width or grid.depth > width:
+            raise ValueError(
+                f"method {name} fills a cube as wide as the images; give a grid {width} wide and no deeper"
+            )
+        preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)
+        state = preset.start(tilt_series, max_steps=settings.num_steps)
+        settings.run_stage(name, state)
+        projector = projector_of(tilt_series, grid, settings.device)
+        model = TomographySignal(state.field(grid), projector, state.response, weight=0.0)
+        volume = Volume(model.volume().cpu().numpy(), grid.voxel_size)
+        choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
+        return Reconstruction(volume, model.images(), name, state.noise_model, signal_model=model, choices=choices)
+
+    return Method(
+        name,
+        description,
+        run,
+        learns_noise=True,
+        memory=PRESETS[name].memory,
+        continuous=True,
+        refuses=("second-axis",),
+    )
+
+
+METHOD = preset_method(
+    "kniesel2022", "Kniesel et al. 2022 with its own settings and a density that is normalised (days)."
+)

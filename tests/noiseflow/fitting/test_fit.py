@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.fitting.average import BestState, WeightAverage
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.fitting.steps import BestState, WeightAverage
 
 
 def gradient_image(size: int = 256) -> torch.Tensor:

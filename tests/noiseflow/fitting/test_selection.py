@@ -7,7 +7,7 @@ import torch
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.distributions.laws.latent import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
 

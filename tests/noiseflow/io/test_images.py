@@ -39,11 +39,29 @@ def test_grey_png_files_are_read_as_they_are(tmp_path: Path, dtype: type) -> Non
     assert np.array_equal(found, image)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "P", "LA"])
-def test_png_files_that_are_not_grey_are_refused(tmp_path: Path, mode: str) -> None:
-    Image.new(mode, (9, 8)).save(tmp_path / "image.png")
+@pytest.mark.parametrize(("mode", "pixel"), [("RGB", (1, 2, 1)), ("P", 0), ("LA", (1, 2)), ("RGBA", (1, 1, 1, 2))])
+def test_png_files_that_are_not_grey_are_refused(tmp_path: Path, mode: str, pixel: int | tuple[int, ...]) -> None:
+    image = Image.new(mode, (9, 8))
+    image.putpixel((3, 2), pixel)
+    image.save(tmp_path / "image.png")
     with pytest.raises(ValueError, match="convert it to one grey channel"):
         io.read(tmp_path / "image.png")
+
+
+@pytest.mark.parametrize("colours", [2, 3, 4])
+def test_grey_images_saved_in_colour_are_read_as_grey(tmp_path: Path, colours: int) -> None:
+    grey = np.random.default_rng(0).integers(0, 256, (5, 20, 30), np.uint8)
+    coloured = np.repeat(grey[..., None], colours, -1)
+    if colours != 3:
+        coloured[..., -1] = 255
+    Image.fromarray(coloured[0]).save(tmp_path / "image.png")
+    np.testing.assert_array_equal(io.read_image(tmp_path / "image.png"), grey[0])
+    if colours == 3:
+        tifffile.imwrite(tmp_path / "stack.tif", coloured, photometric="rgb")
+        np.testing.assert_array_equal(io.read(tmp_path / "stack.tif", mapped=True).data, grey)
+        assert cv2.imwrite(str(tmp_path / "deep.png"), coloured[0].astype(np.uint16) * 257)
+        with pytest.raises(ValueError, match="convert it to one grey channel"):
+            io.read(tmp_path / "deep.png")
 
 
 def test_png_files_cut_short_are_refused(tmp_path: Path) -> None:
@@ -104,7 +122,7 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 def test_colour_and_complex_images_are_refused(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
+    tifffile.imwrite(tmp_path / "colour.tif", np.arange(216, dtype=np.uint8).reshape(8, 9, 3), photometric="rgb")
     np.save(tmp_path / "complex.npy", np.zeros((2, 2), complex))
     with pytest.raises(ValueError, match="colour"):
         io.read(tmp_path / "colour.tif")

@@ -50,7 +50,7 @@ def test_dots_per_inch_are_no_pixel_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dtype", ["u1", "u2"])
 def test_colour_is_refused_by_name(tmp_path: Path, dtype: str) -> None:
-    tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 9, 3), dtype), photometric="rgb")
+    tifffile.imwrite(tmp_path / "a.tif", np.arange(216).reshape(8, 9, 3).astype(dtype), photometric="rgb")
     with pytest.raises(ValueError, match="is a colour image") as caught:
         io.read(tmp_path / "a.tif")
     assert "damaged" not in str(caught.value)
@@ -107,6 +107,12 @@ def test_folder_pairs_angles_of_the_names_with_their_images(tmp_path: Path) -> N
         (["a+10.tif", "a-10.tif", "a+0.tif"], [10, -10, 0]),
         (["tilt-10.tif", "tilt--10.tif", "tilt-0.tif"], [10, -10, 0]),
         (["tilt_5.tif", "tilt_10.tif"], [5, 10]),
+        (["s1_m60.tif", "s1_p00.tif", "s1_P60.tif"], [-60, 0, 60]),
+        (["neg60deg.tif", "neg_5deg.tif", "50deg.tif"], [-60, -5, 50]),
+        (["m_-5.0.tif", "m_0.0.tif", "m_5.0.tif"], [-5, 0, 5]),
+        (["m-5.0.tif", "m0.0.tif", "m5.0.tif"], [-5, 0, 5]),
+        (["p10.tif", "p20.tif"], None),
+        (["n10.tif", "n20.tif"], None),
         (["img_001.tif", "img_002.tif"], None),
         (["tilt-5.tif", "tilt-10.tif"], None),
         (["a_1.0_2.0.tif", "a_3.0_4.0.tif"], None),

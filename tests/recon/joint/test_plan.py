@@ -22,11 +22,10 @@ PLANS = {
         Facts(),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      40  simple, rate 1, remembered
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
@@ -50,16 +49,14 @@ PLANS = {
         Facts(halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
+        slab   settle                       signal      40  simple, rate 1, remembered
         slab   choose noise                 candidates  30 x 2  chosen
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        slab   begin again                  signal      37  simple, rate 0.6, afresh
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  begin                        signal      74  simple, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -77,8 +74,7 @@ PLANS = {
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  go on                        signal      37  chosen, rate 0.6, half the resolution
+        whole  begin                        signal      74  simple, rate 0.6, half the resolution
         whole  fit                          signal      76  chosen, rate 0.6
         """,
     ),
@@ -101,22 +97,20 @@ PLANS = {
         whole  begin                        signal      60  simple, rate 0.6, offset held
         whole  go on                        signal      120  simple, rate 0.6, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, offset held
+        whole  fit                          signal      60  chosen, rate 0.6, offset held, warm-up
         """,
     ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   settle                       signal      40  simple, rate 1, offset held, remembered
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
         slab   refine noise                 noise       20  simple
-        slab   begin again                  signal      60  simple, rate 0.6, offset held, afresh
         slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      60  simple, rate 0.6, offset held, half the resolution
-        whole  go on                        signal      60  simple, rate 0.6, offset held, half the resolution
+        whole  begin                        signal      120  simple, rate 0.6, offset held, half the resolution
         whole  fit                          signal      120  simple, rate 0.6, offset held
         whole  describe noise               noise       600  chosen
         """,
@@ -195,10 +189,10 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
         started.append(name)
         return noiseflow.fit(*parts, **given)
 
-    short = replace(Schedule(), settle=1, adapt=1, quiet=4, quiet_trial=1, describe=1)
+    short = replace(Schedule(), settle=1, adapt=1, quiet=2, describe=1)
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
-    assert JointReconstructor().plan(smooth(32, 160))[1] == 12
+    assert JointReconstructor().plan(smooth(32, 160))[1] == 16
 
 
 def test_stages_are_values():

@@ -9,9 +9,8 @@ import torch
 
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare, fourier_shell_correlation, match
+from recon.projection.classical import sirt, wbp
 from recon.projection.projector import SliceProjector
-from recon.projection.sirt import sirt
-from recon.projection.wbp import wbp
 from recon.series.masks import plausible
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.noises import SkewedNoise

@@ -5,13 +5,12 @@ import pytest
 import torch
 
 from noiseflow import Gaussian, RadialFlow, fit
-from recon.joint.laplace import Laplace
 from recon.methods import find_method, method_names, reconstruct
 from recon.methods._classical import LineIntegralProblem, best_num_iterations, best_window
 from recon.methods.kniesel2022.presets import PRESETS
+from recon.methods.l1 import Laplace
 from recon.metrics.metrics import compare
-from recon.projection.sirt import sirt
-from recon.projection.wbp import wbp
+from recon.projection.classical import sirt, wbp
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series

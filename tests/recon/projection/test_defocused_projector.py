@@ -11,6 +11,7 @@ from benchmarks.scenes import make_scene
 from recon.joint.joint import JointReconstructor
 from recon.methods import _registry as methods
 from recon.metrics.metrics import compare
+from recon.projection.classical import sirt
 from recon.projection.defocused_projector import (
     KERNELS,
     DefocusedProjector,
@@ -19,7 +20,6 @@ from recon.projection.defocused_projector import (
 )
 from recon.projection.projector import SliceProjector
 from recon.projection.rays import march, view_matrices, view_rays
-from recon.projection.sirt import sirt
 from recon.series.tilt_series import VolumeGrid
 
 ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]

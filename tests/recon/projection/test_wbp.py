@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from recon.projection.classical import WINDOWS, angular_shares, wbp
 from recon.projection.projector import SliceProjector
-from recon.projection.wbp import WINDOWS, angular_shares, wbp
 
 WIDTH = 24
 WINDOW_OF_SHARE = {  # as signal-processing textbooks print them, of frequency over cutoff

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import rotate
 
+from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.projection.sirt import sirt
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import AxisUndetermined, find_alignment
 from recon.series.prepare import prepare

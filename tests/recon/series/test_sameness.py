@@ -15,7 +15,7 @@ from noiseflow import Gaussian
 from noiseflow.models.pixel_maps import WithMaps
 from recon.methods import reconstruct
 from recon.methods._registry import Settings, find_method
-from recon.projection.wbp import angular_shares
+from recon.projection.classical import angular_shares
 from recon.reconstruction import Reconstruction
 from recon.series.holdout import Holdout
 from recon.series.orientation import Orientation
