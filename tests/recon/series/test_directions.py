@@ -10,10 +10,13 @@ import pytest
 
 import recon
 from recon.metrics.metrics import compare
+from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.uncertainty.coverage import left_out
+from recon.verdict.gap_fit import GapFit
 from recon.verdict.judge import judge
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant
@@ -83,3 +86,29 @@ def test_directions_lie_within_half_a_turn_and_mirror_few_images(name: str) -> N
     clean, _ = clean_tilt_series(np.random.default_rng(0).random((8, 3, 8)), angles)
     same, _ = clean_tilt_series(np.random.default_rng(0).random((8, 3, 8)), found.angles[found.order])
     np.testing.assert_allclose(found.arranged(clean.images), same.images, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("hold_out", [lambda a: left_out(a, 8), lambda a: Holdout.views(a, 4).groups == 1])
+def test_a_direction_is_held_out_with_its_mirror_images(name: str, hold_out: Any) -> None:
+    angles = ORDERS[name]
+    out = hold_out(angles)
+    assert 0 < out.mean() < 0.4
+    apart = np.abs((angles[out][:, None] - angles[~out] + 90) % 180 - 90)
+    assert apart.min() > 0.3  # no tilt that is left shows a direction that was held out
+    np.testing.assert_array_equal(hold_out(angles + 180), out)
+    directions, groups = Directions.of(angles), Holdout.gaps(angles).groups
+    assert (np.diff(groups[directions.order]) >= 0).all()
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_left_out_tilts_are_predicted_alike_half_a_turn_away(name: str) -> None:
+    """A mirror image at the angle plus 180° has the error of the image, mirrored."""
+    angles = ORDERS[name]
+    images = np.random.default_rng(0).random((len(angles), 2, 8))
+    turned = np.arange(len(angles)) % 3 == 0
+    errors = GapFit(angles, depth=8, width=8, detector_width=8).errors(images)
+    other = GapFit(angles + 180 * turned, depth=8, width=8, detector_width=8)
+    mirrored = np.where(turned[:, None, None], images[:, :, ::-1], images)
+    found = np.where(turned[:, None, None], other.errors(mirrored)[:, :, ::-1], other.errors(mirrored))
+    np.testing.assert_allclose(found, errors, atol=1e-3)
