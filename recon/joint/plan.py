@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from noiseflow.described import described
 
@@ -47,7 +47,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Numbers of steps and learning rates; `docs/benchmarks/ablations.md` has a row for each.
+    """Numbers of steps and learning rates; `docs/benchmarks/schedule.md` has a row for each.
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
@@ -58,9 +58,9 @@ class Schedule:
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
             was still ten times too wide.
-        trial: signal steps for the comparison of weights, after those of `settle`.
-        quiet_trial: the same for quiet series, as many as for the volume, because unconverged fits predict gaps of tilts best
-            at much too large weights (needle: 51 after 50 steps, 8 after 180).
+        trial: signal steps for the comparison of weights, after those of `settle`. Three quarters of `quiet` for quiet series,
+            because unconverged fits predict gaps of tilts best at much too large weights (needle: 51 after 50 steps, 8 after
+            180).
         whole: signal steps of the volume, unless the user sets their number.
         quiet: the same for quiet series, which have more detail to fit.
         rate: learning rate of all signal fits but the first; 1.4 times as much diverges on sparse objects of 96 voxels.
@@ -73,7 +73,6 @@ class Schedule:
     learn: int = 60
     describe: int = 600
     trial: int = 50
-    quiet_trial: int = 180
     whole: int = 150
     quiet: int = 240
     rate: float = 0.6
@@ -164,7 +163,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
-        steps, rate = schedule.quiet_trial if facts.quiet else schedule.trial, schedule.rate
+        steps, rate = schedule.quiet * 3 // 4 if facts.quiet else schedule.trial, schedule.rate
         stages.append(
             FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
         )
@@ -180,9 +179,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     quarter, stages = num_steps // 4, list[FitStage]()
     taken_over = facts.quiet and not facts.simple_is_final
 
-    def add(name: str, model: Noise, steps: int, halvings: int = 0) -> None:
-        rate, hold = schedule.rate, facts.hold_offset
-        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, halvings=halvings, hold_offset=hold))
+    def add(name: str, model: Noise, steps: int, halvings: int = 0, *, warm_up: bool = False) -> None:
+        how: dict[str, Any] = {"rate": schedule.rate, "hold_offset": facts.hold_offset, "warm_up": warm_up}
+        stages.append(FitStage(name, "signal", "whole", model, steps, halvings=halvings, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
         # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more
@@ -196,7 +195,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         elif facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-    add("fit", noise, num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1))
+    # with full steps at once, a narrow noise model that follows the usual fit can throw slices of a good volume off for good
+    last = num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1)
+    add("fit", noise, last, warm_up=taken_over)
     return stages
 
 

@@ -97,7 +97,7 @@ PLANS = {
         whole  begin                        signal      60  simple, rate 0.6, offset held
         whole  go on                        signal      120  simple, rate 0.6, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, offset held
+        whole  fit                          signal      60  chosen, rate 0.6, offset held, warm-up
         """,
     ),
     "quiet": (
@@ -189,7 +189,7 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
         started.append(name)
         return noiseflow.fit(*parts, **given)
 
-    short = replace(Schedule(), settle=1, adapt=1, quiet=4, quiet_trial=1, describe=1)
+    short = replace(Schedule(), settle=1, adapt=1, quiet=2, describe=1)
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
     assert JointReconstructor().plan(smooth(32, 160))[1] == 16
