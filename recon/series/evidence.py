@@ -15,8 +15,8 @@ from recon.series.holdout import Holdout
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
 from recon.series.views import Directions
 
-# degrees; wider than the gaps of the verdict, because an axis competes with all others: with gaps of 12°, the true axis of a needle
-# (64² pixels, shifts of one pixel) led the perpendicular one by less than four standard errors
+# Degrees. Wider than the gaps of the verdict, because an axis competes with all others: with 12°, the true axis of a needle (64²
+# pixels, shifts of one pixel) led the perpendicular one by less than four standard errors.
 _GAP = 15.0
 _FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
 _DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
